@@ -11,11 +11,12 @@ from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
+from mapserver.doctor.run_checks import run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
 # Wrong units, axes or cameras: a survey would not fail on them but be wrong. Gaps, blur and damage it can cope with.
-DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error"}
+DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
 DECISIVE |= {"gyro scale", "gyro axes", *(parameter.value for parameter in TOLERANCES)}
 # What nothing but the calibration tells a map, and the checks that judge it.
 SUBJECTS = {
@@ -111,6 +112,11 @@ def checked(
     settled = [f for f in checks.findings if f.name not in corrections or f.verdict is not Verdict.WARN]
     found = rig_evidence(given, [*settled, *(replace(f, sentence=f"after its correction {f.sentence}") for f in again)])
     return CheckedRecording(rig, checks.findings, found, corrections)
+
+
+def refuse_hopeless(recording: Recording) -> None:
+    """RecordingError for what `checked` would refuse, as far as that is seen within a second: before a drive that would be in vain."""
+    _refuse(recording, run_cheap_checks(recording, SAMPLED_FRAMES))
 
 
 def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:

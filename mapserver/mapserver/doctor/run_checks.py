@@ -9,17 +9,19 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
-from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
+from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import inertial, timing
 from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
 from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.depth import depth_share, measured_depth
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo, swapped_cameras
 from mapserver.survey.executor import SERIAL, Executor
 
+_PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
 
@@ -77,14 +79,12 @@ def run_checks(
         timing.imu_rate(imu.stamps_ns),
         timing.imu_gaps(imu.stamps_ns),
         timing.stamp_order(recording.issues),
-        timing.camera_imu_overlap(stamps_ns, imu.stamps_ns, shift_s),
-        inertial.gravity_magnitude(imu),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     calibration = MeasuredCalibration([], None)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
-    if recording.sensor_set in (SensorSet.STEREO, SensorSet.STEREO_INERTIAL):
-        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
+    findings += _soon_seen(recording, rectifier, seen)
+    if recording.sensor_set in _PAIRS:
         calibration = measure_calibration(recording, on_frame, executor, follow)
     turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
@@ -92,35 +92,58 @@ def run_checks(
     return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
 
 
+def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
+    """Those of `run_checks` for which the IMU and `sampled` frames will do: what can be said before a long drive begins."""
+    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+    seen = _sampled(recording, _Frames(recording, lambda: None), rectifier, sampled, SERIAL)
+    return _soon_seen(recording, rectifier, seen)
+
+
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What frames all over the recording show."""
+    """What frames all over the recording show. depth_shares: of pixels that have a depth."""
 
     pairs: list[StereoMatches]
     variances: list[float]
+    depth_shares: list[float]
+
+
+def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen) -> list[Finding]:
+    imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
+    overlap = timing.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
+    findings = [overlap, inertial.gravity_magnitude(imu)]
+    if recording.sensor_set in _PAIRS:
+        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
+    if recording.sensor_set is SensorSet.RGBD:
+        findings.append(measured_depth(seen.depth_shares))
+    return findings
 
 
 def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
-    seen = _Seen([], [])
-    for variance, pair in executor.map(_look, None, _moments(recording, frames, rectifier, count)):
+    seen = _Seen([], [], [])
+    for variance, pair, share in executor.map(_look, None, _moments(recording, frames, rectifier, count)):
         seen.variances.append(variance)
         seen.pairs.extend([] if pair is None else [pair])
+        seen.depth_shares.extend([] if share is None else [share])
     return seen
 
 
 def _moments(
     recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
-) -> Iterator[tuple[Image, RectifiedFrame | None]]:
-    """Frames spread over the recording: left as recorded, and the pair where there is a right picture."""
+) -> Iterator[tuple[CameraFrame, RectifiedFrame | None]]:
+    """Frames spread over the recording: as recorded, and the pair where there is a right picture."""
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
         if frame is not None:
-            yield frame.left, None if frame.right is None else rectifier.rectify(frame)
+            yield frame, None if frame.right is None else rectifier.rectify(frame)
 
 
-def _look(_: None, moment: tuple[Image, RectifiedFrame | None]) -> tuple[float, StereoMatches | None]:
-    left, pair = moment
-    return laplacian_variance(left), None if pair is None else match_stereo(pair)
+def _look(
+    _: None, moment: tuple[CameraFrame, RectifiedFrame | None]
+) -> tuple[float, StereoMatches | None, float | None]:
+    frame, pair = moment
+    share = None if frame.depth_m is None else depth_share(frame.depth_m)
+    return laplacian_variance(frame.left), None if pair is None else match_stereo(pair), share
 
 
 def _camera_turns(
