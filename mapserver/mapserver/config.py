@@ -11,7 +11,9 @@ import msgspec
 
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, over, read_given, refuse_internal
+from fleetmap.recordings import Topics
 from fleetmap.sensors.samples import SensorSet
+from fleetmap.sources.source import SourceSection
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
@@ -21,8 +23,13 @@ from mapserver.survey.settings import SurveySettings
 _PRESETS = Path(__file__).parent / "presets"
 
 TIERS = {
-    "user": {"": "site store"},
+    "user": {
+        "": "site store",
+        "source": "kind sensors calibration endpoint recording device",
+        "topics": "*",
+    },
     "tuning": {
+        "source": "domain keys speed width_px height_px rate_hz delay_s",
         "gate": "*",
         "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes",
         "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
@@ -42,10 +49,12 @@ TIERS = {
 
 
 class MapserverConfig(Section, frozen=True):
-    """The file without the sections of commands."""
+    """The file without the sections of commands. source: the sensors of a survey robot, for `live`; topics: of recordings too."""
 
     site: str | None = None
     store: str | None = None
+    source: SourceSection = SourceSection()
+    topics: Topics = Topics()
     survey: SurveySettings = SurveySettings()
     gate: GateSettings = GateSettings()
     ingest: IngestSettings = IngestSettings()

@@ -52,8 +52,10 @@ def _documented() -> dict[tuple[str, str, str], dict[str, str]]:
     for tier in ("user", "tuning"):
         part = text(DOCUMENT).split(f"\n## {tier.capitalize()} settings\n")[1].split("\n## ")[0]
         for heading, body in re.findall(r"^### (.*)$([^#]*)", part, re.MULTILINE):
-            section, program = re.fullmatch(r"(?:`\[([\w.]+)\]`|Top of the file) of `(\w+)`", heading).groups()
-            found[tier, program, section or ""] = {code_words(row[0])[0]: row[1].strip("`") for row in rows(body)}
+            match = re.fullmatch(r"(?:`\[([\w.]+)\]`|Top of the file) of `(\w+)`(?: and `(\w+)`)?", heading)
+            section, *programs = match.groups()
+            for program in filter(None, programs):
+                found[tier, program, section or ""] = {code_words(row[0])[0]: row[1].strip("`") for row in rows(body)}
     return found
 
 

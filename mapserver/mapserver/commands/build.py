@@ -97,7 +97,7 @@ def build(
     from mapserver.build.sensor_subset import named_sensor_set
 
     use = None if options.use is None else named_sensor_set(options.use)
-    asked = options.asked() | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
+    asked = options.asked(context) | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
     site, store = asked.pop("site"), asked.pop("store")
     asked["trajectory"] = trajectory.given()
     built = build_map(recordings, store, site, BuildOptions(**asked))

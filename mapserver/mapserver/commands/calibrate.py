@@ -10,7 +10,7 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, config_path, expand_options
 from fleetmap.errors import RecordingError
-from mapserver.commands.options import Calibration, check_output
+from mapserver.commands.options import Calibration, check_output, topics_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,9 +53,9 @@ def calibrate(
     """
     out, guess = options.out, options.guess
     check_output("--out", out)
-    from fleetmap.recordings import OpenOptions, named_topics, open_recording
+    from fleetmap.recordings import OpenOptions, open_recording
 
-    topics = named_topics(options.topic)
+    topics = topics_of(context, options.topic)
     if guess is not None:
         _from_guess(recordings, out, guess, config_path(context), topics)
         return

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fleetmap.foxglove.server import FoxgloveServer
     from fleetmap.live_survey import LiveSurveyState
     from mapserver import BuildOptions
+    from mapserver.config import MapserverConfig
     from mapserver.live import Drive
     from mapserver.live.live_viewer import LiveViewer
     from mapserver.survey.settings import SurveySettings
@@ -63,9 +64,15 @@ def live(
 ) -> None:
     """Map a survey while it drives; Ctrl-C ends the drive, and what was seen becomes a draft."""
     options.check()
-    if (recording is None) == (options.sensors is None) or (options.sensors is None) != (options.record is None):
+    sensors = (options.sensors or config_path(context)) if recording is None else options.sensors
+    if (recording is None) == (sensors is None) or (recording is None) != (options.record is not None):
         raise UsageError(
-            "name a RECORDING to play, or --sensors FILE to drive with and --record FILE.mcap to keep it in"
+            "name a RECORDING to play, or --record FILE.mcap to keep what the [source] of --sensors FILE (or --config FILE) sends"
+        )
+    of_recordings = [name for name in ("use", "calibration", "topic") if getattr(options, name) is not None]
+    if recording is None and of_recordings:
+        raise UsageError(
+            f"--{of_recordings[0]} says how a RECORDING is read; the [source] and [topics] of {sensors} say it of sensors"
         )
     if options.frozen != (options.map is not None):
         raise UsageError("--map VERSION --frozen localizes in a version; without both of them a map is made")
@@ -81,16 +88,18 @@ def live(
     from mapserver.live import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)
-    asked = options.asked() | {"config": config_path(context), "use": use}
-    site, store, speed, server, sensors, record, version, ros2 = (
-        asked.pop(name) for name in ("site", "store", "speed", "server", "sensors", "record", "map", "ros2")
+    asked = options.asked(context) | {"config": config_path(context), "use": use}
+    site, store, speed, server, record, version, ros2 = (
+        asked.pop(name) for name in ("site", "store", "speed", "server", "record", "map", "ros2")
     )
-    for name in ("frozen", "foxglove", "insecure"):
+    for name in ("frozen", "foxglove", "insecure", "sensors"):
         asked.pop(name)
     build, is_stopped = BuildOptions(**asked), _stopping()
     with (
         _foxglove(at, site) as foxglove,
-        _drive(recording, sensors, record, build, speed) as (drive, settings),
+        _played(recording, build, speed)
+        if recording is not None
+        else _driven(context.obj.read_config(sensors)[0], record, build) as (drive, settings),
         _bus(server, store) as bus,
         _bus(ros2, store, is_ros=True) as ros2_bus,
     ):
@@ -105,22 +114,25 @@ def live(
 
 
 @contextmanager
-def _drive(
-    recording: Path | None, sensors: Path | None, record: Path | None, build: "BuildOptions", speed: float
-) -> "Iterator[tuple[Drive, SurveySettings]]":
-    """The survey's source, and the settings that suit its sensors."""
-    from fleetmap.sensors.samples import SensorSet
+def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[tuple[Drive, SurveySettings]]":
+    """A recording, and the settings that suit its sensors."""
     from mapserver.config import survey_settings
-    from mapserver.live import RecordedDrive, SensorDrive
+    from mapserver.live import RecordedDrive
 
-    if recording is not None:
-        with build.reading.open(recording) as (opened, indices):
-            settings = survey_settings(build.config, opened.sensor_set)
-            yield RecordedDrive(recording, opened, indices, build.frames, speed), settings
-        return
-    assert sensors is not None
-    assert record is not None
-    drive = SensorDrive.open(sensors, record)
+    with build.reading.open(recording) as (opened, indices):
+        settings = survey_settings(build.config, opened.sensor_set)
+        yield RecordedDrive(recording, opened, indices, build.frames, speed), settings
+
+
+@contextmanager
+def _driven(given: "MapserverConfig", record: Path, build: "BuildOptions") -> "Iterator[tuple[Drive, SurveySettings]]":
+    """The sensors that a configuration file names, and the settings that suit them; errors of `open_source`."""
+    from fleetmap.sensors.samples import SensorSet
+    from fleetmap.sources.source import open_source
+    from mapserver.config import survey_settings
+    from mapserver.live import SensorDrive
+
+    drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
     kinds = {
         (2, True): SensorSet.STEREO_INERTIAL,
         (2, False): SensorSet.STEREO,

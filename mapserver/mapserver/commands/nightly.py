@@ -37,7 +37,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     from mapserver.nightly import NightRequest, run_night
 
     FrameSelection.parse(options.frames)
-    asked = {name: value for name, value in options.asked().items() if name != "report"}
+    asked = {name: value for name, value in options.asked(context).items() if name != "report"}
     request = NightRequest(now_ns=time.time_ns(), config=config_path(context), **asked)
     try:
         sentence = run_night(request, settings_of(context).gate, Console(stderr=True))

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleetmap.cli_options import TopicNames
+from fleetmap.cli_options import TopicNames, settings_of
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
+    from fleetmap.recordings import Topics
     from mapserver.store import Actor, MapStore
 
 
@@ -75,12 +76,10 @@ class SurveyOptions(SiteOptions):
 
     keys: BuilderKeys = None
 
-    def asked(self) -> dict[str, Any]:
+    def asked(self, context: typer.Context) -> dict[str, Any]:
         """All options by their names, topics as Topics."""
-        from fleetmap.recordings import named_topics
-
         values = dict(vars(self))
-        values["topics"] = named_topics(values.pop("topic"))
+        values["topics"] = topics_of(context, values.pop("topic"))
         return values
 
     def check(self) -> None:
@@ -89,6 +88,14 @@ class SurveyOptions(SiteOptions):
 
         check_output("--report", self.report)
         check_name(self.site, "site")
+
+
+def topics_of(context: typer.Context, words: list[str] | None) -> "Topics":
+    """The [topics] of the configuration file, and over them those that --topic names."""
+    from fleetmap.recordings import named_topics
+
+    topics: Topics = settings_of(context).topics
+    return named_topics(words, topics)
 
 
 def version_named(maps: "MapStore", site: str, version: int | None) -> int:

@@ -8,6 +8,7 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
 from fleetmap.errors import UsageError, disk_errors
+from mapserver.commands.options import topics_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -51,9 +52,9 @@ def train_vocabulary(
 
     from fleetmap.bow import encode_vocabulary, vocabulary_hash
     from fleetmap.bow import train_vocabulary as train
-    from fleetmap.recordings import OpenOptions, named_topics
+    from fleetmap.recordings import OpenOptions
 
-    orb, opening = settings_of(context).survey.orb, OpenOptions(topics=named_topics(topic))
+    orb, opening = settings_of(context).survey.orb, OpenOptions(topics=topics_of(context, topic))
     pictures = [rows for recording in recordings for rows in _descriptors(recording, opening, options.frames, orb)]
     images = np.repeat(np.arange(len(pictures)), [len(rows) for rows in pictures])
     rows = np.concatenate(pictures)

@@ -3,13 +3,13 @@
 import threading
 import time
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.config import Section, load_toml
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.recordings import Recording, StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame
@@ -19,7 +19,9 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, SensorSet, WheelSample
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
-from fleetmap.sources.source import Source, SourceSection, open_source
+from fleetmap.sources.source import Source
+from mapserver.build.admission import refuse_hopeless
+from mapserver.build.build import BuildOptions
 from mapserver.build.worker import read_ahead
 from mapserver.survey.odometry_pass import SampleFeed
 
@@ -29,6 +31,7 @@ _QUEUE = 40  # frames of sensors that may wait for tracking: two seconds
 _IMU_WAIT_S = 0.05
 _POLL_S = 0.25
 _WARM_UP_FRAMES = 3
+_SILENCE_S = 10.0  # after which a sensor that has said nothing is no sensor
 
 
 class DueFrame(NamedTuple):
@@ -53,14 +56,17 @@ class Drive(Protocol):
     def dropped(self) -> int:
         """Frames so far."""
 
+    def check(self) -> list[str]:
+        """What is wanting, in words; RecordingError for what a build would refuse, as far as that shows before the drive."""
+
     def warm_up(self) -> tuple[RectifiedFrame, ...]:
         """A few frames to load kernels on, if there are any before it begins."""
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """Each frame when it is due; None now and then while none comes."""
 
-    def finish(self, count: int) -> tuple[Path, str]:
-        """The recording and its `--frames` that hold the `count` frames which were taken."""
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+        """The recording, and the options with which a build reads the `count` frames of it that were taken."""
 
 
 class RecordedDrive:
@@ -80,6 +86,11 @@ class RecordedDrive:
         """See Drive: it waits for who takes its frames."""
         return 0
 
+    def check(self) -> list[str]:
+        """See Drive."""
+        refuse_hopeless(self._recording)
+        return [f"issue: {issue.what}: {issue.detail}" for issue in self._recording.issues]
+
     def warm_up(self) -> tuple[RectifiedFrame, ...]:
         """See Drive."""
         return tuple(self._frame(int(index)) for index in self._indices[:_WARM_UP_FRAMES])
@@ -97,23 +108,16 @@ class RecordedDrive:
             imu, wheel = feed.until(frame.stamp_ns)
             yield DueFrame(frame, imu, list(wheel), due_s)
 
-    def finish(self, count: int) -> tuple[Path, str]:
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
         """See Drive."""
         if count == len(self._indices):
-            return self._path, self._given
+            return self._path, replace(options, frames=self._given)
         seen = self._indices[: max(count, 1)]
         step = int(self._indices[1] - self._indices[0]) if len(self._indices) > 1 else 1
-        return self._path, f"{int(seen[0])}:{int(seen[-1]) + 1}:{step}"
+        return self._path, replace(options, frames=f"{int(seen[0])}:{int(seen[-1]) + 1}:{step}")
 
     def _frame(self, index: int) -> RectifiedFrame:
         return self.rectifier.rectify(self._recording.read_frame(index))
-
-
-class SensorsFile(Section, frozen=True):
-    """A file with the [source] and the [topics] of a robot's configuration."""
-
-    source: SourceSection = SourceSection()
-    topics: Topics = Topics()
 
 
 class SensorDrive:
@@ -126,7 +130,7 @@ class SensorDrive:
         self.name, self.calibration, self.has_depth = path.stem, source.calibration, source.has_depth
         self.rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
         self._source, self._path, self._topics = source, path, topics
-        self._ended = threading.Event()
+        self._ended, self._recorded_frames = threading.Event(), 0
         self.speed = 1.0
         self._intake = Intake(
             frames=_QUEUE,
@@ -135,16 +139,14 @@ class SensorDrive:
             imu_wait_s=_IMU_WAIT_S,
         )
 
-    @classmethod
-    def open(cls, file: Path, path: Path) -> Self:
-        """The sensors that a configuration file names; errors of `open_source`."""
-        given = load_toml(file, SensorsFile)
-        return cls(open_source(given.source, given.topics), path, given.topics)
-
     @property
     def dropped(self) -> int:
         """See Drive."""
         return self._intake.counts.frames_dropped
+
+    def check(self) -> list[str]:
+        """See Drive: sensors are judged by what they send."""
+        return []
 
     def warm_up(self) -> tuple[RectifiedFrame, ...]:
         """See Drive."""
@@ -155,25 +157,52 @@ class SensorDrive:
         feeding = threading.Thread(target=self._feed, name="sensors", daemon=True)
         writer = McapRecordingWriter(self._path, self.calibration, topics=self._topics, in_place=True)
         feeding.start()
+        begun_s = time.monotonic()
         try:
             while not self._intake.exhausted:
                 bundle = self._intake.take(_POLL_S)
                 due_s = time.monotonic()
                 frame = None if bundle.frame is None else self._recorded(writer, bundle)
                 yield None if frame is None else DueFrame(frame, bundle.imu, bundle.wheel, due_s)
+                if due_s - begun_s > _SILENCE_S:
+                    self._refuse_silence()
         finally:
             self._ended.set()
             feeding.join(5.0)
             self._source.close()
-            writer.close()
+            if self._recorded_frames:
+                writer.close()
+            else:
+                writer.discard()
 
-    def finish(self, count: int) -> tuple[Path, str]:
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
         """See Drive."""
         if not count:
+            self._refuse_silence()
             raise RecordingError(
-                f"{self._path}: no frame came from the sensors; look at their topics with `locclient check`"
+                f"no frame could be used; look at the sensors with `locclient check`{self._unreadable()}"
             )
-        return self._path, "::"
+        return self._path, replace(options, frames="::", calibration=None, topics=self._topics, use=None)
+
+    def _refuse_silence(self) -> None:
+        """RecordingError where cameras or IMU have said nothing, with the topics on which they are expected."""
+        counts, topics = self._intake.counts, self._topics
+        second = topics.depth if self.has_depth else topics.right if len(self.calibration.cameras) > 1 else ""
+        if not counts.frames:
+            images = f"{topics.left} and {second}" if second else topics.left
+            raise RecordingError(
+                f"no frame came from the sensors: images are expected on {images}; look at [source] sensors and [topics] with "
+                f"`locclient check`{self._unreadable()}"
+            )
+        if self.calibration.imu is not None and not counts.imu_samples:
+            raise RecordingError(
+                f"{self._path}: images come, but no sample of the IMU that the calibration has; it is expected on {topics.imu}. Start "
+                "it, correct [topics] imu, or take it out of the calibration file"
+            )
+
+    def _unreadable(self) -> str:
+        count = self._intake.counts.unreadable
+        return f"; {count} messages could not be read" if count else ""
 
     def _feed(self) -> None:
         try:
@@ -194,4 +223,5 @@ class SensorDrive:
             self._intake.count_unreadable()
             return None
         writer.write_frame(bundle.frame)
+        self._recorded_frames += 1
         return rectified

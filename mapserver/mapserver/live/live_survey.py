@@ -15,9 +15,9 @@ from rich.console import Console
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, StateError, SurveyError, UsageError
 from fleetmap.geometry import se3_inverse, skew
-from fleetmap.live_survey import LiveSurveyState
+from fleetmap.live_survey import NO_PART, LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.build.build import BuildOptions
@@ -54,6 +54,7 @@ class LiveFigures(NamedTuple):
     """How the survey kept up: frames and the seconds that they last; 0.5 and 0.99 of the frames were answered within latency_ms, None
     where they were not played at their own speed; late_frames took longer than the time to the next one. most_behind: keyframes that
     waited at once; lag_s: the longest time from a keyframe to the map that shows it. dropped: frames that came too quickly to be taken.
+    localized: share of the keyframes that were placed in a frozen version, None without one.
     """
 
     frames: int
@@ -67,6 +68,7 @@ class LiveFigures(NamedTuple):
     loops: int
     parts: int
     mapping_failed: str
+    localized: float | None = None
 
     def words(self) -> str:
         """A sentence."""
@@ -74,10 +76,12 @@ class LiveFigures(NamedTuple):
         kept = "played as fast as it went"
         if self.latency_ms is not None:
             kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
-        apart = f" in {self.parts} parts that nothing has joined" if self.parts > 1 else ""
+        made = f"{self.loops} loops" + (f" in {self.parts} parts that nothing has joined" if self.parts > 1 else "")
+        if self.localized is not None:
+            made = f"{self.localized:.0%} of them localized in the version"
         return (
             f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
-            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {self.loops} loops{apart}{'; ' if failed else ''}{failed}"
+            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
         )
 
 
@@ -98,27 +102,38 @@ def run_live(
 ) -> LiveResult:
     """Follows a survey to its end, or until it is stopped, and builds the draft of what was seen.
 
-    tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, UsageError for what
-    cannot be mapped live.
+    tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, before the drive
+    where possible, UsageError for what cannot be localized in a version, SurveyError for a drive of which nothing was.
     """
     survey = _Survey(request, drive, tell, see)
-    survey.follow(is_stopped)
-    console.print(survey.figures().words(), markup=False)
-    if request.frozen is not None:
-        drive.finish(survey.figures().frames)
-        survey.say("localized", words=survey.figures().words())
-        return LiveResult(survey.figures(), None)
-    survey.say("adjusting")
     try:
-        path, frames = drive.finish(survey.figures().frames)
-        built = build_map(
-            path, request.store, request.site, replace(request.options, frames=frames, settings=request.settings)
-        )
+        for remark in survey.check():
+            console.print(remark, markup=False)
+        survey.follow(is_stopped)
+        console.print(survey.figures().words(), markup=False)
+        built = _finished(request, drive, survey)
     except FleetmapError as error:
         survey.say("failed", words=str(error))
         raise
-    survey.say("stored", version=built.version, words=built.sentence)
+    if built is None:
+        survey.say("localized", words=survey.figures().words())
+    else:
+        survey.say("stored", version=built.version, words=built.sentence)
     return LiveResult(survey.figures(), built)
+
+
+def _finished(request: LiveRequest, drive: Drive, survey: "_Survey") -> BuiltMap | None:
+    """The draft; None with a frozen version, SurveyError where nothing was localized in that."""
+    path, options = drive.finish(survey.figures().frames, replace(request.options, settings=request.settings))
+    if request.frozen is None:
+        survey.say("adjusting")
+        return build_map(path, request.store, request.site, options)
+    if not survey.figures().localized:
+        raise SurveyError(
+            f"none of {survey.figures().keyframes} keyframes was localized in version {request.frozen} of site {request.site}; is it the "
+            "map of this place? Drive a metre or more through what it shows, the same way round as its survey, or name another --map"
+        )
+    return None
 
 
 class _Survey:
@@ -136,13 +151,8 @@ class _Survey:
         # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
         self._stamps_since: list[int] = []
-        self._localized = 0  # keyframes
-
-    def follow(self, is_stopped: Callable[[], bool]) -> None:
-        """Tracks all frames, each when it is due."""
-        request, drive = self._request, self._drive
         rectifier, imu = drive.rectifier, drive.calibration.imu
-        rig = LiveRig(
+        self._rig = LiveRig(
             rectifier.camera,
             rectifier.body_from_cam,
             imu,
@@ -150,21 +160,43 @@ class _Survey:
             drive.has_depth,
             scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
         )
+        self._make: MakeMap
+
+    def check(self) -> list[str]:
+        """What is wanting before it begins, in words; FleetmapErrors for what could only be in vain."""
+        remarks = self._drive.check()
+        self._make = self._maker()
+        if not self._rig.scale_known:
+            remarks.append(
+                "scale: unknown: one camera without an IMU shows no metres; the draft can be inspected, and published only if docks or "
+                "tags tell them. Record an IMU, a second camera or depths"
+            )
+        return remarks
+
+    def follow(self, is_stopped: Callable[[], bool]) -> None:
+        """Tracks all frames, each when it is due; `check` comes first."""
+        request, drive = self._request, self._drive
+        rectifier = drive.rectifier
         warm_up = drive.warm_up()
         scratch = LiveTracking(drive.calibration, rectifier, request.settings)
         for frame in warm_up:
             scratch.handle(frame, ImuSamples.empty(), ())
         del scratch
         # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
-        with _one_thread(), MappingProcess(self._maker(rig), rig, warm_up) as mapping:
+        with _one_thread(), MappingProcess(self._make, self._rig, warm_up) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
             self._look(mapping)
 
-    def _maker(self, rig: LiveRig) -> MakeMap:
+    def _maker(self) -> MakeMap:
         """What makes the map that takes the keyframes."""
-        request = self._request
+        request, rig = self._request, self._rig
         if request.frozen is not None:
+            if not rig.scale_known:
+                raise UsageError(
+                    "--frozen: one camera without an IMU shows no metres, and a version has them; localize with an IMU, a second camera "
+                    "or depths"
+                )
             return partial(FrozenMap, frozen_version(request.store, request.site, request.frozen), rig)
         zones = read_zones(request.options.zones)
         return partial(LiveMap, SurveyConfig(request.settings, default_vocabulary(), zones), rig)
@@ -219,7 +251,13 @@ class _Survey:
             loops=self._sketch.loops,
             parts=len(self._sketch.parts),
             mapping_failed=self._failed,
+            localized=self._localized(),
         )
+
+    def _localized(self) -> float | None:
+        if self._request.frozen is None:
+            return None
+        return float((self._sketch.part != NO_PART).sum() / max(len(self._sketch.part), 1))
 
     def _seconds(self) -> float:
         return (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0
@@ -303,8 +341,10 @@ def _one_thread() -> Iterator[None]:
 
 
 def frozen_version(store: Path, site: str, version: int) -> FrozenVersion:
-    """A version of a store to localize in; StoreErrors where it is not there."""
+    """A version of a store to localize in; StoreErrors where it is not there, StateError where it has no metres."""
     found = open_map(store, site, version)
+    if found.manifest.report.get("scale") == "unknown":
+        raise StateError(f"version {version} of site {site} has a scale of its own, no metres; name another --map")
     with MapStore.open(store) as maps:
         vocabulary = decode_vocabulary(maps.blob(found.manifest.vocabulary.sha256))
     return FrozenVersion(version, found.tiles, vocabulary, found.manifest.camera.focal_px)

@@ -1,0 +1,274 @@
+"""`mapserver live` for every kind of rig, by one configuration file, and what it refuses. A robot rides through a painted room."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from rich.console import Console
+from typer.testing import CliRunner
+
+import mapserver
+from fleetmap.errors import FleetmapError, RecordingError, StateError, SurveyError, UsageError
+from fleetmap.live_survey import LiveSurveyState
+from fleetmap.recordings import OpenOptions, Topics, open_recording
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from fleetmap.sources.intake import Intake
+from mapserver.build.build import BuildOptions
+from mapserver.cli import app
+from mapserver.commands import live as live_command
+from mapserver.config import survey_settings
+from mapserver.live import LiveRequest, RecordedDrive, SensorDrive, drives, live_survey, run_live
+from mapserver.store import DraftContent, MapStore
+from support.recordings.live_drives import MappingHere, played, write_rgbd
+from support.recordings.recording_samples import calibration, kalibr_text, write_euroc
+from support.storage.map_samples import draft_details
+from support.worlds import robot_world
+
+METRIC = [SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD, SensorSet.MONO_INERTIAL]
+KINDS = [*METRIC, SensorSet.MONO]
+QUIET = Console(quiet=True)
+
+
+class Site:
+    """Recordings of one ride, by kind of rig, and the store of the room's map."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.store = folder, folder / "maps"
+        self.pairs = write_euroc(folder / "ride", robot_world.cycle())
+        self.depths = write_rgbd(folder / "depths.mcap", robot_world.cycle())
+        with MapStore.open(self.store, create=True) as store:
+            self.version = robot_world.save(store, site="lab")
+
+    def recording(self, kind: SensorSet) -> Path:
+        return self.depths if kind is SensorSet.RGBD else self.pairs
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    return Site(tmp_path_factory.mktemp("site"))
+
+
+Call = tuple[object, Path, str, BuildOptions]
+
+
+@pytest.fixture(autouse=True)
+def builds(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+    """Mapping in this process; builds are ordered, not done: test_live_survey.py does one."""
+    ordered: list[Call] = []
+
+    def build_map(recordings: object, store: Path, name: str, options: BuildOptions) -> object:
+        ordered.append((recordings, store, name, options))
+        return type("Built", (), {"version": 1, "sentence": "built"})()
+
+    monkeypatch.setattr(live_survey, "MappingProcess", MappingHere)
+    monkeypatch.setattr(live_survey, "build_map", build_map)
+    monkeypatch.setattr(mapserver, "build_map", build_map)
+    monkeypatch.setattr(live_command, "_stopping", lambda: lambda: False)
+    return ordered
+
+
+def configured(tmp_path: Path, site: Site, kind: SensorSet, more: str = "") -> Path:
+    """The configuration file for a kind of rig."""
+    file, use = tmp_path / "rig.toml", f'use = "{kind}"'
+    survey = "[survey.keyframes]\nmax_interval_s = 0.9"
+    file.write_text(
+        f'site = "lab"\nstore = "{site.store}"\n{survey}\n[live]\nspeed = 0.0\n{use}\n[build]\n{use}\n{more}'
+    )
+    return file
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_live_and_build_take_one_configuration_file(
+    site: Site, tmp_path: Path, builds: list[Call], kind: SensorSet
+) -> None:
+    file, recording = configured(tmp_path, site, kind), site.recording(kind)
+    done = run("live", recording, "--config", file)
+    assert done.exit_code == 0, done.exception
+    found = MappingHere.made.sketch
+    assert found.keyframes > 8
+    assert [part.is_map for part in found.parts] == [True]
+    assert found.estimate is not None
+    assert found.estimate.status == "TRACKING"
+    assert ("scale: unknown" in done.stderr) is (kind is SensorSet.MONO)
+    assert run("build", recording, "--config", file).exit_code == 0
+    (_, *live_at, by_live), (_, *build_at, by_build) = builds
+    assert live_at == build_at
+    assert by_live.settings == survey_settings(file, kind)
+    assert by_live.settings.keyframes.max_interval_s == 0.9
+    assert replace(by_live, settings=None) == by_build
+    assert by_live.use is kind
+
+
+@pytest.mark.parametrize("kind", METRIC)
+def test_every_metric_kind_is_localized_in_a_frozen_version(site: Site, tmp_path: Path, kind: SensorSet) -> None:
+    words = ("--config", configured(tmp_path, site, kind), "--map", site.version, "--frozen")
+    done = run("live", site.recording(kind), *words)
+    assert done.exit_code == 0, done.exception
+    after = MappingHere.made.after
+    placed = {
+        n: s.estimate for n, s in after.items() if s.estimate is not None and s.estimate.map_from_body is not None
+    }
+    assert f"{len(placed) / len(after):.0%} of them localized in the version" in done.stdout
+    assert len(placed) > 0.6 * len(after)
+    for number, estimate in placed.items():
+        assert np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]) < 0.02
+    with MapStore.open(site.store) as store:
+        assert [info.version for info in store.versions("lab")] == [site.version]
+
+
+def driven(
+    site: Site,
+    drive: RecordedDrive | SensorDrive,
+    kind: SensorSet,
+    *,
+    frozen: int | None = None,
+    store: Path | None = None,
+) -> list[LiveSurveyState]:
+    told: list[LiveSurveyState] = []
+    request = LiveRequest("lab", store or site.store, survey_settings(None, kind), BuildOptions(), frozen)
+    try:
+        run_live(request, drive, told.append, lambda: False, QUIET)
+    except FleetmapError:
+        assert told[-1].phase == "failed"
+        raise
+    return told
+
+
+def test_one_camera_alone_has_no_metres_to_be_localized_with(site: Site, tmp_path: Path) -> None:
+    words = ("--config", configured(tmp_path, site, SensorSet.MONO), "--map", site.version, "--frozen")
+    done = run("live", site.pairs, *words)
+    assert isinstance(done.exception, UsageError)
+    assert "record" not in str(done.exception)
+    assert "localize with an IMU" in str(done.exception)
+
+
+def test_a_version_without_metres_is_not_localized_in(site: Site, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "maps", create=True) as store:
+        details = draft_details(path_m=10.0, scale="unknown")
+        content = DraftContent(
+            tiles=list(robot_world.tiles()), vocabulary=robot_world.vocabulary(), details=details, archive=b"archive"
+        )
+        version = store.save_draft("lab", content)
+    with (
+        pytest.raises(StateError, match="a scale of its own"),
+        played(site.pairs, speed=0, use=SensorSet.STEREO) as drive,
+    ):
+        driven(site, drive, SensorSet.STEREO, frozen=version, store=tmp_path / "maps")
+
+
+def test_the_map_of_another_place_is_said_not_to_be_this_one(site: Site, tmp_path: Path) -> None:
+    """The room upside down is another one."""
+    sample = robot_world.cycle()
+    other = replace(
+        sample,
+        left=[np.ascontiguousarray(image[::-1]) for image in sample.left],
+        right=[np.ascontiguousarray(image[::-1]) for image in sample.right],
+    )
+    path = write_euroc(tmp_path / "other", other)
+    with (
+        pytest.raises(
+            SurveyError, match=r"none of \d+ keyframes was localized in version 1 of site lab; is it the map of"
+        ),
+        played(path, ":45", speed=0, use=SensorSet.STEREO) as drive,
+    ):
+        driven(site, drive, SensorSet.STEREO, frozen=site.version)
+
+
+def not_begun(*_: object) -> MappingHere:
+    raise AssertionError("the drive began")
+
+
+def test_what_a_build_would_refuse_is_refused_before_the_drive(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_survey, "MappingProcess", not_begun)
+    config = configured(tmp_path, site, SensorSet.STEREO)
+    other = tmp_path / "other.yaml"
+    text = kalibr_text()
+    first = text.index("T_cn_cnm1")
+    row = text.index(
+        "  - ", text.index("  - ", first) + 1
+    )  # of the second row: the right camera looks down by a degree
+    end = text.index("\n", row)
+    other.write_text(
+        f"{text[:row]}  - [0.0, 0.99985, -0.01745, 0.0]\n  - [0.0, 0.01745, 0.99985, 0.0]{text[text.index(chr(10), end + 1) :]}"
+    )
+    blind = write_rgbd(tmp_path / "blind.mcap", replace(robot_world.cycle(), stamps_ns=robot_world.cycle().stamps_ns[:9],
+        left=robot_world.cycle().left[:9], world_from_body=robot_world.cycle().world_from_body[:9]), has_depth=False)  # fmt: skip
+    cases: list[tuple[tuple[object, ...], type[Exception], str]] = [
+        ((site.pairs, "--calibration", other), RecordingError, "epipolar error"),
+        ((site.depths, "--use", "stereo"), RecordingError, "use it as rgbd, mono"),
+        ((site.pairs, "--use", "rgbd"), RecordingError, "is stereo-inertial, it cannot be used as rgbd"),
+        ((blind, "--use", "rgbd"), RecordingError, "depth: 100.0% of the pixels have no depth"),
+    ]
+    for words, kind, message in cases:
+        done = run("live", *words, "--config", config)
+        assert isinstance(done.exception, kind), words
+        assert message in str(done.exception)
+
+
+class Scripted:
+    """Sensors that send these frames and no IMU, whatever the calibration says."""
+
+    has_depth = False
+
+    def __init__(self, frames: list[CameraFrame]) -> None:
+        self.calibration, self._frames = calibration(), frames
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        for frame in self._frames:
+            intake.put_frame(frame)
+        while not wait(0.05):
+            pass
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_sensors_that_say_nothing_are_not_waited_for(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drives, "_SILENCE_S", 0.2)
+    record, sample = tmp_path / "drive.mcap", robot_world.cycle()
+    names = Topics(left="/front/left", right="/front/right")
+    drive = SensorDrive(Scripted([]), record, names)
+    with pytest.raises(RecordingError, match="expected on /front/left and /front/right"):
+        driven(site, drive, SensorSet.STEREO_INERTIAL)
+    assert not record.exists(), "nothing was recorded"
+    frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(3)]
+    with pytest.raises(RecordingError, match="no sample of the IMU"):
+        driven(site, SensorDrive(Scripted(frames), record, names), SensorSet.STEREO_INERTIAL)
+    with open_recording(record, OpenOptions(topics=names)) as kept:
+        assert 1 <= len(kept) <= len(frames)
+        np.testing.assert_array_equal(kept.read_frame(0).right, frames[0].right)
+    assert "sensors" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_path: Path, builds: list[Call]) -> None:
+    record = tmp_path / "drive.mcap"
+    more = f'[source]\nkind = "recording"\nrecording = "{site.depths}"\nspeed = 0.0\n'
+    file = configured(tmp_path, site, SensorSet.RGBD, more)
+    file.write_text(file.read_text().replace('[live]\nspeed = 0.0\nuse = "rgbd"\n', f'[live]\nrecord = "{record}"\n'))
+    done = run("live", "--config", file)
+    assert done.exit_code == 0, done.exception
+    ((path, _, name, options),) = builds
+    assert (path, name, options.frames, options.settings) == (
+        record,
+        "lab",
+        "::",
+        survey_settings(file, SensorSet.RGBD),
+    )
+    with options.reading.open(record) as (kept, indices):
+        assert (kept.sensor_set, len(indices)) == (SensorSet.RGBD, len(robot_world.cycle().stamps_ns))
+    for option, value in (("--use", "stereo"), ("--calibration", file), ("--topic", "imu=/a")):
+        refused = run("live", "--config", file, option, value)
+        assert isinstance(refused.exception, UsageError)
+        assert "[source]" in str(refused.exception)

@@ -1,0 +1,82 @@
+"""Surveys under way in a test: recordings that are played for a kind of rig, and mapping without a process of its own."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
+from mapserver.build.survey_recordings import RecordingOptions
+from mapserver.live import RecordedDrive
+from mapserver.live.mapping_process import NO_SKETCH, MakeMap, MapSketch, sketch_of
+from mapserver.survey.live.live_values import LiveRig, NewKeyframe
+from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, calibration
+from support.worlds.box_room import points_seen
+
+_FURTHEST_M = 6.0  # that the depth camera measures
+
+
+class MappingHere:
+    """In the place of `MappingProcess`: every keyframe is mapped when it is put, and what the map was then is kept."""
+
+    made: "MappingHere"
+
+    def __init__(self, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+        self._map, self.sketch, self.behind, self.failed, self.longest_lag_s = make(), NO_SKETCH, 0, "", 0.0
+        self.after: dict[int, MapSketch] = {}  # by frame
+        MappingHere.made = self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe, stamps_ns: list[int]) -> None:
+        """One more keyframe."""
+        self._map.add(frame, keyframe)
+        self.sketch = self.after[keyframe.number] = sketch_of(self._map)
+
+    def finish(self) -> None:
+        """Nothing waits."""
+
+    @property
+    def map_from_body(self) -> Array:
+        """(K, 4, 4) of the keyframes."""
+        return self._map.map_from_body
+
+
+@contextmanager
+def played(
+    recording: Path, frames: str = "::", speed: float = 1.0, use: SensorSet | None = None
+) -> Iterator[RecordedDrive]:
+    """A recording, or the sensors `use` of it, as a drive."""
+    with RecordingOptions(frames, use=use).open(recording) as (opened, indices):
+        yield RecordedDrive(recording, opened, indices, frames, speed)
+
+
+def write_rgbd(path: Path, sample: Sample, *, has_depth: bool = True) -> Path:
+    """A ride through the box room as its left camera and a depth camera see it; has_depth: False for one that measures nothing."""
+    rig = calibration(has_imu=False)
+    with McapRecordingWriter(path, replace(rig, cameras=rig.cameras[:1])) as writer:
+        for stamp_ns, left, map_from_body in zip(
+            sample.stamps_ns.tolist(), sample.left, sample.world_from_body, strict=True
+        ):
+            depth_m = depth_of(map_from_body) * np.float32(has_depth)
+            writer.write_frame(CameraFrame(stamp_ns, left, None, depth_m))
+    return path
+
+
+def depth_of(map_from_body: Array) -> Image:
+    """(H, W) metres along the left camera's axis, 0 beyond its reach."""
+    map_from_cam = map_from_body @ BODY_FROM_CAM0
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+    points = points_seen(map_from_cam, np.column_stack([u.ravel(), v.ravel()]))
+    depth = ((points - map_from_cam[:3, 3]) @ map_from_cam[:3, 2]).reshape(HEIGHT, WIDTH)
+    return np.where(depth < _FURTHEST_M, depth, 0.0).astype(np.float32)
