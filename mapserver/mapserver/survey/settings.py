@@ -165,7 +165,8 @@ class SurveySettings(Section, frozen=True):
     monocular: SingleCameraSettings = SingleCameraSettings()
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
-    rough_bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-3)
+    # Outliers go on creeping for long: they are cut after a few steps, and the rest converges without them.
+    rough_bundle: BundleSettings = BundleSettings(max_iterations=8, relative_cost_tolerance=1e-3)
     final_bundle: BundleSettings = BundleSettings(
         max_iterations=20, relative_cost_tolerance=1e-4, huber_sigmas=0.7, cutoff_sigmas=2.5
     )
