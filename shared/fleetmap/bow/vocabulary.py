@@ -48,6 +48,11 @@ class Vocabulary:
             packed(descriptors), self.centres, self.first_child, self.child_count, word_of_node
         )
 
+    def branches(self, descriptors: Descriptors) -> NDArray[np.int32]:
+        """(N, 2) the two children of the root that are nearest to each descriptor (N, 32), by their number; 0 without children."""
+        children = self.centres[1 : 1 + int(self.child_count[0])]
+        return vocabulary_kernels.two_nearest(packed(descriptors), children)
+
     def bow_vector(self, words: WordIds) -> BowVector:
         """The tf-idf vector of a place's words (N,), L1-normalised. Source: Galvez-Lopez and Tardos 2012 (DBoW2)."""
         word_ids, counts = np.unique(words, return_counts=True)

@@ -32,6 +32,23 @@ def descend(
 
 
 @kernel
+def two_nearest(packed: Packed, centres: Packed) -> NDArray[np.int32]:
+    """(N, 2) numbers of the nearest centre and the second nearest, the same twice for one centre, 0 for none. Ties: lower number."""
+    found = np.zeros((len(packed), 2), np.int32)
+    for i in range(len(packed)):
+        best, runner_up = FAR, FAR + 1
+        for c in range(len(centres)):
+            distance = hamming(packed, i, centres, c)
+            if distance < best:
+                best, runner_up = distance, best
+                found[i, 0], found[i, 1] = c, found[i, 0]
+            elif distance < runner_up:
+                runner_up = distance
+                found[i, 1] = c
+    return found
+
+
+@kernel
 def seed_centres(packed: Packed, members: Indices, branching: int, uniforms: Array) -> Packed:
     """Up to `branching` distinct members, spread out; fewer where there are fewer. Source: Arthur 2007 (k-means++)."""
     centres = np.empty((branching, 4), np.uint64)

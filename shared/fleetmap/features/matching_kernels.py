@@ -92,6 +92,51 @@ def mutual(a: Packed, b: Packed, max_distance: int, ratio: float) -> Indices:
 
 
 @kernel
+def mutual_within(
+    a: Packed, nodes_a: NDArray[np.int32], b: Packed, nodes_b: NDArray[np.int32], max_distance: int, ratio: float
+) -> Indices:
+    """As `mutual`, of rows of a with those of b whose node (B,) is one of their two (A, 2): of others it knows nothing."""
+    if len(a) == 0 or len(b) == 0:
+        return np.empty((0, 2), np.int64)
+    order = np.argsort(nodes_b, kind="mergesort")
+    starts = np.searchsorted(nodes_b[order], np.arange(max(nodes_a.max(), nodes_b.max()) + 2))
+    all_words, all_column_best = b[order].T.copy(), np.full(len(b), np.int64(FAR) << 32)
+    index, all_distances = np.full(len(a), -1, np.int64), np.empty(len(b), np.int64)
+    for i in range(len(a)):
+        a0, a1, a2, a3 = a[i, 0], a[i, 1], a[i, 2], a[i, 3]
+        best, runner_up, found = FAR, FAR, -1
+        for side in range(2 if nodes_a[i, 1] != nodes_a[i, 0] else 1):
+            first, last = starts[nodes_a[i, side]], starts[nodes_a[i, side] + 1]
+            words, distances = all_words[:, first:last], all_distances[first:last]
+            column_best = all_column_best[first:last]
+            for j in range(len(distances)):
+                distances[j] = (
+                    popcount64(a0 ^ words[0, j])
+                    + popcount64(a1 ^ words[1, j])
+                    + popcount64(a2 ^ words[2, j])
+                    + popcount64(a3 ^ words[3, j])
+                )
+            for j in range(len(distances)):
+                column_best[j] = min(column_best[j], (distances[j] << 32) + i)
+            for j in range(len(distances)):
+                distance = distances[j]
+                if distance < runner_up:
+                    if distance < best:
+                        runner_up = best
+                        best, found = distance, first + j
+                    else:
+                        runner_up = distance
+        if best <= max_distance and best < ratio * runner_up:
+            index[i] = found
+    pairs, count = np.empty((len(a), 2), np.int64), 0
+    for i in range(len(a)):
+        if index[i] >= 0 and all_column_best[index[i]] & 0xFFFFFFFF == i:
+            pairs[count, 0], pairs[count, 1] = i, order[index[i]]
+            count += 1
+    return pairs[:count].copy()
+
+
+@kernel
 def grid_cells(pixels: Array) -> tuple[Array, Indices, Indices, Indices]:
     """Pixels (N, 2) sorted into square cells; those that are not finite are left out.
 

@@ -47,6 +47,15 @@ def test_words_are_those_of_the_walk_down_the_tree() -> None:
     assert 16 < vocabulary.word_count <= 4**3
 
 
+def test_branches_are_the_two_nearest_children_of_the_root() -> None:
+    vocabulary, descriptors, _ = _trained()
+    centres = vocabulary.centres[1 : 1 + vocabulary.child_count[0]].view(np.uint8).reshape(-1, 32)
+    distances = np.unpackbits(descriptors[:, None] ^ centres[None], axis=2).sum(2)
+    np.testing.assert_array_equal(vocabulary.branches(descriptors), np.argsort(distances, axis=1, kind="stable")[:, :2])
+    single = train_vocabulary(np.zeros((0, 32), np.uint8), 4, 3, np.random.default_rng(0))
+    assert (single.branches(descriptors) == 0).all()
+
+
 def test_centres_above_the_leaves_are_majorities_of_what_lies_below() -> None:
     """Well separated clusters, as many as the branching: each child is the bit-wise median of one of them."""
     rng = np.random.default_rng(5)

@@ -70,6 +70,25 @@ def test_mutual_is_brute_force(max_distance: int, ratio: float) -> None:
     np.testing.assert_array_equal(match_mutual(a, b, max_distance, ratio), wanted)
 
 
+@pytest.mark.parametrize(("max_distance", "ratio", "count"), [(256, 0.99, 4), (64, 0.8, 3), (64, 0.8, 1)])
+def test_mutual_within_nodes_is_brute_force_over_what_shares_one(max_distance: int, ratio: float, count: int) -> None:
+    rng = np.random.default_rng(count)
+    a, b = _family(rng, 70)
+    nodes_a, nodes_b = (rng.integers(0, count, shape).astype(np.int32) for shape in ((len(a), 2), len(b)))
+    table = _distances(a, b)
+    table[~(nodes_a[:, :, None] == nodes_b).any(axis=1)] = FAR
+    wanted = []
+    for i in range(len(a)):
+        j = int(table[i].argmin())
+        if table[i, j] <= max_distance and table[i, j] < ratio * np.sort(table[i])[1] and table[:, j].argmin() == i:
+            wanted.append((i, j))
+    assert len(wanted) > 5
+    np.testing.assert_array_equal(match_mutual(a, b, max_distance, ratio, (nodes_a, nodes_b)), wanted)
+    nothing = np.zeros((0, 32), np.uint8)
+    assert match_mutual(nothing, b, 64, 0.8, (nodes_a[:0], nodes_b)).shape == (0, 2)
+    assert match_mutual(a, nothing, 64, 0.8, (nodes_a, nodes_b[:0])).shape == (0, 2)
+
+
 def _projection_twin(
     predicted: Array, radius: Array, a: np.ndarray, span: np.ndarray, pixels: Array, octaves: np.ndarray, b: np.ndarray,
     max_distance: int, ratio: float,

@@ -71,7 +71,8 @@ class MemoryImageStore:
 class Keyframe:
     """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
 
-    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own.
+    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own. nodes (N, 2): the
+    vocabulary's branches that are nearest to each feature; None where all descriptors are compared.
     """
 
     frame_index: int
@@ -82,6 +83,7 @@ class Keyframe:
     images: ImageStore
     image_number: int
     from_views: bool = False
+    nodes: NDArray[np.int32] | None = None
 
     @property
     def pictures(self) -> Pictures:

@@ -132,7 +132,8 @@ class LoopCloser:
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        self._bare.update(enumerate(map(without_pictures, new), len(self._bare)))
+        bare = [replace(without_pictures(k), nodes=vocabulary.branches(k.features.descriptors)) for k in new]
+        self._bare.update(enumerate(bare, len(self._bare)))
         self._depths_m = np.append(self._depths_m, [median_depth_m(keyframe) for keyframe in new])
 
     @property

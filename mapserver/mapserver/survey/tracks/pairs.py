@@ -130,7 +130,9 @@ def _from_descriptors(
 ) -> PnpResult | None:
     camera, settings = inputs.camera, inputs.settings
     known = np.flatnonzero(np.isfinite(a.disparities[:, 0]))
-    pairs = match_mutual(a.features.descriptors[known], b.features.descriptors, settings.max_distance, settings.ratio)
+    nodes = None if a.nodes is None or b.nodes is None else (a.nodes[known], b.nodes[:, 0])
+    descriptors = a.features.descriptors[known], b.features.descriptors
+    pairs = match_mutual(*descriptors, settings.max_distance, settings.ratio, nodes)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
     matches = _correspondences(a, b, inputs, np.column_stack([index_a, index_b]))
     least = settings.min_inliers
