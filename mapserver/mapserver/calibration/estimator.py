@@ -40,6 +40,10 @@ from mapserver.calibration.schur_kernels import (
 _ROUNDS = 5  # in each the sizes of the errors are estimated anew, and the samples integrated at the new biases
 _MAX_STEPS = 12
 _TOLERANCE = 1e-5
+_ROUGH_TOLERANCE = 1e-2  # where the sizes of the errors are not known yet
+_SLOPE_ROUNDS = (
+    2  # in which the lenses' derivatives are taken: at the given calibration, and near the one that is found
+)
 _DRAWS = 2  # of random errors, for what residuals of each kind should be
 _FIRST_SIGMAS = np.array([0.1] * 3 + [3.0] * 3)  # holds what nothing observes: heading and place of the first keyframe
 _BIAS_SIGMAS = np.repeat([10.0, 0.1, 0.5], 3)  # of the first keyframe: velocity m/s, gyro rad/s, accelerometer m/s^2
@@ -96,14 +100,16 @@ def adjust(data: CalibrationData) -> Adjusted:
     scales = problem.first_scales(theta, state)
     information, sigmas = np.diag(problem.prior), (np.inf, np.inf)
     for round_number in range(_ROUNDS):
+        last = round_number + 1 == _ROUNDS
+        if round_number < _SLOPE_ROUNDS:
+            problem.slopes = problem.seen.measured_slopes(theta)
         problem.prepare(state, theta, scales)
-        theta, state = problem.descend(theta, state)
+        theta, state = problem.descend(theta, state, _TOLERANCE if last else _ROUGH_TOLERANCE)
         system = problem.system(theta, state)
-        information = problem.calibration_information(system)
-        if round_number + 1 < _ROUNDS:
-            scales = problem.measured_scales(system)
+        if last:
+            information, sigmas = problem.calibration_information(system), problem.scale_sigmas(system)
         else:
-            sigmas = problem.scale_sigmas(system)
+            scales = problem.measured_scales(system)
     seen = int(np.isfinite(problem.seen.row_sigmas[:, 0]).sum())
     own = len(COLUMNS)
     lens = np.linalg.solve(information[own:, own:], information[own:, :own])
@@ -128,6 +134,7 @@ class _Problem:
         marks = len(data.start.points_map)
         self.starts = np.searchsorted(data.obs_landmark, np.arange(marks + 1))
         self.keyframes = data.obs_keyframe.astype(np.int64)
+        self.slopes = np.zeros((len(data.obs_keyframe), 4, UNKNOWNS))  # of what is measured, by the calibration
 
     def prepare(self, state: MotionState, theta: Array, scales: ErrorScales) -> None:
         """Integrates the samples and takes over the scales."""
@@ -139,7 +146,6 @@ class _Problem:
             self.inertial = inertial_edges(self.data, state, offset_s, scales.noise(given))
         self.wheels: list[WheelEdge] = wheel_edges(self.data, state, offset_s)
         self.rates_map = body_rates(self.data, state, offset_s)
-        self.slopes = self.seen.measured_slopes(theta)
 
     def _at_exposure(self, theta: Array, state: MotionState) -> MotionState:
         """The body when the images were taken: the states are those at the offset for which the samples were integrated."""
@@ -231,7 +237,7 @@ class _Problem:
         factor, lower = scipy.linalg.cho_factor(info, lower=False, overwrite_a=True, check_finite=False)
         return np.asarray(factor), bool(lower)
 
-    def descend(self, theta: Array, state: MotionState) -> tuple[Array, MotionState]:
+    def descend(self, theta: Array, state: MotionState, tolerance: float) -> tuple[Array, MotionState]:
         """The optimum near theta and `state`, by Levenberg-Marquardt."""
         cost, damping = self.cost(theta, state), 1e-6
         for _ in range(_MAX_STEPS):
@@ -252,7 +258,7 @@ class _Problem:
                 break
             theta, state = moved
             damping = max(damping * 0.1, 1e-9)
-            if gained < _TOLERANCE * cost:
+            if gained < tolerance * cost:
                 break
         return theta, state
 
