@@ -170,10 +170,13 @@ def _adjust_globally(
         if search:
             tracks = tracks_of(_match_all(state, finder, settings, tools))
             redundant = redundant_keyframes(tracks, odometry.keyframes, settings)
-            landmarks = build_landmarks(posed, tracks, settings, tools.executor, redundant)
+            landmarks, observed_from = (
+                build_landmarks(posed, tracks, settings, tools.executor, redundant),
+                posed.map_from_cam,
+            )
             del tracks
         else:  # a second search finds hardly a match more; its coordinates are finer
-            landmarks = refine_observations(posed, state.landmarks, settings, tools.executor)
+            landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
         state = replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))
         del landmarks
         tools.release()

@@ -17,6 +17,9 @@ from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
 from mapserver.survey.tracks.tracks_kernels import join as join_kernel
 
+_SAME_WARP = (
+    0.01  # change of a patch's shape that moves its rim by less than a twentieth of a pixel, to all sides alike
+)
 _BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
 
 
@@ -119,12 +122,36 @@ def build_landmarks(
 
 
 def refine_observations(
-    posed: PosedKeyframes, marks: Landmarks, settings: SurveySettings, executor: Executor = SERIAL
+    posed: PosedKeyframes, marks: Landmarks, settings: SurveySettings, executor: Executor, before: Array
 ) -> Landmarks:
-    """The same landmarks with refined coordinates: better poses warp the patches better."""
+    """The same landmarks with refined coordinates where better poses warp the patches better.
+
+    before: map_from_cam (K, 4, 4) at which they were observed.
+    """
     table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
-    pixels, sigmas = _observe(posed, table, marks.points_map, settings, executor)
+    turned, scaled = (
+        now - then
+        for now, then in zip(
+            _warps(table, marks.points_map, posed.map_from_cam), _warps(table, marks.points_map, before), strict=True
+        )
+    )
+    anew = np.zeros(len(marks.points_map), bool)
+    anew[table[np.abs(turned).max(axis=(1, 2)) + np.abs(scaled) > _SAME_WARP, 1]] = True
+    rows = np.flatnonzero(anew[table[:, 1]])
+    pixels, sigmas = marks.obs_pixels.copy(), marks.obs_sigma_px.copy()
+    if len(rows):
+        pixels[rows], sigmas[rows] = _observe(posed, table[rows], marks.points_map, settings, executor)
     return replace(marks, obs_pixels=pixels, obs_sigma_px=sigmas)
+
+
+def _warps(table: NDArray[np.int64], points_map: Array, map_from_cam: Array) -> tuple[Array, Array]:
+    """Rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of how much farther it is than from there."""
+    own, cam_from_map = table[:, 0], se3_inverse(map_from_cam)
+    reference = own[np.maximum.accumulate(np.where(_is_first(table), np.arange(len(table)), 0))]
+    points = points_map[table[:, 1]]
+    depths = [np.einsum("mi,mi->m", cam_from_map[k, 2, :3], points) + cam_from_map[k, 2, 3] for k in (own, reference)]
+    scale = np.log(np.maximum(depths[0], 1e-6) / np.maximum(depths[1], 1e-6))
+    return np.asarray(cam_from_map[own, :3, :3] @ map_from_cam[reference, :3, :3]), np.asarray(scale)
 
 
 def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -1,17 +1,19 @@
 """Landmarks from pairs: joined as a brute-force twin joins them, observed to a fraction of a pixel."""
 
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import Rectifier
+from mapserver.survey.executor import SERIAL
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
-from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, tracks_of
+from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, refine_observations, tracks_of
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, points_seen, stereo_pair
 
@@ -168,6 +170,22 @@ def test_sigmas_tell_refined_observations_from_others() -> None:
     assert np.median(np.abs(normal)) < 0.7
     assert (np.abs(normal) < 4).mean() > 0.97
     assert (marks.obs_sigma_px > 0).all()
+
+
+def test_only_what_better_poses_warp_otherwise_is_observed_anew() -> None:
+    """Coordinates are spoiled: those of landmarks that the turned keyframe sees are found again, the others are not touched."""
+    keyframes, map_from_body, rectifier, marks = views()
+    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    spoiled = replace(marks, obs_pixels=marks.obs_pixels + 5.0)
+    same = refine_observations(posed, spoiled, SurveySettings(), SERIAL, posed.map_from_cam)
+    np.testing.assert_array_equal(same.obs_pixels, spoiled.obs_pixels)
+    before = posed.map_from_cam.copy()
+    before[3, :3, :3] = before[3, :3, :3] @ so3_exp(np.array([0.0, 0.05, 0.0]))
+    found = refine_observations(posed, spoiled, SurveySettings(), SERIAL, before)
+    anew = np.isin(marks.obs_landmark, marks.obs_landmark[marks.obs_keyframe == 3])
+    assert 0.1 < anew.mean() < 0.99
+    np.testing.assert_allclose(found.obs_pixels[anew], marks.obs_pixels[anew], atol=1e-9)
+    np.testing.assert_array_equal(found.obs_pixels[~anew], spoiled.obs_pixels[~anew])
 
 
 def test_spare_keyframes_observe_and_define_nothing() -> None:
