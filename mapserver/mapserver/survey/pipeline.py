@@ -44,7 +44,15 @@ from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.matching import PairFinder, fixed_allowance_m
 from mapserver.survey.tracks.mono_depths import MonoDepths
 from mapserver.survey.tracks.pairs import PairMatch
-from mapserver.survey.tracks.tracks import build_landmarks, no_landmarks, refine_observations, tracks_of
+from mapserver.survey.tracks.tracks import (
+    Tracks,
+    build_landmarks,
+    no_landmarks,
+    refine_observations,
+    tracks_of,
+)
+
+_Known = tuple[set[tuple[int, int]], Tracks | None]
 
 
 @dataclass(frozen=True)
@@ -91,10 +99,12 @@ def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTool
     settings = options.settings
     odometry, depths = chain.odometry, chain.depths
     state, loops = _close_loops(odometry, chain.state, chain.matched, options, tools)
+    # Neighbours need not be matched again. Of one camera they are, as depths by which they were matched have changed.
+    known: _Known = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
     # The landmarks so far are those of neighbours; all are made anew, and nobody may hold the old ones meanwhile.
     del chain
     state = replace(state, landmarks=no_landmarks())
-    odometry, state, stereo_yaw = _adjust_globally(odometry, state, depths, settings, tools)
+    odometry, state, stereo_yaw = _adjust_globally(odometry, state, known, depths, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array([k.frame_index for k in odometry.keyframes], np.int64)
     components = find_components(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
@@ -107,8 +117,12 @@ def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTool
     return Survey(survey_map, options.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
 
 
-def _match_all(state: SurveyState, finder: PairFinder, settings: SurveySettings, tools: SurveyTools) -> list[PairMatch]:
-    candidates = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
+def _match_all(
+    state: SurveyState, finder: PairFinder, matched: set[tuple[int, int]], settings: SurveySettings, tools: SurveyTools
+) -> list[PairMatch]:
+    """The matches of all pairs that should see the same now, but for those that were matched before."""
+    every = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
+    candidates = [pair for pair in every if pair not in matched]
     allowed_m, report = fixed_allowance_m(state.map_from_body), progress_of(tools, "matching again", len(candidates))
     sigma_rad = ADJUSTED_SIGMA_RAD
     return finder.match(candidates, state.map_from_body, allowed_m, rotation_sigma_rad=sigma_rad, progress=report)
@@ -155,9 +169,17 @@ def _at(state: SurveyState, map_from_body: Array) -> SurveyState:
 
 
 def _adjust_globally(
-    odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None, settings: SurveySettings, tools: SurveyTools
+    odometry: OdometryPass,
+    state: SurveyState,
+    known: _Known,
+    depths: MonoDepths | None,
+    settings: SurveySettings,
+    tools: SurveyTools,
 ) -> tuple[OdometryPass, SurveyState, StereoYaw]:
-    """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error."""
+    """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error.
+
+    known: pairs that need not be matched, and what they have joined.
+    """
     yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
     finder = pair_finder(odometry, state, settings, tools)
     for round_number in range(2):
@@ -168,7 +190,7 @@ def _adjust_globally(
             finder = pair_finder(odometry, state, settings, tools)
         posed = posed_keyframes(odometry, state)
         if search:
-            tracks = tracks_of(_match_all(state, finder, settings, tools))
+            tracks = tracks_of(_match_all(state, finder, known[0], settings, tools), known[1])
             redundant = redundant_keyframes(tracks, odometry.keyframes, settings)
             landmarks, observed_from = (
                 build_landmarks(posed, tracks, settings, tools.executor, redundant),

@@ -71,22 +71,32 @@ class Tracks:
     features: NDArray[np.int64]
     starts: NDArray[np.int64]
 
+    @classmethod
+    def of(cls, marks: Landmarks) -> "Tracks":
+        """The observations of landmarks, each one's reference first."""
+        starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
+        return cls(marks.obs_keyframe.astype(np.int64), marks.obs_feature, starts)
 
-def tracks_of(pairs: list[PairMatch]) -> Tracks:
+
+def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     """Groups of features that pairs connect, no keyframe twice in a group; pairs with most matches are joined first.
 
+    known: what belongs together before any pair is asked.
     Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
     """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
-    if not ordered:
-        nothing = np.zeros(0, np.int64)
-        return Tracks(nothing, nothing, nothing)
+    known = Tracks.of(no_landmarks()) if known is None else known
+    if not ordered and not len(known.starts):
+        return known
     # Keyframes have far fewer features than pairs have matches: any feature is a node, and links stay small.
-    stride = 1 + max(int(p.features.max(initial=0)) for p in ordered)
-    owners = np.arange(1 + max(p.j for p in ordered), dtype=np.int32).repeat(stride)
-    first = np.concatenate([(p.i * stride + p.features[:, 0]).astype(np.int32) for p in ordered])
-    second = np.concatenate([(p.j * stride + p.features[:, 1]).astype(np.int32) for p in ordered])
-    roots = join_kernel(first, second, owners)
+    stride = 1 + max([int(known.features.max(initial=0)), *(int(p.features.max(initial=0)) for p in ordered)])
+    count = 1 + max([int(known.keyframes.max(initial=0)), *(p.j for p in ordered)])
+    linked = (known.keyframes * stride + known.features).astype(np.int32)
+    follows = np.setdiff1d(np.arange(len(linked)), known.starts, assume_unique=True)
+    first = [linked[follows - 1], *((p.i * stride + p.features[:, 0]).astype(np.int32) for p in ordered)]
+    second = [linked[follows], *((p.j * stride + p.features[:, 1]).astype(np.int32) for p in ordered)]
+    owners = np.arange(count, dtype=np.int32).repeat(stride)
+    roots = join_kernel(np.concatenate(first), np.concatenate(second), owners)
     shared = np.flatnonzero(np.bincount(roots, minlength=len(roots))[roots] > 1)
     nodes = shared[np.argsort(roots[shared], kind="stable")]
     starts = np.flatnonzero(np.diff(roots[nodes], prepend=-1))

@@ -38,9 +38,9 @@ def joined_by_hand(pairs: list[PairMatch]) -> list[list[Node]]:
     return sorted(sorted(g) for g in groups if len(g) > 1)
 
 
-def groups(pairs: list[PairMatch]) -> list[list[tuple[int, int]]]:
+def groups(pairs: list[PairMatch], known: Tracks | None = None) -> list[list[tuple[int, int]]]:
     """The tracks of some pairs, (keyframe, feature) of each member."""
-    found = tracks_of(pairs)
+    found = tracks_of(pairs, known)
     members = list(zip(found.keyframes.tolist(), found.features.tolist(), strict=True))
     return [members[start:end] for start, end in pairwise([*found.starts.tolist(), len(members)])]
 
@@ -69,6 +69,16 @@ def test_a_chain_of_matches_is_one_track_and_a_contradiction_is_left_out() -> No
     found = groups([pair(0, 2, [(9, 7)]), *strong])
     assert sorted(found) == [[(0, 1), (1, 5), (2, 7)], [(0, 2), (1, 6), (2, 8)]]
     assert groups([]) == []
+
+
+def test_what_is_known_comes_first_and_pairs_go_on_from_it() -> None:
+    """Known are 0:1-1:5-2:7 and 0:3-2:4: a pair adds keyframe 3 to one, and cannot join them, as keyframe 2 has both."""
+    known = Tracks(np.array([0, 1, 2, 0, 2]), np.array([1, 5, 7, 3, 4]), np.array([0, 3]))
+    found = groups([pair(2, 3, [(7, 8)]), pair(1, 2, [(5, 4), (9, 2)])], known)
+    assert sorted(found) == [[(0, 1), (1, 5), (2, 7), (3, 8)], [(0, 3), (2, 4)], [(1, 9), (2, 2)]]
+    assert sorted(groups([], known)) == [[(0, 1), (1, 5), (2, 7)], [(0, 3), (2, 4)]]
+    again = tracks_of([], Tracks.of(views()[3]))
+    assert len(again.starts) == len(views()[3].points_map)
 
 
 def test_the_order_of_pairs_does_not_matter() -> None:
