@@ -32,12 +32,13 @@ def _interpolated(stamp_ns: int, stamps_ns: Stamps, values: Array, out: Array) -
 def _between(x: float, at: Array, values: Array, out: Array) -> None:
     """Row of values (N, 3) at x, linear between at (N,), the nearest row beyond them. To the bit as np.interp."""
     after = int(np.searchsorted(at, x, side="right"))
-    if after in (0, len(at)) or at[after - 1] == x:
-        out[:] = values[max(after - 1, 0)]
-        return
+    is_held = after in (0, len(at)) or at[after - 1] == x
+    before = max(after - 1, 0)
     for a in range(3):
-        slope = (values[after, a] - values[after - 1, a]) / (at[after] - at[after - 1])
-        out[a] = slope * (x - at[after - 1]) + values[after - 1, a]
+        out[a] = values[before, a]
+        if not is_held:
+            slope = (values[after, a] - values[before, a]) / (at[after] - at[before])
+            out[a] = slope * (x - at[before]) + values[before, a]
 
 
 @kernel

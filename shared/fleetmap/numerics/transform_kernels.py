@@ -50,26 +50,45 @@ def turned(rotation: Array, vector: Array) -> Array:
 @kernel
 def skewed(v: Array) -> Array:
     """As `geometry.skew`."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    out = np.zeros((3, 3))
+    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
+    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
+    return out
 
 
 @kernel
 def rotation_of(rotvec: Array) -> Array:
     """As `geometry.so3_exp`."""
     angle = math.sqrt(rotvec[0] * rotvec[0] + rotvec[1] * rotvec[1] + rotvec[2] * rotvec[2])
-    cross = skewed(rotvec)
-    if angle < 1e-6:
-        return np.eye(3) + cross + product(0.5 * cross, cross)
-    return (
-        np.eye(3) + math.sin(angle) / angle * cross + product((1.0 - math.cos(angle)) / (angle * angle) * cross, cross)
-    )
+    cross, scaled = skewed(rotvec), np.empty((3, 3))
+    linear, square = 1.0, 0.5
+    if angle >= 1e-6:
+        linear, square = math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)
+    for i in range(3):
+        for j in range(3):
+            scaled[i, j] = square * cross[i, j]
+    out = product(scaled, cross)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = ((1.0 if i == j else 0.0) + linear * cross[i, j]) + out[i, j]
+    return out
+
+
+@kernel
+def copy_into(out: Array, values: Array) -> None:
+    """Fills out (n, m) with values (n, m); assigned as slices, they would take a hundred times the memory of this loop."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            out[i, j] = values[i, j]
 
 
 @kernel
 def transform_of(rotation: Array, position: Array) -> Array:
     """As `geometry.se3`."""
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation, position
+    copy_into(out, rotation)
+    for a in range(3):
+        out[a, 3] = position[a]
     return out
 
 
@@ -87,9 +106,12 @@ def inverse(rotation: Array, position: Array) -> Array:
 @kernel
 def adjoint(target_from_source: Array) -> Array:
     """As `geometry.se3_adjoint`."""
-    rotation, out = target_from_source[:3, :3].copy(), np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = rotation
-    out[3:, :3] = product(skewed(target_from_source[:3, 3]), rotation)
+    rotation, out = target_from_source[:3, :3], np.zeros((6, 6))
+    lower = product(skewed(target_from_source[:3, 3]), rotation)
+    for a in range(3):
+        for b in range(3):
+            out[a, b] = out[3 + a, 3 + b] = rotation[a, b]
+            out[3 + a, b] = lower[a, b]
     return out
 
 
@@ -112,5 +134,7 @@ def angle_between_rad(first: Array, second: Array) -> float:
 @kernel
 def distance_between(first: Array, second: Array) -> float:
     """Length of the translation of first @ inverse of second, both (4, 4)."""
-    off = first[:3, 3] - turned(product(first[:3, :3], second[:3, :3].T), second[:3, 3])
+    off = turned(product(first[:3, :3], second[:3, :3].T), second[:3, 3])
+    for a in range(3):
+        off[a] = first[a, 3] - off[a]
     return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])

@@ -34,10 +34,12 @@ def transition(covariance: Array, first: int, state_to_state: Array, noise: Arra
 @kernel
 def forget(covariance: Array, kept: float, added: Array) -> None:
     """Scales the first K errors by what is kept of them, and adds variances (K,); in place."""
-    count = len(added)
-    covariance[:count] *= kept
-    covariance[:, :count] *= kept
-    for k in range(count):
+    for k in range(len(added)):
+        for j in range(len(covariance)):
+            covariance[k, j] *= kept
+    for k in range(len(added)):
+        for j in range(len(covariance)):
+            covariance[j, k] *= kept
         covariance[k, k] += added[k]
 
 
@@ -49,7 +51,9 @@ def with_clone(covariance: Array, first: int, offset: int, by_offset: Array) -> 
     """
     size = len(covariance)
     grown = np.empty((size + 6, size + 6))
-    grown[:size, :size] = covariance
+    for a in range(size):
+        for b in range(size):
+            grown[a, b] = covariance[a, b]
     for a in range(6):
         own, shared, factor = covariance[first + a + (3 if a > 2 else 0)], covariance[offset], by_offset[a]
         for j in range(size):
@@ -66,8 +70,12 @@ def without_errors(covariance: Array, at: int) -> Array:
     """The covariance less the six errors that begin there."""
     size = len(covariance) - 6
     kept = np.empty((size, size))
-    kept[:at, :at], kept[:at, at:] = covariance[:at, :at], covariance[:at, at + 6 :]
-    kept[at:, :at], kept[at:, at:] = covariance[at + 6 :, :at], covariance[at + 6 :, at + 6 :]
+    for a in range(size):
+        row, old = kept[a], covariance[a if a < at else a + 6]
+        for b in range(at):
+            row[b] = old[b]
+        for b in range(at, size):
+            row[b] = old[b + 6]
     return kept
 
 

@@ -10,6 +10,7 @@ from fleetmap.numerics.kernel import kernel
 from fleetmap.numerics.linear_kernels import exp_so3, matmul, rotate
 from fleetmap.numerics.transform_kernels import (
     adjoint,
+    copy_into,
     earlier_from_later,
     inverse,
     product,
@@ -53,10 +54,11 @@ def turn_clones(rotations: Array, positions: Array, errors: Array) -> None:
 def apply_error(state: State, rotations: Array, positions: Array, error: Array) -> None:
     """Corrects state and clones in place by an error (16 + 6 M,): state, time offset, clones."""
     turn = rotation_of(error[0:3])
-    state.rotation[:] = product(turn, state.rotation)
-    state.velocity[:] = turned(turn, state.velocity) + error[3:6]
-    state.position[:] = turned(turn, state.position) + error[6:9]
+    velocity, position = turned(turn, state.velocity), turned(turn, state.position)
+    copy_into(state.rotation, product(turn, state.rotation))
     for a in range(3):
+        state.velocity[a] = velocity[a] + error[3 + a]
+        state.position[a] = position[a] + error[6 + a]
         state.gyro_bias[a] += error[9 + a]
         state.accel_bias[a] += error[12 + a]
     turn_clones(rotations, positions, error[16:])
@@ -78,10 +80,15 @@ def add_clone(window: Window, state: State, rate_body: Array, considered: int, o
     """The window with the state's body as its newest clone; rate_body (3,) ties it to the time offset, error number `offset`."""
     count = len(window.positions)
     rotations, positions = np.empty((count + 1, 3, 3)), np.empty((count + 1, 3))
-    rotations[:count], positions[:count] = window.rotations, window.positions
-    rotations[count], positions[count] = state.rotation, state.position
+    for m in range(count):
+        copy_into(rotations[m], window.rotations[m])
+    copy_into(positions, window.positions)
+    copy_into(rotations[count], state.rotation)
     turn, by_offset = turned(state.rotation, rate_body), np.empty(6)
-    by_offset[:3], by_offset[3:] = turn, state.velocity + turned(skewed(state.position), turn)
+    moved = turned(skewed(state.position), turn)
+    for a in range(3):
+        positions[count, a] = state.position[a]
+        by_offset[a], by_offset[3 + a] = turn[a], state.velocity[a] + moved[a]
     covariance = with_clone(window.covariance, 0, offset, by_offset)
     true_error_cov = with_clone(window.true_error_cov, considered, considered + offset, by_offset)
     return Window(rotations, positions, covariance, true_error_cov)
@@ -92,8 +99,11 @@ def drop_clone(window: Window, index: int, considered: int, clones: int) -> Wind
     """The window without a clone; the first one's errors begin at number `clones`."""
     count, at = len(window.positions) - 1, clones + 6 * index
     rotations, positions = np.empty((count, 3, 3)), np.empty((count, 3))
-    rotations[:index], positions[:index] = window.rotations[:index], window.positions[:index]
-    rotations[index:], positions[index:] = window.rotations[index + 1 :], window.positions[index + 1 :]
+    for m in range(count):
+        old = m if m < index else m + 1
+        copy_into(rotations[m], window.rotations[old])
+        for a in range(3):
+            positions[m, a] = window.positions[old, a]
     covariance, true_error_cov = window.covariance, window.true_error_cov
     return Window(rotations, positions, without_errors(covariance, at), without_errors(true_error_cov, considered + at))
 
@@ -113,9 +123,11 @@ def cam_from_earlier(
 def body_covariance(position: Array, true_error_cov: Array, considered: int) -> Array:
     """(6, 6) of rotation and position of the state, from that of its errors, which begin at number `considered`."""
     jacobian = np.zeros((6, 9))
-    jacobian[3:6, 0:3] = -skewed(position)
+    lever = skewed(position)
     for a in range(3):
         jacobian[a, a] = jacobian[3 + a, 6 + a] = 1.0
+        for b in range(3):
+            jacobian[3 + a, b] = -lever[a, b]
     own = true_error_cov[considered : considered + 9, considered : considered + 9]
     return product(product(jacobian, own), jacobian.T)
 
@@ -145,16 +157,20 @@ def wheel_rows(
     by_considered: Array,
 ) -> Array:
     """Residual (4,) of `measurements.wheel_odometry`; fills jacobian (4, 15) and by_considered (4, 4), zero before."""
-    turn = base_from_body[:3, :3].copy()
+    turn, rate = np.empty((3, 3)), np.empty(3)
+    copy_into(turn, base_from_body[:3, :3])
+    for a in range(3):
+        rate[a] = gyro[a] - state.gyro_bias[a]
     base_body = inverse(turn, base_from_body[:3, 3])[:3, 3]
-    rate = gyro - state.gyro_bias
     base_from_odom, turning = product(turn, state.rotation.T), turned(turn, rate)
-    velocity = turned(base_from_odom, state.velocity) + turned(turn, turned(skewed(rate), base_body))
+    driven, swung = turned(base_from_odom, state.velocity), turned(turn, turned(skewed(rate), base_body))
     # R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
-    jacobian[:3, 3:6] = base_from_odom
-    jacobian[:3, 9:12] = product(turn, skewed(base_body))
-    jacobian[3, 9:12] = -turn[2]
-    by_considered[0, 2], by_considered[3, 3] = velocity[0], turning[2]
+    copy_into(jacobian[:3, 3:6], base_from_odom)
+    copy_into(jacobian[:3, 9:12], product(turn, skewed(base_body)))
     residual = np.empty(4)
-    residual[:3], residual[3] = velocity_base - velocity, yaw_rate - turning[2]
+    for a in range(3):
+        jacobian[3, 9 + a] = -turn[2, a]
+        residual[a] = velocity_base[a] - (driven[a] + swung[a])
+    by_considered[0, 2], by_considered[3, 3] = driven[0] + swung[0], turning[2]
+    residual[3] = yaw_rate - turning[2]
     return residual

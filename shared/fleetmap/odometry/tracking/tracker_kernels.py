@@ -53,29 +53,38 @@ def motion_of(
     -1 agree where they determine none, or are fewer than `least`. cam_from_previous (4, 4) goes from a guess to the motion;
     information (6, 6) and squared (N,), of the points with depth, are filled as by `refine_twice`.
     """
-    usable = kept.copy()
+    count, rows = 0, np.empty(len(kept), np.int64)
     for n in range(len(kept)):
-        for a in range(3):
-            if not math.isfinite(points_cam[n, a]):
-                usable[n] = False
-    count = int(usable.sum())
+        known = math.isfinite(points_cam[n, 0]) and math.isfinite(points_cam[n, 1]) and math.isfinite(points_cam[n, 2])
+        if kept[n] and known:
+            rows[count] = n
+            count += 1
     if count < least:
         return count, -1
-    measured, at = np.full((count, 3), np.nan), 0
-    for n in range(len(kept)):
-        if usable[n]:
-            measured[at, 0], measured[at, 1] = flowed[n, 0], flowed[n, 1]
-            at += 1
+    points, measured = np.empty((count, 3)), np.full((count, 3), np.nan)
+    for k in range(count):
+        measured[k, 0], measured[k, 1] = flowed[rows[k], 0], flowed[rows[k], 1]
+        for a in range(3):
+            points[k, a] = points_cam[rows[k], a]
     width, gate_squared, iterations = refinement
-    rotation, translation = cam_from_previous[:3, :3].copy(), cam_from_previous[:3, 3].copy()
-    matches = points_cam[usable], measured, np.ones((count, 2))
+    rotation, translation = np.empty((3, 3)), np.empty(3)
+    for a in range(3):
+        translation[a] = cam_from_previous[a, 3]
+        for b in range(3):
+            rotation[a, b] = cam_from_previous[a, b]
     if not refine_twice(
-        rotation, translation, matches[0], matches[1], matches[2], camera, width, gate_squared, np.zeros((6, 6)),
+        rotation, translation, points, measured, np.ones((count, 2)), camera, width, gate_squared, np.zeros((6, 6)),
         iterations, information, squared[:count],
     ):  # fmt: skip
         return count, -1
-    cam_from_previous[:3, :3], cam_from_previous[:3, 3] = rotation, translation
-    return count, int((squared[:count] < gate_squared).sum())
+    agree = 0
+    for k in range(count):
+        agree += squared[k] < gate_squared
+    for a in range(3):
+        cam_from_previous[a, 3] = translation[a]
+        for b in range(3):
+            cam_from_previous[a, b] = rotation[a, b]
+    return count, agree
 
 
 @kernel
