@@ -345,5 +345,5 @@ def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, 
         expect(trial).to_contain_text("Version 1 is tried by 5.0 % of the robots")
         releases.end_canary(store, canary, promote=False, outcome="it fails more often than the margin allows")
     expect(trial).to_contain_text("rolled back", timeout=10_000)
-    expect(trial).to_contain_text("it fails more often than the margin allows")
+    expect(trial).to_contain_text("It fails more often than the margin allows")
     assert seen.faults == []
