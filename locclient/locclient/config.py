@@ -8,7 +8,7 @@ import msgspec
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
-from fleetmap.sources.source import SourceSection
+from fleetmap.sensors.source_settings import SourceSection
 from locclient.daemon.output_section import OutputSection
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES

@@ -11,9 +11,8 @@ import msgspec
 
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, over, read_given, refuse_internal
-from fleetmap.recordings import Topics
 from fleetmap.sensors.samples import SensorSet
-from fleetmap.sources.source import SourceSection
+from fleetmap.sensors.source_settings import SourceSection, Topics
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings

@@ -93,7 +93,9 @@ def test_v101_survey(v101: tuple[Report, Path]) -> None:
 
 def test_v101_as_a_whole_refuses_no_revisit_of_its_own(tmp_path: Path) -> None:
     """A gate surer than the odometry refused two dozen that shared up to 209 points, after five seconds without a picture."""
-    report = built(real_data("euroc_v101_keyframes"), tmp_path)
+    to_store = ["--site", "s", "--store", tmp_path / "store", "--report", tmp_path / "b.json"]
+    run(mapserver_app, "build", real_data("euroc_v101_keyframes"), *to_store)
+    report = json.loads((tmp_path / "b.json").read_text())
     assert report["ate_rmse_m"] <= 0.02
     assert report["loops"]["accepted"] >= 100
     refused = [r for r in report["loop_records"] if r["verdict"] == "gated_out" and r["inliers"] >= 30]

@@ -16,7 +16,8 @@ from fleetmap.recordings.calibration_files import format_calibration, read_calib
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
-from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, Topics, named_topics
+from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, named_topics
+from fleetmap.sensors.source_settings import Topics
 
 __all__ = [
     "FILE_SUFFIXES",

@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.config import Section
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings.images import StoredFrame
 from fleetmap.sensors.calibration import RigCalibration
@@ -24,21 +23,7 @@ from fleetmap.sensors.samples import (
     Trajectory,
     WheelSample,
 )
-
-
-class Topics(Section, frozen=True):
-    """Topic names in MCAP files and ROS bags. An image topic also stands for itself with `/compressed` behind it."""
-
-    left: str = "/cam0/image_raw"
-    right: str = "/cam1/image_raw"
-    depth: str = "/depth/image_raw"
-    left_info: str = "/cam0/camera_info"
-    right_info: str = "/cam1/camera_info"
-    imu: str = "/imu0"
-    wheel: str = "/odom"
-    prior: str = "/prior"
-    ground_truth: str = "/ground_truth"
-    tf_static: str = "/tf_static"
+from fleetmap.sensors.source_settings import Topics
 
 
 def named_topics(words: Sequence[str] | None, others: Topics | None = None) -> Topics:

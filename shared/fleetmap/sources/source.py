@@ -3,38 +3,20 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import cv2
 
 from fleetmap.bus import ZenohBus
-from fleetmap.config import Section
 from fleetmap.errors import UsageError
 from fleetmap.recordings import OpenOptions, Topics, open_recording, read_calibration
 from fleetmap.recordings.ros2.graph import key_layout
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.playback import RecordingSource
 from fleetmap.sources.ros2 import Ros2Source
 from fleetmap.sources.uvc import UvcSource, VideoMode
-
-
-class SourceSection(Section, frozen=True):
-    """Kind of the sensor source, and its options; a kind ignores those of others. sensors: of topics, with the IMU if the rig has one."""
-
-    kind: str = "ros2"
-    sensors: Literal["stereo", "rgbd", "mono"] = "stereo"
-    calibration: str | None = None
-    endpoint: str = "tcp/127.0.0.1:7447"
-    domain: int = 0
-    keys: str = "rmw_zenoh"
-    recording: str | None = None
-    speed: float = 1.0
-    device: str = "/dev/video0"
-    width_px: int = 1280
-    height_px: int = 480
-    rate_hz: float = 30.0
-    delay_s: float = 0.0
 
 
 class Source(Protocol):

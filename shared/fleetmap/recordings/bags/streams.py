@@ -21,9 +21,10 @@ from fleetmap.recordings.folders.image_files import hash_file
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
 from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, clean_imu, trajectory_of_rows, values_forward
-from fleetmap.recordings.recording import OpenOptions, Recording, Topics
+from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.source_settings import Topics
 
 V = TypeVar("V")
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.ordering import ReadLog
-from fleetmap.recordings.recording import Topics
+from fleetmap.sensors.source_settings import Topics
 
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 _TYPES = {

@@ -16,11 +16,12 @@ from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, file_kind, grey_image, store_frame
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
-from fleetmap.recordings.recording import Recording, Topics
+from fleetmap.recordings.recording import Recording
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.definitions import ros2msg
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
+from fleetmap.sensors.source_settings import Topics
 
 BODY_FRAME, BASE_FRAME, MAP_FRAME, ODOM_FRAME = "body", "base", "map", "odom"
 _CHUNK_BYTES = 1 << 20  # what one flipped bit costs at most

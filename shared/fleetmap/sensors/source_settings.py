@@ -1,0 +1,38 @@
+"""Where sensors are read from, as configurations say it; apart from the code, so that reading one loads no library of a source."""
+
+from typing import Literal
+
+from fleetmap.config import Section
+
+
+class SourceSection(Section, frozen=True):
+    """Kind of the sensor source, and its options; a kind ignores those of others. sensors: of topics, with the IMU if the rig has one."""
+
+    kind: str = "ros2"
+    sensors: Literal["stereo", "rgbd", "mono"] = "stereo"
+    calibration: str | None = None
+    endpoint: str = "tcp/127.0.0.1:7447"
+    domain: int = 0
+    keys: str = "rmw_zenoh"
+    recording: str | None = None
+    speed: float = 1.0
+    device: str = "/dev/video0"
+    width_px: int = 1280
+    height_px: int = 480
+    rate_hz: float = 30.0
+    delay_s: float = 0.0
+
+
+class Topics(Section, frozen=True):
+    """Topic names in MCAP files and ROS bags. An image topic also stands for itself with `/compressed` behind it."""
+
+    left: str = "/cam0/image_raw"
+    right: str = "/cam1/image_raw"
+    depth: str = "/depth/image_raw"
+    left_info: str = "/cam0/camera_info"
+    right_info: str = "/cam1/camera_info"
+    imu: str = "/imu0"
+    wheel: str = "/odom"
+    prior: str = "/prior"
+    ground_truth: str = "/ground_truth"
+    tf_static: str = "/tf_static"
