@@ -6,6 +6,7 @@
 #   make check                 format, lint, types, import contracts
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 how fast and how exact, in numbers
+#   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
 
@@ -26,7 +27,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test check kernels kernels-server kernels-robot kernels-simulator bench conformance clean
+.PHONY: help demo demo-recording test check kernels kernels-server kernels-robot kernels-simulator bench study conformance clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -63,6 +64,10 @@ kernels-simulator: $(DEV_STAMP)
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
+
+study: $(DEV_STAMP)
+	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=square"; exit 2; }
+	PYTHONPATH=tests $(BIN)/python -m studies.$(NAME)
 
 conformance: $(DEV_STAMP)
 	@test -d "$(SUITE)/tuf_conformance" || { echo "SUITE=DIR: a checkout of tuf-conformance"; exit 2; }

@@ -179,7 +179,28 @@ class Relocalizer:
             found = ransac_pnp(matched, threshold_px=threshold_px, min_inliers=min_inliers, seed=seed)
             if found is None or found.inliers.sum() < _MIN_RANSAC_SHARE * len(pairs):
                 return None
-        return self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+        fix = self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+        return None if fix is None else self._in_best_minimum(query, fix)
+
+    def _in_best_minimum(self, query: FrameFeatures, fix: Fix) -> Fix:
+        """The fix, or the one that more of its own matches agree with.
+
+        Landmarks that lie nearly in a plane allow a second pose, turned about it, which least squares do not leave; its covariance
+        says nothing of the first. Three points at a time find either. Source: Schweighofer and Pinz 2006, on the two minima.
+        """
+        if fix.matched is None:
+            return fix
+        settings = self._settings.fix
+        found = ransac_pnp(
+            fix.matched,
+            threshold_px=settings.ransac_px,
+            min_inliers=settings.min_inliers // 2,
+            seed=self._settings.seed,
+        )
+        if found is None or found.inliers.sum() <= fix.inliers:
+            return fix
+        other = self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+        return other if other is not None and other.inliers > fix.inliers else fix
 
     def _with_aliases(self, query: FrameFeatures, fixes: list[Fix]) -> TimeSliced[list[Fix]]:
         """The fixes, and those at the aliases of the best one."""

@@ -77,7 +77,7 @@ def _improved(
     for loop, weight in zip(loops, weights, strict=True):
         if weight >= 1.0 - _UNSURE:
             graph.push_back(loop)
-        elif weight > _UNSURE:
+        elif weight > 0.0:  # however little: a sure loop far off begins with the bound's share of its square
             noise = loop.noiseModel()
             assert isinstance(noise, gtsam.noiseModel.Gaussian)
             weaker = gtsam.noiseModel.Gaussian.SqrtInformation(noise.R() * np.sqrt(weight))

@@ -1,0 +1,91 @@
+"""What all studies share: results that are kept as they come, and the page that shows them.
+
+A study is a module of this folder with a `main`; `make study NAME=square` runs it. Its rows are kept in docs/studies/NAME.json after each
+case, so that one that was stopped goes on where it was; `make study NAME=square FRESH=1` begins anew. Its page is docs/studies/NAME.md:
+prose by hand, and between two marks the tables of the last run.
+"""
+
+import importlib.metadata
+import io
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import track
+
+PAGES = Path(__file__).parents[2] / "docs" / "studies"
+_BEGIN, _END = "<!-- begin of results -->", "<!-- end of results -->"
+_VERSIONS = "numpy", "scipy", "gtsam", "numba", "opencv-python-headless"
+
+Row = dict[str, Any]
+
+
+class Column(NamedTuple):
+    """A column of a table: the row's key, what stands above it, and how a value is written."""
+
+    key: str
+    title: str
+    form: str = "{}"
+
+
+def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[int] = ()) -> list[Row]:
+    """A row for each case: those in the kept file, the others made now and kept one by one. `seeds` are kept beside them."""
+    path = PAGES / f"{name}.json"
+    kept = json.loads(path.read_text()) if path.exists() and not os.environ.get("FRESH") else {}
+    rows = {row["case"]: row for row in kept.get("rows", []) if row["case"] in cases}
+    for case in track([c for c in cases if c not in rows], name, console=Console(stderr=True), disable=len(cases) < 2):
+        begin_s = time.process_time()
+        row = cases[case]()
+        rows[case] = {"case": case, **row, "cpu_s": round(time.process_time() - begin_s, 2)}
+        _keep(path, [rows[c] for c in cases if c in rows], seeds)
+    return [rows[case] for case in cases]
+
+
+def _keep(path: Path, rows: list[Row], seeds: Sequence[int]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    versions = {package: importlib.metadata.version(package) for package in _VERSIONS}
+    about = {"machine": f"{platform.machine()}, {os.cpu_count()} cores", "python": platform.python_version()} | versions
+    beside = path.with_suffix(".part")
+    beside.write_text(json.dumps({"about": about, "seeds": list(seeds), "rows": rows}, indent=1) + "\n")
+    beside.replace(path)
+
+
+def table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
+    """Markdown; a value that a row lacks is left open."""
+    lines = ["| " + " | ".join(c.title for c in columns) + " |", "|" + "---|" * len(columns)]
+    for row in rows:
+        cells = ["" if row.get(c.key) is None else c.form.format(row[c.key]) for c in columns]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def publish(name: str, tables: Sequence[str], figure: Figure | None) -> None:
+    """Writes the tables between the marks of the study's page and the picture beside it, and prints the tables."""
+    page = PAGES / f"{name}.md"
+    before, _, rest = page.read_text().partition(_BEGIN)
+    if _END not in rest:
+        raise ValueError(f"{page} lacks the lines {_BEGIN} and {_END}; add them where the tables belong")
+    about = json.loads((PAGES / f"{name}.json").read_text())
+    hours = sum(row["cpu_s"] for row in about["rows"]) / 3600
+    made = ", ".join(f"{what} {value}" for what, value in about["about"].items())
+    seeds = f"Seeds {', '.join(map(str, about['seeds']))}. " if about["seeds"] else ""
+    note = f"{seeds}{hours:.2g} CPU hours. {made}."
+    text = "\n\n".join([_BEGIN, *tables, note, _END])
+    page.write_text(before + text + rest.partition(_END)[2])
+    print("\n\n".join([*tables, note]))
+    if figure is not None:
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=110, facecolor="white", metadata={"Software": None})
+        (PAGES / f"{name}.png").write_bytes(buffer.getvalue())
+
+
+def rms(errors: np.ndarray[Any, Any]) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(errors))))
