@@ -136,5 +136,12 @@ say "what the server knows of the robots"
 say "the result"
 "$BIN/python" deploy/demo_report.py table "$OUT/build.json" "${reports[@]}"
 
+dashboard=$http/dashboard/?site=demo
+if [[ -t 0 && -t 1 ]]; then
+  printf '\nAll of it took %d s. The dashboard is at %s until you press Enter. ' "$SECONDS" "$dashboard"
+  read -r || true
+else
+  deploy/dashboard_pictures.sh "$http" "$OUT" demo
+fi
 stop_server || fail "the server did not end cleanly; see $OUT/server.log"
 printf '\nPictures, reports and trajectories are in %s; all of it took %d s.\n' "$OUT" "$SECONDS"

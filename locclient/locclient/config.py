@@ -19,7 +19,7 @@ from locclient.vda5050.settings import Vda5050Section
 TIERS = {
     "user": {
         "": "site store server",
-        "run": "server store site robot prior cache cache_bytes root identity insecure spool failures",
+        "run": "server store site robot prior cache cache_bytes root identity insecure spool failures replays",
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint map robot_height_m autostart",
         "topics": "*",
@@ -27,7 +27,7 @@ TIERS = {
         "download_token_file download_ca robot_actions factsheet frame",
     },
     "tuning": {
-        "run": "spool_bytes frame_queue imu_wait_s",
+        "run": "spool_bytes replays_bytes frame_queue imu_wait_s",
         "run.window": "*",
         "run.trial": "*",
         "source": "domain keys speed width_px height_px rate_hz delay_s",
@@ -62,6 +62,8 @@ class RunSection(Section, frozen=True):
     spool: str | None = None
     spool_bytes: int = 50_000_000
     failures: str | None = None
+    replays: str = "full"
+    replays_bytes: int = 50_000_000
     frame_queue: int = 2
     imu_wait_s: float = 0.05
     window: TileSelectionSettings = TileSelectionSettings()

@@ -1,10 +1,11 @@
-"""A position prior as users write it: X,Y,YAW,SIGMA_M."""
+"""Position priors as users write them, X,Y,YAW,SIGMA_M, and as the server passes on a person's word."""
 
 import numpy as np
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import LinkError, UsageError
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.sensors.samples import PositionPrior
+from fleetmap.messages import InitialPoseMessage
+from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 
 
 def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
@@ -19,3 +20,16 @@ def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
         raise UsageError(f"{name} {text!r}: all four must be finite numbers and SIGMA_M positive metres")
     covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
     return PositionPrior(0, se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.0])), covariance)
+
+
+def told_prior(told: InitialPoseMessage) -> PositionPrior:
+    """A person's word from now on: believed over what the robot tracks, until fixes outweigh it. LinkError for what is no place."""
+    values = [told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m]
+    if not np.isfinite(values).all() or not told.sigma_m > 0:
+        raise LinkError(f"a place at {values[:2]} m, heading {told.heading_rad} rad, sigma {told.sigma_m} m is none")
+    sigmas = UNSAID_SIGMAS.copy()
+    sigmas[3:5] = told.sigma_m
+    if told.heading_rad is None:
+        sigmas[2] = np.inf
+    map_from_base = se3(so3_exp(np.array([0.0, 0.0, told.heading_rad or 0.0])), np.array([*values[:2], 0.0]))
+    return PositionPrior(0, map_from_base, np.diag(sigmas**2), is_revisable=True)

@@ -25,6 +25,7 @@ from mapserver.commands.site.align import align
 from mapserver.commands.site.areas import AREAS_GROUP
 from mapserver.commands.site.grid import GRID
 from mapserver.commands.site.masks import MASKS_GROUP
+from mapserver.commands.site.surfels import MAP
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
 from mapserver.commands.store.gc import gc
@@ -63,6 +64,7 @@ COMMANDS: Commands = {
     "robots": ROBOTS,
     "grid": GRID,
     "masks": MASKS_GROUP,
+    "map": MAP,
     "operators": OPERATORS,
     "audit": audit,
     "prepare": prepare,

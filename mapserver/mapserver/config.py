@@ -13,6 +13,7 @@ from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, over, read_given, refuse_internal
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sensors.source_settings import SourceSection, Topics
+from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
@@ -26,14 +27,15 @@ TIERS = {
         "": "site store",
         "source": "kind sensors calibration endpoint recording device",
         "topics": "*",
+        "alerts": "*",
     },
     "tuning": {
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "gate": "*",
-        "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes",
+        "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes replay_bytes",
         "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
         "resurvey": "recent_days before_days min_failures rising_ratio fading",
-        "survey": "seed occupancy_grid",
+        "survey": "seed occupancy_grid surfel_map",
         "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",
         "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",
@@ -59,6 +61,7 @@ class MapserverConfig(Section, frozen=True):
     ingest: IngestSettings = IngestSettings()
     canary: CanarySettings = CanarySettings()
     resurvey: ResurveySettings = ResurveySettings()
+    alerts: AlertSettings = AlertSettings()
 
 
 def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig, Options]:

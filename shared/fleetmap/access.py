@@ -11,7 +11,7 @@ from typing import Any
 from fleetmap.messages import robot_key
 
 SITE_ANSWERS = ("manifests", "blobs", "patches", "trust")
-ROBOT_KEYS = ("ack", "health", "pose", "estimate", "wanted", "failures", "alive", "renew")
+ROBOT_KEYS = ("ack", "health", "pose", "estimate", "wanted", "initial_pose", "failures", "replays", "alive", "renew")
 # Far above what robots send: one message is dropped where two come closer together, without a burst.
 _MOST_HZ = {"ack": 10.0, "health": 10.0, "pose": 60.0, "estimate": 60.0}
 _REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20

@@ -1,11 +1,13 @@
 """Messages between robots and the server, as MessagePack, and the keys of the bus that carry them.
 
 fleetmap/{site}/robots/{robot}/wanted    asked by the robot; published by the server when it changes: WantedVersion
+fleetmap/{site}/robots/{robot}/initial_pose published by the server when a person says where the robot stands: InitialPoseMessage
 fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
 fleetmap/{site}/robots/{robot}/health    published by the robot: RobotHealth
 fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
 fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
+fleetmap/{site}/robots/{robot}/replays   asked by the robot, ReplayPart: FailureAck, with how much of a failure's recording has come
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
 fleetmap/{site}/robots/{robot}/renew     asked by the robot with its next key: fleetmap.trust.enrolment
 fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
@@ -104,6 +106,20 @@ class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
     site: Name
     version: Version | None
     manifest_sha256: str | None
+
+
+class InitialPoseMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """A person's word of where the robot's base stands on the floor of `map`, as ROS's `initialpose`.
+
+    heading_rad: from x towards y, None where nobody said it. sigma_m: standard deviation along x and along y.
+    """
+
+    site: Name
+    robot: Name
+    x_map_m: float
+    y_map_m: float
+    heading_rad: float | None = None
+    sigma_m: float = 0.5
 
 
 class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
@@ -296,23 +312,14 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
-    """The server has this report on its disk, now or since before. refused: why it never will, so that it is not sent again."""
+    """The server has this report on its disk, now or since before. refused: why it never will, so that it is not sent again.
+    received_bytes: of the failure's recording, from its beginning on; all of them once it is kept."""
 
     id: Name
     refused: Text = ""
+    received_bytes: int = 0
 
 
-Message = (
-    WantedVersion
-    | RobotAck
-    | RobotHealth
-    | PoseMessage
-    | ChunkRequest
-    | Part
-    | EstimateMessage
-    | FailureReport
-    | FailureAck
-)
 M = TypeVar("M", bound=msgspec.Struct)
 
 
@@ -340,7 +347,7 @@ def part_of(data: bytes, question: bytes) -> bytes:
     return encode_message(Part(total_bytes=len(data), offset=asked.offset, data=part))
 
 
-def report_dict(message: Message) -> dict[str, Any]:
+def report_dict(message: msgspec.Struct) -> dict[str, Any]:
     """The message as plain values, for reports."""
     built: dict[str, Any] = msgspec.to_builtins(message)
     return built
@@ -356,7 +363,7 @@ def finite(value: Any) -> Any:
 
 
 def robot_key(site: str, robot: str, what: str) -> str:
-    """Key of a robot's wanted, ack, health, pose, estimate, failures, alive or renew; '*' for any site or robot."""
+    """Key of a robot's wanted, initial_pose, ack, health, pose, estimate, failures, alive or renew; '*' for any site or robot."""
     return f"{_ROOT}/{site}/robots/{robot}/{what}"
 
 

@@ -192,16 +192,18 @@ def test_nobody_hears_what_is_for_others(make: Callable[[bool], World], is_guard
     world = make(is_guarded)
     eve, bob = world.join("a.1"), world.join("b.1")
     heard: list[str] = []
-    for key_expr in (OWN + "wanted", OTHERS + "wanted", "**", "fleetmap/hall/robots/*/health"):
+    for key_expr in (OWN + "wanted", OWN + "initial_pose", OTHERS + "wanted", "**", "fleetmap/hall/robots/*/health"):
         eve.subscribe(key_expr, lambda key, _: heard.append(key))
     world.settle()
     world.server.publish(OTHERS + "wanted", b"3")
     bob.publish(OTHERS + "health", b"x")
+    for key in (OTHERS, OWN):
+        world.server.publish(key + "initial_pose", b"4")
     world.server.publish(OWN + "wanted", b"3")
     assert eventually(lambda: OWN + "wanted" in heard, 5)
     world.settle()
     if is_guarded:
-        assert set(heard) == {OWN + "wanted"}
+        assert set(heard) == {OWN + "wanted", OWN + "initial_pose"}
     else:
         assert OTHERS + "wanted" in heard, "the control"
 

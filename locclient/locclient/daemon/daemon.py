@@ -19,9 +19,11 @@ from locclient.config import LocclientConfig, RunSection
 from locclient.daemon.publishers import PublisherInputs, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
+from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox
+from locclient.delivery.replay_delivery import ReplayQueue
 from locclient.identity import GivenAddress, MapAddress, check_reach
-from locclient.maps.connection import cache_folder, open_bus, outbox_path, trusted_map
+from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -67,6 +69,8 @@ def check_run(config: LocclientConfig) -> MapAddress:
             f"[output] odom_topic = {output.odom_topic!r} is also where [topics] wheel listens: the robot would take its own "
             'odometry for that of its wheels; set wheel = "" where it has none'
         )
+    if run.replays not in ("off", *PICTURES):
+        raise UsageError(f"[run] replays = {run.replays!r}: choose off, {' or '.join(PICTURES)}")
     if run.frame_queue < 1:
         raise UsageError(f"[run] frame_queue = {run.frame_queue}: at least one frame must be able to wait")
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
@@ -108,7 +112,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             has_imu=calibration.imu is not None,
             imu_wait_s=run.imu_wait_s,
         )
-        outbox = Outbox(configured_outbox(run, site, name), max_bytes=run.spool_bytes)
+        outbox_file = configured_outbox(run, site, name)
+        outbox = Outbox(outbox_file, max_bytes=run.spool_bytes)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
@@ -128,7 +133,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             client.require(trusted_map(bus, address, cache_folder(run.cache)))
             maps, first = CachedMap(caches[1], site), client.active()
             server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
-        robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time)
+        keeps_replay = server is not None and run.replays != "off"
+        robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
         told_bus = _output_bus(config, bus, stack)
@@ -141,15 +147,20 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         fleet_manager: MqttLink | None = None
         if server is not None and config.vda5050.broker is not None:
             fleet_manager = _fleet_manager(config, site, server, caches[0], intake)
+        mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
+        profile = RobotProfile(site, name, *mounting, config.localizer, calibration.imu, rectifier.imu_minus_cam_s)
+        replays: ReplayQueue | None = None
+        if server is not None and keeps_replay:
+            server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes)
+            replays = ReplayQueue(server.replays, profile, run.replays)
         yield RuntimeParts(
-            profile=RobotProfile(
-                site, name, robot.base_from_body, rectifier.body_from_cam, rectifier.camera, config.localizer
-            ),
+            profile=profile,
             source=source,
             intake=intake,
             robot=robot,
             tile_loader=TileLoader(maps, run.window),
             outbox=outbox,
+            replays=replays,
             publisher=publisher,
             server=server,
             first=first,

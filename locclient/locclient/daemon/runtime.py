@@ -18,6 +18,7 @@ from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
+from locclient.delivery.replay_delivery import ReplayQueue
 from locclient.delivery.report_delivery import write_failure
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.tile_cache import TileCache
@@ -49,6 +50,7 @@ class RuntimeParts:
     robot: Robot
     tile_loader: TileLoader
     outbox: Outbox
+    replays: ReplayQueue | None
     publisher: Publisher | None
     server: ServerSync | None
     first: WantedVersion | None
@@ -113,6 +115,9 @@ class Runtime:
             if self._parts.fleet_manager is not None:
                 self._parts.fleet_manager.stop()
             self._queue_failures()
+            if self._parts.replays is not None and self._parts.robot.ring is not None:
+                self._parts.robot.ring.finish()
+                self._parts.replays.work()
             _log.info("stopped: %s", self._health(is_silent=False))
         if self._shared.errors:
             raise self._shared.errors[0]
@@ -126,6 +131,8 @@ class Runtime:
             robot.use(shared.loaded.popleft())
         while self._parts.server is not None and self._parts.server.frames:
             robot.align(self._parts.server.frames.popleft())
+        while self._parts.server is not None and self._parts.server.priors:
+            self._parts.intake.put_prior(self._parts.server.priors.popleft())
         outcome = None
         try:
             outcome = robot.handle(bundle)
@@ -225,6 +232,8 @@ class Runtime:
         while not self._stop.wait(_IDLE_S):
             self._load_maps()
             self._queue_failures()
+            if self._parts.replays is not None:
+                self._parts.replays.work()
 
     def _load_maps(self) -> None:
         loader, server, shared = self._parts.tile_loader, self._parts.server, self._shared
@@ -297,6 +306,8 @@ class Runtime:
             report = failure_report(context, parts.profile, report_id=uuid.uuid4().hex, wall_ns=wall_ns)
             try:
                 parts.outbox.put(QueuedReport(report.id, encode_message(report)))
+                if parts.replays is not None:
+                    parts.replays.add(report, context.cut)
                 if parts.failures_folder is not None:
                     write_failure(parts.failures_folder, report)
             except FleetmapError as error:

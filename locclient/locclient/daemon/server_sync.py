@@ -8,14 +8,18 @@ from collections.abc import Callable
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import RobotHealth, WantedVersion
+from fleetmap.sensors.samples import PositionPrior
 from locclient.delivery.outbox import Outbox
+from locclient.delivery.replay_delivery import deliver_replay_part
 from locclient.delivery.report_delivery import deliver
 from locclient.maps.map_client import MapClient
+from locclient.prior_option import told_prior
 from locclient.robot.robot import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
 _UPKEEP_EVERY_S = 3600.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
+_REPLAY_PART_EVERY_S = 1.0  # a quarter of a megabyte: two megabits a second
 _log = logging.getLogger(__name__)
 
 
@@ -23,7 +27,7 @@ class ServerSync:
     """In each `step`: fetches the wanted version, delivers failures, acknowledges, reports health.
 
     Other threads append to `health`, `changes` and `refetch` (a held version with damaged pieces on the disk), and take fetched
-    versions from `fetched`. While the server is away, reports wait in the outbox.
+    versions from `fetched`, a person's word from `priors`. While the server is away, reports wait in the outbox.
     """
 
     def __init__(
@@ -37,6 +41,9 @@ class ServerSync:
         upkeep: Callable[[], None] = lambda: None,
     ) -> None:
         """retry_s: when a postponed version is offered again. upkeep: called once an hour; what it refuses goes into the log."""
+        self.replays: Outbox | None = None  # recordings of failures, which may be large
+        self._replayed_bytes: dict[str, int] = {}
+        self._replay_at_s = 0.0
         self.follows = True  # the server's choice of a version; False: somebody else's, whom the server is told
         self.on_change: Callable[[VersionChange], None] = lambda _: None
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
@@ -57,7 +64,12 @@ class ServerSync:
         self._ask_at_s, self._silent_until_s, self._backoff_s = 0.0, 0.0, _BACKOFF_S
         self._announced: deque[WantedVersion] = deque(maxlen=1)
         self._last_ack: tuple[int | None, str] | None = None
-        self._handles = [client.announce_presence(), client.on_wanted(self._announced.append)]
+        self.priors: deque[PositionPrior] = deque(maxlen=4)  # where a person says that the robot stands
+        self._handles = [
+            client.announce_presence(),
+            client.on_wanted(self._announced.append),
+            client.on_initial_pose(lambda told: self.priors.append(told_prior(told))),
+        ]
 
     def step(self) -> None:
         """Does what is due. Returns early where nobody answers, and then waits with an exponential backoff."""
@@ -72,6 +84,7 @@ class ServerSync:
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
+            self._send_replay(now_s)
             if now_s >= self._upkeep_at_s:
                 self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
                 self._upkeep()
@@ -188,6 +201,13 @@ class ServerSync:
                 _log.info("the acknowledgement was not sent: %s", error)
 
     # --- reports ------------------------------------------------------------------------------------------------------
+
+    def _send_replay(self, now_s: float) -> None:
+        """A part of a recording, at most one in a second, while no report waits and no version is fetched."""
+        if self.replays is None or now_s < self._replay_at_s or self._outbox.waiting():
+            return
+        goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+        self._replay_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
 
     def _publish_health(self) -> None:
         while self.health:

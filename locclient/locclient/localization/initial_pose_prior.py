@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, so3_log
-from fleetmap.odometry import Odometry, OdometryEstimate
+from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import (
@@ -16,8 +16,9 @@ from locclient.localization.hypothesis_set import (
     recent,
     vote,
 )
+from locclient.localization.localizer_state import PriorState, all_copied, copied
 from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
-from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 _SIGMA_M = 0.05  # added to any prior: it is of a moment between two frames
@@ -56,7 +57,20 @@ class InitialPosePrior:
         self.contradictions: list[PoseHypothesis] = []
         self.is_revisable = prior.is_revisable
 
-    def propagate(self, tracker: Odometry, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
+    @classmethod
+    def restored(cls, state: PriorState, base_from_body: Array) -> "InitialPosePrior":
+        """As it was when `capture` was called."""
+        made = cls(state.prior, base_from_body)
+        made._travelled_m, made._since = state.travelled_m, copied(state.since)
+        made.hypothesis, made.contradictions = copied(state.hypothesis), list(all_copied(state.contradictions))
+        return made
+
+    def capture(self) -> PriorState:
+        """All of it, as values."""
+        hypotheses = copied(self._since), copied(self.hypothesis), all_copied(self.contradictions)
+        return PriorState(self._prior, self._travelled_m, *hypotheses)
+
+    def propagate(self, tracker: Motion, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
         """To the present frame, by `step` (4, 4) from the last one. The caller propagates `hypothesis` with the others."""
         self._travelled_m += float(np.linalg.norm(step[:3, 3]))
         if self._since is not None:

@@ -1,16 +1,15 @@
 """The localizer: samples and tiles in, one estimate for each frame out. Pure."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
-from fleetmap.messages import Cause, Status
+from fleetmap.messages import Status
 from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import Odometry, OdometryEstimate
+from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
@@ -18,22 +17,20 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.alias_disambiguation import ViewpointGate
-from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
+from locclient.localization.calibration.monitor import FinishedQuery
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
-from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate, LocalizationState, QueryResult, assemble
 from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
-from locclient.localization.image_quality import ImageQualityMonitor
 from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
-from locclient.localization.pose_covariance import boxminus, boxplus, transport_cov
+from locclient.localization.localizer_state import LocalizerState, copied
+from locclient.localization.perception import Perception, SensorPerception
+from locclient.localization.pose_covariance import innovation_of, kalman_update, transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-_SLICES_AT_REST = (
-    3  # of a search, in a frame, where the last one began too: a late estimate costs a robot nothing there
-)
+_SLICES_AT_REST = 3  # of a search, in a frame, where the last one began too: a late estimate costs nothing there
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 
 
@@ -56,7 +53,7 @@ class Localizer:
         self._cam_from_body = se3_inverse(body_from_cam)
         self._base_from_body = calibration.base_from_body
         rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
-        self._odometry = Odometry(*rig, settings.odometry, settings.stereo)
+        self.perception: Perception = SensorPerception(*rig, settings)
         self._relocalizer: Relocalizer | None = None
         self._map_version: int | None = None
         self._lookalikes: LookAlikes | None = None
@@ -72,21 +69,17 @@ class Localizer:
         self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
         self._search_gate = ViewpointGate()
         self._is_at_rest = False  # the search that goes on begins where the one before did
-        self._image_monitor = ImageQualityMonitor(settings.sight)
         self._was_tracking = False
-        mounting = Mounting(self._cam_from_body, calibration.base_from_body)
-        self._calibration = CalibrationMonitor(mounting, settings.relocalizer, imu_minus_cam_s)
         self._query_input: tuple[RectifiedFrame, OdometryEstimate] | None = None  # of that query
         self._query_features: FrameFeatures | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
         """IMU samples newer than any before."""
-        self._odometry.handle_imu(samples)
+        self.perception.handle_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         """Wheel odometry newer than any before."""
-        self._odometry.handle_wheel(samples)
-        self._calibration.watch.handle_wheel(samples)
+        self.perception.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """A prior at this moment, used until a pose is confirmed, with a covariance that grows with the distance since. One whose
@@ -104,7 +97,7 @@ class Localizer:
         self._candidates.reset()
         self._was_tracking, self._failed_queries = False, 0
         self._failed_places.clear()
-        self._calibration.give_up()
+        self.perception.give_up()
 
     def handle_version(
         self,
@@ -124,22 +117,44 @@ class Localizer:
         self._relocalizer = Relocalizer(view, self._camera, self._settings.relocalizer)
         self._work = self._query_frame = None
         self._failed_places.clear()
-        self._calibration.give_up()
+        self.perception.give_up()
+
+    def capture(self) -> LocalizerState | None:
+        """What later estimates depend on beside maps and perception, as values; None while a map query goes on."""
+        if self._work is not None:
+            return None
+        return LocalizerState(
+            confirmed=copied(self._confirmed),
+            candidates=self._candidates.capture(),
+            prior=None if self._prior is None else self._prior.capture(),
+            odom_from_body=self._last_odom_from_body,
+            stamps_ns=(self._last_ns, self._query_ns),
+            failed_queries=self._failed_queries,
+            failed_places=tuple(self._failed_places),
+            search_odom_from_body=self._search_gate.odom_from_body,
+            was_tracking=self._was_tracking,
+        )
+
+    def restore(self, state: LocalizerState) -> None:
+        """Goes on from a state, in the map that was given last."""
+        self._work = self._query_frame = None
+        self._confirmed = copied(state.confirmed)
+        self._candidates.restore(state.candidates)
+        self._prior = None if state.prior is None else InitialPosePrior.restored(state.prior, self._base_from_body)
+        self._last_odom_from_body, (self._last_ns, self._query_ns) = state.odom_from_body, state.stamps_ns
+        self._failed_queries, self._failed_places = state.failed_queries, list(state.failed_places)
+        self._search_gate = ViewpointGate(state.search_odom_from_body)
+        self._was_tracking = state.was_tracking
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """The estimate at `frame`, newer than any before."""
         begun_s = self._clock()
-        image = self._image_monitor.judge(frame)
-        if image.cause is Cause.FROZEN:
-            frame = self._image_monitor.without_frozen(frame)
+        frame, image = self.perception.judge(frame)
         judged_s = self._clock()
-        odometry = self._odometry.handle_stereo(frame)
-        if image.cause is Cause.NONE:
-            image = replace(image, cause=self._image_monitor.judge_depth(odometry.scene_depth_m))
+        odometry, image = self.perception.follow(frame, image)
         tracked_s = self._clock()
         self._propagate(odometry)
-        self._calibration.work()
-        is_reversed = self._calibration.is_reversed(frame, is_localized=self._confirmed is not None)
+        is_reversed = self.perception.is_reversed(frame, is_localized=self._confirmed is not None)
         result = QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry)
         self._last_ns = frame.stamp_ns
         stage_s = {"sight": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
@@ -159,11 +174,8 @@ class Localizer:
         prior, has_failed = self._prior.hypothesis if self._prior else None, self._failed_queries > 0
         state = LocalizationState(self._confirmed, self._candidates, prior, has_failed, self._was_tracking)
         last_fix_ns = None if self._confirmed is None else self._confirmed.stamp_ns
-        return self._calibration.judged(
-            assemble(estimate, state, self._track), last_fix_ns, was_localized=self._was_tracking
-        )
-
-    # --- odometry -----------------------------------------------------------------------------------------------------
+        assembled = assemble(estimate, state, self._track)
+        return self.perception.judged(assembled, last_fix_ns, was_localized=self._was_tracking)
 
     def _propagate(self, odometry: OdometryEstimate) -> None:
         """Propagates every hypothesis to the present frame."""
@@ -174,7 +186,7 @@ class Localizer:
         if last is not None and odometry.previous_from_body is not None:
             step = odometry.previous_from_body
         for hypothesis in [*self._hypotheses(), *([self._query_frame] if self._query_frame else [])]:
-            hypothesis.propagate(self._odometry, odometry, step, self._track)
+            hypothesis.propagate(self.perception, odometry, step, self._track)
             if change is not None:
                 hypothesis.history.redefine_odom(change)
         if change is not None:
@@ -182,13 +194,11 @@ class Localizer:
             self._search_gate.redefine_odom(change)
         self._last_odom_from_body = odometry.odom_from_body
         if self._prior is not None:
-            self._prior.propagate(self._odometry, odometry, step, self._track)
+            self._prior.propagate(self.perception, odometry, step, self._track)
 
     def _hypotheses(self) -> list[PoseHypothesis]:
         confirmed = [self._confirmed, *self._confirmed.kidnap_hypotheses] if self._confirmed else []
         return [*confirmed, *self._candidates.tracked(), *(self._prior.tracked() if self._prior else [])]
-
-    # --- map queries --------------------------------------------------------------------------------------------------
 
     def _query_map(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> QueryResult:
         """The result of a map query that is finished with this frame, an empty one otherwise.
@@ -224,7 +234,7 @@ class Localizer:
                 looked = FinishedQuery(
                     *self._query_input, self._query_features, result.fix, self._relocalizer, is_confirmed
                 )
-                self._calibration.add(looked)
+                self.perception.add(looked)
             self._failed_queries = 0 if result.fix is not None else self._failed_queries + 1
             return result
         return QueryResult()
@@ -244,7 +254,7 @@ class Localizer:
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
 
     def _query(self, frame: RectifiedFrame, relocalizer: Relocalizer) -> TimeSliced[QueryResult]:
-        features = self._query_features = yield from relocalizer.extract(frame)
+        features = self._query_features = yield from self.perception.extract(relocalizer, frame)
         if self._confirmed is None:
             fixes = yield from self._search(features, relocalizer)
             return (yield from self._update_candidates(fixes))
@@ -320,8 +330,6 @@ class Localizer:
         map_from_body = fix.map_from_cam @ self._cam_from_body
         return map_from_body, transport_cov(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
 
-    # --- tracking of a confirmed pose ---------------------------------------------------------------------------------
-
     def _update_confirmed(
         self, fixes: list[Fix], map_from_body: Array, covariance: Array, *, is_near: bool
     ) -> QueryResult:
@@ -332,7 +340,7 @@ class Localizer:
         """
         assert self._confirmed is not None
         assert self._query_frame is not None
-        innovations = [(fix, *self._innovation(fix, map_from_body, covariance)) for fix in fixes]
+        innovations = [(fix, *innovation_of(*self._at_body(fix), map_from_body, covariance)) for fix in fixes]
         # A fix near the prediction is tested by the gate alone; one found by search must be reliable besides.
         limit = self._track.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self._is_reliable(entry[0]))]
@@ -345,19 +353,11 @@ class Localizer:
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
             return QueryResult(None, reason, innovation, off_m if is_near else None)
         _, cov_fix = self._at_body(fix)
-        gain = np.linalg.solve(covariance + cov_fix, covariance).T  # K = P (P + R)^-1
-        rest = np.eye(6) - gain
-        updated = rest @ covariance @ rest.T + gain @ cov_fix @ gain.T  # (I - K) P (I - K)^T + K R K^T
         support = self._confirmed.support + 1
-        self._confirmed = PoseHypothesis.at_query(self._query_frame, boxplus(map_from_body, gain @ error), updated)
+        updated = kalman_update(map_from_body, covariance, error, cov_fix)
+        self._confirmed = PoseHypothesis.at_query(self._query_frame, *updated)
         self._confirmed.support = support
         return QueryResult(fix, "", innovation, off_m)
-
-    def _innovation(self, fix: Fix, map_from_body: Array, covariance: Array) -> tuple[Array, float]:
-        """(6,) innovation of a fix, and its squared Mahalanobis distance."""
-        measured, cov_fix = self._at_body(fix)
-        error = boxminus(measured, map_from_body)
-        return error, float(error @ np.linalg.solve(covariance + cov_fix, error))
 
     def _detect_kidnapping(self, fixes: list[Fix]) -> None:
         """Abandons the confirmed pose when refused fixes agree with each other query after query; theirs must be confirmed anew."""
@@ -369,8 +369,6 @@ class Localizer:
             self._candidates.reset(self._confirmed, hypotheses)
             self._confirmed = None
             self._prior = None  # it led to that pose
-
-    # --- confirmation -------------------------------------------------------------------------------------------------
 
     def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""

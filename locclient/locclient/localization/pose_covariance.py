@@ -20,6 +20,20 @@ def boxplus(map_from_body: Array, rot_trans: Array) -> Array:
     return se3(so3_exp(rot_trans[:3]) @ map_from_body[:3, :3], map_from_body[:3, 3] + rot_trans[3:])
 
 
+def innovation_of(measured: Array, cov_measured: Array, predicted: Array, covariance: Array) -> tuple[Array, float]:
+    """(6,) innovation of a measured pose (4, 4), and its squared Mahalanobis distance."""
+    error = boxminus(measured, predicted)
+    return error, float(error @ np.linalg.solve(covariance + cov_measured, error))
+
+
+def kalman_update(map_from_body: Array, covariance: Array, error: Array, cov_measured: Array) -> tuple[Array, Array]:
+    """A pose and its covariance after a measured pose, which is off by `error` (6,). Source: Bucy and Joseph 1968."""
+    gain = np.linalg.solve(covariance + cov_measured, covariance).T  # K = P (P + R)^-1
+    rest = np.eye(6) - gain
+    updated = rest @ covariance @ rest.T + gain @ cov_measured @ gain.T  # (I - K) P (I - K)^T + K R K^T
+    return boxplus(map_from_body, gain @ error), updated
+
+
 def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
     """The covariance about a point at `lever_m` (map axes) from the one that `cov_rot_trans` is about, on the same rigid body."""
     adjoint = np.eye(6)

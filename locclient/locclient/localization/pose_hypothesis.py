@@ -1,11 +1,12 @@
 """Pose hypotheses that the odometry propagates from frame to frame. Pure."""
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from fleetmap.geometry import Array, length
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometryStatus
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
 from locclient.localization.pose_covariance import compose_cov, compose_end_cov
 from locclient.localization.settings import TrackSettings
@@ -13,6 +14,16 @@ from locclient.localization.settings import TrackSettings
 # Sigmas of one step: radians, metres, share of the distance.
 _MEASURED_DRIFT, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can turn the motion
+
+
+class Motion(Protocol):
+    """The odometry's answers about frames that it still knows."""
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """As `Odometry.motion_since`."""
+
+    def will_forget(self, frame_index: int) -> bool:
+        """As `Odometry.will_forget`."""
 
 
 @dataclass
@@ -99,7 +110,7 @@ class PoseHypothesis:
         self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans
         self.now_map_from_body, self.now_cov = other.now_map_from_body, other.now_cov
 
-    def propagate(self, tracker: Odometry, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
+    def propagate(self, tracker: Motion, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
         """To the present frame: by the motion since its own frame while the odometry holds that, else by `step` (4, 4) from the last.
 
         Moves to the present frame before the odometry forgets its own.

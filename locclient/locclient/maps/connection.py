@@ -80,6 +80,11 @@ def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:
     return cache_folder(cache).parent / "spool" / f"{site}.{robot}.sqlite3"
 
 
+def replay_outbox(outbox: Path) -> Path:
+    """The file in which recordings of failures wait, beside the one of their reports."""
+    return outbox.with_name(f"{outbox.stem}.replays{outbox.suffix}")
+
+
 def cache_folder(setting: str | Path | None = None) -> Path:
     """The folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
     if setting is not None:

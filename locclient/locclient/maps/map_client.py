@@ -7,6 +7,7 @@ from contextlib import suppress
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
+from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import (
     MAX_MANIFEST_BYTES,
     Manifest,
@@ -20,6 +21,7 @@ from fleetmap.mapformat import (
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
 from fleetmap.messages import (
     FailureAck,
+    InitialPoseMessage,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -109,6 +111,19 @@ class MapClient(MapSource):
         """Calls `listener`, on a thread of the bus, whenever the server wants another version."""
         key = self._key("wanted")
         return self._bus.subscribe(key, lambda _, payload: listener(decode_message(payload, WantedVersion)))
+
+    def on_initial_pose(self, listener: Callable[[InitialPoseMessage], None]) -> Handle:
+        """Calls `listener`, on a thread of the bus, whenever a person says at the server where this robot stands."""
+
+        def hear(_: str, payload: bytes) -> None:
+            told = decode_message(payload, InitialPoseMessage)
+            if (told.site, told.robot) != (self._site, self._robot):
+                raise LinkError(
+                    f"a place for robot {told.robot!r} of {told.site!r} came to {self._robot} of {self._site}"
+                )
+            listener(told)
+
+        return self._bus.subscribe(self._key("initial_pose"), hear)
 
     def active(self) -> WantedVersion | None:
         """The version that is whole in the cache, None before the first one."""
@@ -316,6 +331,11 @@ class MapClient(MapSource):
     def report_failure(self, payload: bytes) -> FailureAck:
         """The server's answer to an encoded FailureReport, once it is on its disk; errors as of `wanted`."""
         return decode_message(self._bus.get(self._key("failures"), payload, timeout_s=self._timeout_s), FailureAck)
+
+    def send_replay_part(self, part: ReplayPart) -> FailureAck:
+        """How much of a failure's recording the server has; errors as of `wanted`."""
+        answer = self._bus.get(self._key("replays"), encode_message(part), timeout_s=self._timeout_s)
+        return decode_message(answer, FailureAck)
 
     def publish_health(self, health: RobotHealth) -> None:
         """Sends the robot's report."""

@@ -68,13 +68,16 @@ def replay(
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
     loaded, tiles, note = load_map(connection.source)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
-    robot = Robot(source.calibration, rectifier, options.settings, TrialSettings(), time.process_time)
+    keeps_replay = connection.outbox is not None
+    settings = (options.settings, TrialSettings(), time.process_time)
+    robot = Robot(source.calibration, rectifier, *settings, keeps_replay=keeps_replay)
     robot.use(loaded)
     if prior is not None:
         robot.localizer.handle_prior(prior)
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [])
     mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
-    profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings)
+    clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
+    profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
     reporter = RunReporter(connection, result, profile)
     if options.viewer is not None:
         options.viewer.begin(loaded, profile, rectifier)
@@ -99,6 +102,8 @@ def replay(
         if options.viewer is not None:
             options.viewer.handle(outcome)
         options.progress(number)
+    if robot.ring is not None:
+        robot.ring.finish()
     reporter.finish()
     return result
 

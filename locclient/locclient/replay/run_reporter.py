@@ -8,9 +8,11 @@ from pathlib import Path
 
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.messages import OFF_MAP, RobotHealth, encode_message
+from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox, QueuedReport
+from locclient.delivery.replay_delivery import ReplayQueue, deliver_replay_part
 from locclient.delivery.report_delivery import deliver
-from locclient.maps.connection import MapConnection
+from locclient.maps.connection import MapConnection, replay_outbox
 from locclient.maps.map_client import MapClient
 from locclient.replay.run_metrics import METRICS
 from locclient.replay.run_result import ReplayResult
@@ -34,6 +36,8 @@ class RunReporter:
     def __init__(self, connection: MapConnection, result: ReplayResult, profile: RobotProfile) -> None:
         self._connection, self._result, self._profile = connection, result, profile
         self._outbox: Outbox | None = None
+        self._replays: ReplayQueue | None = None
+        self._replayed_bytes: dict[str, int] = {}
         self._fixes = FixFigures()
         self._health_ns = self._pose_ns = -(2**62)
         self._broken = False
@@ -45,6 +49,8 @@ class RunReporter:
         self._fixes.handle(outcome.estimate, outcome.dock_error_m, outcome.speed_mps)
         if outcome.failure is not None:
             self._report_failure(outcome.failure)
+        if self._replays is not None:
+            self._replays.work()
         stamp_ns = outcome.estimate.stamp_ns
         message = outcome.pose_message()
         if message is not None and stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
@@ -59,9 +65,17 @@ class RunReporter:
         if self._result.estimates:
             self._publish_health()
         path, until_s = self._connection.outbox, time.monotonic() + _DELIVERY_S
+        if self._replays is not None:
+            self._replays.work()
         if path is not None and (self._outbox is not None or path.exists()):
             while self._deliver(path) and time.monotonic() < until_s:
                 time.sleep(_RETRY_S)
+        if self._connection.client is not None and self._replays is not None:
+            replays = self._replays.outbox
+            while time.monotonic() < until_s and deliver_replay_part(
+                self._connection.client, replays, self._replayed_bytes
+            ):
+                pass
         waiting = self._result.failure_reports["waiting"]
         if waiting:
             self._result.notes.append(f"{waiting} reports of failures wait in {path} for the server")
@@ -75,6 +89,10 @@ class RunReporter:
         report = failure_report(context, self._profile, report_id=uuid.uuid4().hex, wall_ns=began_ns)
         try:
             self._open(path).put(QueuedReport(report.id, encode_message(report)))
+            if self._replays is None:
+                outbox = Outbox(replay_outbox(path), max_bytes=_OUTBOX_BYTES)
+                self._replays = ReplayQueue(outbox, self._profile, PICTURES[0])
+            self._replays.add(report, context.cut)
         except FleetmapError as error:
             self._result.notes.append(f"the report of a failure is lost: {error}")
             return

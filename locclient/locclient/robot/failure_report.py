@@ -13,6 +13,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
+from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.localization.settings import LocalizerSettings
@@ -85,7 +86,8 @@ _MATCHES_WIDTH_PX = 800
 
 @dataclass(frozen=True)
 class RobotProfile:
-    """What is the same in all reports of a robot: names of its site and itself, mounting, rectified camera, settings."""
+    """What is the same in all reports of a robot: names of its site and itself, mounting, rectified camera, settings, noise and clock of
+    the IMU."""
 
     site: str
     robot: str
@@ -93,6 +95,8 @@ class RobotProfile:
     body_from_cam: Array
     camera: StereoCamera
     settings: LocalizerSettings
+    imu: ImuNoise | None = None
+    imu_minus_cam_s: float = 0.0
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:

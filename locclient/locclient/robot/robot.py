@@ -22,6 +22,7 @@ from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
+from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
@@ -50,6 +51,7 @@ class FailureContext:
     """A failure with what its report shows: its onset, the evidence for its cause, and the version that ran.
 
     unmatched: the onset of the search for itself that it belongs to, when the robot knew its place best; else that of the failure.
+    cut: what is kept of the seconds around its onset, None where nothing is.
     """
 
     failure: Failure
@@ -57,6 +59,7 @@ class FailureContext:
     unmatched: Onset
     evidence: Evidence
     running: LoadedMap | None
+    cut: FailureCut | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +115,15 @@ class Robot:
         settings: LocalizerSettings,
         trial: TrialSettings,
         clock_s: Clock = lambda: 0.0,
+        *,
+        keeps_replay: bool = False,
     ) -> None:
-        """clock_s measures CPU; the default measures nothing."""
+        """clock_s measures CPU; the default measures nothing. keeps_replay: whether the seconds around a failure are kept."""
         self._rectifier, self._clock_s = rectifier, clock_s
         self.base_from_body = calibration.base_from_body
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
         self.localizer = Localizer(calibration, *mounting, settings, clock_s)
+        self.ring = FailureRing(self.localizer) if keeps_replay else None
         self._trial_settings = trial
         self._versions = _Versions()
         self._odom = ContinuousOdom(calibration.base_from_body)
@@ -175,6 +181,8 @@ class Robot:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         self.localizer.handle_wheel(bundle.wheel)
+        if self.ring is not None:
+            self.ring.handle_commands(bundle)
         if bundle.forget:
             self.localizer.forget_pose()
         for prior in bundle.priors:
@@ -194,6 +202,8 @@ class Robot:
         speed_mps = self._speed.handle(bundle.wheel, estimate.odometry, published.odom_from_base)
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
+        if self.ring is not None:
+            self.ring.handle(estimate, self.monitor.begun_ns)
         odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
@@ -203,7 +213,10 @@ class Robot:
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""
         failure = self.monitor.handle_silence(for_s)
-        return None if failure is None else self._context(failure, None)
+        context = None if failure is None else self._context(failure, None)
+        if context is not None and self.ring is not None:
+            self.ring.finish()
+        return context
 
     def _may_be_mapped(self, estimate: Estimate) -> bool:
         if estimate.status is Status.TRACKING or estimate.map_from_body is None or self.running is None:
@@ -225,10 +238,13 @@ class Robot:
         lasted_s = failure.duration_s + max(0, began_ns - onset.stamp_ns) * 1e-9
         failure = replace(failure, stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.search or onset
-        return FailureContext(failure, onset, unmatched, evidence, self.running)
+        cut = None if self.ring is None else self.ring.cut(failure.stamp_ns)
+        return FailureContext(failure, onset, unmatched, evidence, self.running, cut)
 
     def _show(self, loaded: LoadedMap) -> None:
         focal_px, tiles = loaded.manifest.camera.focal_px, loaded.tiles.values()
+        if self.ring is not None:
+            self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
         self._place_in_building()
         self.localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)

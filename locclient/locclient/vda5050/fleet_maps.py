@@ -6,8 +6,8 @@ from pathlib import Path
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, disk_errors
+from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
-from fleetmap.version_file import ExportReader, open_export
 from locclient.maps.tile_cache import ActiveVersion, TileCache
 from locclient.maps.version_download import Origins, TooLargeError, download
 

@@ -51,6 +51,7 @@ from mapserver.api.views import (
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
+from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import JobInfo, MapStore, VersionInfo
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
@@ -66,7 +67,7 @@ def create_app(
     lifespan: Lifespan | None = None,
     settings: ApiSettings = USUAL_SETTINGS,
 ) -> FastAPI:
-    """The application over an open store; `bus` is looked at for readiness only, None where none is served."""
+    """The application over an open store; `bus` is looked at for readiness, and robots are told on it; None where none is served."""
     app = FastAPI(
         title="fleetmap",
         description="Versions of maps, the robots that use them, and the jobs that make them.",
@@ -88,7 +89,7 @@ def create_app(
     _install_map_routes(app, store)
     install_file_routes(app, store)
     install_version_routes(app, store, settings)
-    install_fleet_routes(app, store, settings.resurvey)
+    install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
     describe.install(app)
     return app
 
@@ -152,9 +153,15 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         return EventList(*page(found, limit, lambda event: str(event.id)))
 
     @app.get("/v1/jobs")
-    def jobs(site: SiteFilter = None, limit: Limit = 100, cursor: NumberCursor = None) -> JobList:
-        """Jobs (of a site), newest first."""
-        found = store.jobs(site, before=cursor, limit=limit + 1)
+    def jobs(
+        site: SiteFilter = None,
+        since: Since = None,
+        until: Until = None,
+        limit: Limit = 100,
+        cursor: NumberCursor = None,
+    ) -> JobList:
+        """Jobs (of a site) that began in a time, newest first."""
+        found = store.jobs(site, time_range(since, until), before=cursor, limit=limit + 1)
         return JobList(*page(found, limit, lambda job: str(job.id)))
 
     @app.get("/v1/jobs/{job}")

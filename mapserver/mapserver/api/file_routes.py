@@ -3,20 +3,28 @@
 import base64
 import hashlib
 from functools import lru_cache
+from typing import Annotated
 
-from fastapi import FastAPI, Request, Response
+import cv2
+import numpy as np
+from fastapi import FastAPI, Query, Request, Response
+from starlette.exceptions import HTTPException
 from starlette.responses import StreamingResponse
 
 from fleetmap.errors import StateError
 from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.version_file import ExportHead
 from fleetmap.occupancy_grid import map_server_files
-from fleetmap.version_file import ExportHead
 from fleetmap.version_grid import grid_of, occupancy
 from mapserver.api.bytes_response import bytes_response
-from mapserver.api.parameters import RobotHeight, Site, Version
+from mapserver.api.guard import address_of
+from mapserver.api.parameters import RobotHeight, Site, Version, ViewPose
+from mapserver.fleet.rate_limit import RateLimit
+from mapserver.serving.expected_views import ExpectedViews, looking
 from mapserver.store import MapStore
 
 _DIGESTS_KEPT = 256
+_VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a fifth of a second of CPU
 
 
 def install_file_routes(app: FastAPI, store: MapStore) -> None:
@@ -70,6 +78,20 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
     def grid_pgm(request: Request, site: Site, version: Version, robot_height_m: RobotHeight = 1.1) -> Response:
         """The image of `grid.yaml`."""
         return grid_file(request, (site, version), robot_height_m, 1)
+
+    views, drawn = ExpectedViews(store), RateLimit(_VIEWS_AT_ONCE, _VIEWS_PER_S, store.now_ns)
+
+    @app.get("/v1/sites/{site}/versions/{version}/view.png", response_class=Response)
+    def view_png(request: Request, site: Site, version: Version, camera: Annotated[ViewPose, Query()]) -> Response:
+        """What the survey's camera should see at a pose, drawn from the version's surfels; transparent where nothing is known."""
+        store.version(site, version)
+        if not drawn.admits(address_of(request.scope)):
+            raise HTTPException(429, "too many views are asked for; wait a second", {"Retry-After": "1"})
+        place = looking((camera.x_m, camera.y_m, camera.z_m), camera.yaw_deg, camera.pitch_deg)
+        view = views.view(site, version, place, width_px=camera.width_px)
+        alpha = np.where(view.unknown, np.uint8(0), np.uint8(255))
+        png = cv2.imencode(".png", np.dstack([view.picture] * 3 + [alpha]))[1].tobytes()
+        return bytes_response(request, png, sha256_hex(png), "image/png", immutable=False)
 
     @app.get("/v1/sites/{site}/versions/{version}/vda5050")
     def vda5050(request: Request, site: Site, version: Version) -> dict[str, str]:

@@ -3,10 +3,12 @@
 import time
 from typing import Annotated, Any, NamedTuple
 
-from fastapi import Depends, FastAPI, Query, Response
+from fastapi import Depends, FastAPI, Query, Request, Response
 
-from fleetmap.messages import finite, report_dict
-from mapserver.api.bytes_response import PICTURE_HEADERS
+from fleetmap.mapformat import sha256_hex
+from fleetmap.messages import InitialPoseMessage, finite, report_dict
+from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
+from mapserver.api.guard import actor_of
 from mapserver.api.parameters import (
     Axis,
     FailureQuery,
@@ -17,6 +19,8 @@ from mapserver.api.parameters import (
     Number,
     NumberCursor,
     PictureNumber,
+    RequestId,
+    Robot,
     Since,
     Site,
     SiteFilter,
@@ -24,10 +28,23 @@ from mapserver.api.parameters import (
     page,
     time_range,
 )
-from mapserver.api.views import FailureList, FailureView, HourList, HourView, KpisList, KpisView
+from mapserver.api.views import (
+    Act,
+    FailureList,
+    FailureView,
+    HourList,
+    HourView,
+    KpisList,
+    KpisView,
+    PlaceAct,
+    ServiceState,
+    SurveyAct,
+)
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
+from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geojson
+from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import MapStore
 
 
@@ -47,8 +64,22 @@ def _span(hours: Hours = 24, since: Since = None, until: Until = None) -> Span:
 Asked = Annotated[Span, Depends(_span)]
 
 
-def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettings) -> None:
+def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettings, placing: RobotPlacing) -> None:
     """Adds the endpoints."""
+
+    @app.post("/v1/sites/{site}/robots/{robot}/initial_pose")
+    def initial_pose(request: Request, site: Site, robot: Robot, act: PlaceAct) -> ServiceState:
+        """A person's word of where a robot stands: it believes it over what it tracks, until fixes outweigh it. `ok`: it was told."""
+        told = InitialPoseMessage(
+            site=site,
+            robot=robot,
+            x_map_m=act.x_map_m,
+            y_map_m=act.y_map_m,
+            heading_rad=act.heading_rad,
+            sigma_m=act.sigma_m,
+        )
+        placing.tell(told, actor_of(request, act.actor, act.reason))
+        return ServiceState("ok")
 
     @app.get("/v1/fleet/measures")
     def fleet_measures(
@@ -102,6 +133,14 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         headers = {"Cache-Control": "private, max-age=86400", **PICTURE_HEADERS}
         return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
 
+    @app.get("/v1/failures/{number}/replay.mcap", response_class=Response)
+    def replay(request: Request, number: Number) -> Response:
+        """The recording of the seconds around a failure, as MCAP: `mapserver fleet replay` and Foxglove open it."""
+        data = store.fleet.replay(number)
+        response = bytes_response(request, data, sha256_hex(data), "application/octet-stream", immutable=False)
+        response.headers["Content-Disposition"] = f'attachment; filename="failure-{number}.mcap"'
+        return response
+
     @app.get("/v1/sites/{site}/areas")
     def areas(site: Site) -> dict[str, Any]:
         """The named areas of a site as GeoJSON, metres in `map` in the place of degrees."""
@@ -112,6 +151,17 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     def resurvey(site: Site) -> ResurveyList:
         """Tiles to survey again, the worst first, each with its reasons, and a route through them."""
         return resurvey_list(store, site, settings, time.time_ns())
+
+    @app.post("/v1/sites/{site}/resurvey/requests")
+    def ask(request: Request, site: Site, act: SurveyAct) -> SurveyRequest:
+        """Asks for a survey of a polygon; its tiles are on the list until the request is ended."""
+        return ask_for_survey(store, site, act.corners_map_m, actor_of(request, act.actor, act.reason))
+
+    @app.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
+    def end(request: Request, site: Site, asked: RequestId, act: Act) -> ServiceState:
+        """Takes a request off the list: it was surveyed, or is not wanted any more."""
+        end_request(store, site, asked, actor_of(request, act.actor, act.reason))
+        return ServiceState("ok")
 
     @app.get("/v1/sites/{site}/resurvey/route")
     def resurvey_route(site: Site) -> dict[str, Any]:

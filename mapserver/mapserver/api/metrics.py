@@ -119,6 +119,12 @@ class _FleetCollector(Collector):
         tried = {row.site: row.version for row in self._store.canaries(running=True)}
         trials = [((info.site,), tried.get(info.site, 0)) for info in sites]
         yield _filled(_gauge("site_canary_version", "Version that some robots try, 0 for none."), trials)
+        nights = {info.site: self._store.last_night(info.site) for info in sites}
+        failed = [((site,), float(night is not None and night.state == "failed")) for site, night in nights.items()]
+        yield _filled(_gauge("site_night_failed", "1 where the last night failed."), failed)
+        rolled_back = Counts(row.site for row in self._store.canaries() if row.state == "rolled_back")
+        family = CounterMetricFamily("fleetmap_site_canaries_rolled_back", "Versions rolled back.", labels=["site"])
+        yield _filled(family, (((info.site,), rolled_back[info.site]) for info in sites))
         yield from self._robots([info.site for info in sites])
         yield from _trust(self._store)
         totals = [((site,), counts) for (site, _), counts in counters(None, "site").items()]

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeVar
 from fastapi import Path, Query
 from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 
@@ -19,6 +19,8 @@ from mapserver.store import FailureFilter
 Item = TypeVar("Item")
 
 Site = Annotated[str, Path(pattern=NAME_PATTERN, examples=["hall"])]
+Robot = Annotated[str, Path(pattern=NAME_PATTERN, examples=["tug-7"])]
+RequestId = Annotated[str, Path(pattern="^[0-9a-f]{8}$", examples=["3fa9c1d2"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]
 RobotHeight = Annotated[
@@ -42,6 +44,17 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="items of a page", examp
 _NEXT = "`next` of the page before"
 NumberCursor = Annotated[int | None, Query(ge=0, le=(1 << 62), description=_NEXT, examples=[None])]
 NameCursor = Annotated[str | None, Query(max_length=160, description=_NEXT, examples=[None])]
+
+
+class ViewPose(BaseModel):
+    """Where a camera looks from and to, in `map`."""
+
+    x_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[1.5])
+    y_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[2.0])
+    z_m: float = Field(0.0, ge=-1e3, le=1e3, description="of the camera", examples=[0.5])
+    yaw_deg: float = Field(ge=-360, le=360, description="counter-clockwise from x", examples=[90.0])
+    pitch_deg: float = Field(0.0, ge=-90, le=90, description="downwards", examples=[0.0])
+    width_px: int = Field(320, ge=16, le=640, description="of the picture", examples=[320])
 
 
 _TIME = "ISO 8601; without an offset the server's local time, a day alone from its beginning to its end"

@@ -6,8 +6,10 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 from mapserver.fleet.fleet import RobotStatus
+from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_test import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.serving.robot_placing import MOST_SIGMA_M
 from mapserver.store import CanaryRow, Event, FailureRow, JobInfo, PictureRow, SiteInfo, VerdictRow
 
 
@@ -139,6 +141,9 @@ class CanaryView:
     robots: list[str]
 
 
+Metres = Annotated[float, Field(allow_inf_nan=False)]
+
+
 def _body(**example: JsonValue) -> ConfigDict:
     return ConfigDict(extra="forbid", json_schema_extra={"examples": [example]})
 
@@ -169,6 +174,26 @@ class CanaryAct(Act):
 
     model_config = _body(actor="ada", reason="the nightly map", share=0.05)
     share: Annotated[float | None, Field(gt=0, lt=1)] = None
+
+
+class PlaceAct(Act):
+    """Who says where a robot stands: metres in `map`, the heading from x towards y, and how far off the word may be (one sigma)."""
+
+    model_config = _body(actor="ada", x_map_m=12.5, y_map_m=3.0, heading_rad=1.57, sigma_m=0.5)
+    x_map_m: Metres
+    y_map_m: Metres
+    heading_rad: Annotated[float | None, Field(allow_inf_nan=False)] = None
+    sigma_m: Annotated[float, Field(gt=0, le=MOST_SIGMA_M)] = 0.5
+
+
+class SurveyAct(Act):
+    """Who asks for a survey of a polygon, and why; its corners in metres of `map`, the first not repeated at the end."""
+
+    model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
+    corners_map_m: Annotated[
+        list[tuple[Metres, Metres]],
+        Field(min_length=3, max_length=MOST_CORNERS),
+    ]
 
 
 _NOT_FOUND: dict[str, JsonValue] = {

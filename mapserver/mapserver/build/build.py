@@ -19,10 +19,10 @@ from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
-from fleetmap.version_grid import GridReport, Tiles, encode_grid, grid_report
-from mapserver.build.draft_evidence import Before, JudgedSession, examine_draft, replayed_probes
+from mapserver.build.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
-from mapserver.build.job_lock import Job, recorded_job
+from mapserver.build.job_lock import Job, JobProgress, recorded_job
+from mapserver.build.layers import grid_layer, layer_sessions, surfel_layer
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import (
     Accuracy,
@@ -36,27 +36,26 @@ from mapserver.build.report import (
     sentence,
     write_file,
 )
+from mapserver.build.survey_beginnings import SurveyBeginnings
 from mapserver.build.survey_recordings import (
     Admission,
     OpenRecordings,
     RecordingOptions,
-    SurveyBeginnings,
     Surveyed,
     admit_recordings,
-    begins_site,
     joined_truth,
     map_trajectories,
+    read_zones,
     survey_all,
     survey_recording,
 )
 from mapserver.build.trajectory import OtherTrajectory
-from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, judged
-from mapserver.build.worker import open_executor
-from mapserver.build.zones_file import read_zones
-from mapserver.grid.survey_grid import GridSession, grow_grid
+from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, first_vocabulary, judged
+from mapserver.build.worker import SideProcess, open_executor, open_side_process
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
+from mapserver.surfels.surfel_map import Surfels, known_surfels
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
@@ -132,13 +131,16 @@ class _Run:
     times: StageTimes
     started_s: float
     images: ImageSpill
+    side: SideProcess | None
 
-    def tools(self, executor: Executor, view: ProgressView) -> SurveyTools:
-        """With progress that is shown and timed."""
+    def tools(self, executor: Executor, view: ProgressView, told: JobProgress | None = None) -> SurveyTools:
+        """With progress that is shown and timed, and told to those who look at the job."""
 
         def progress(stage: str, done: int, total: int) -> None:
             self.times(stage, done, total)
             view(stage, done, total)
+            if told is not None:
+                told(stage, done, total)
 
         return SurveyTools(progress, self.images, executor)
 
@@ -182,16 +184,21 @@ def build_draft(
         raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), Console(stderr=True)
-    with OpenRecordings(options.reading, request.store) as reading, ImageSpill(reading.folder) as images:
-        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
+    with (
+        open_side_process(options.threads) as side,
+        OpenRecordings(options.reading, request.store) as reading,
+        ImageSpill(reading.folder) as images,
+    ):
+        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images, side)
         admitted = _admitted(run)
         with (
             MapStore.open(request.store, create=True) as maps,
-            recorded_job(maps, request.site, "build") if recorded else nullcontext(Job()) as job,
+            recorded_job(maps, request.site, "build") if recorded else nullcontext(Job(number=options.job)) as job,
         ):
             parent = _parent(request, maps)
             chosen = choose_vocabulary(maps, request.site, options.vocabulary)
-            built = _survey(run, admitted, None if parent is None else parent.survey, chosen)
+            told = JobProgress(maps, job.number)
+            built = _survey(run, admitted, None if parent is None else parent.survey, chosen, told)
             draft = _keep(run, built, parent, maps)
             draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
@@ -201,9 +208,10 @@ def build_draft(
 def _admitted(run: _Run) -> dict[Path, Admission]:
     request, options = run.request, run.request.options
     run.times.begin("examination")
-    with ProgressView(run.console) as view, open_executor(options.threads, None) as executor:
-        begun = len(request.recordings) == 1 and begins_site(request.store, request.site)
-        beginnings = SurveyBeginnings(run.settings, run.tools(executor, view), may_begin=begun)
+    first = first_vocabulary(request.store, request.site, options.vocabulary) if len(request.recordings) == 1 else None
+    config = None if first is None else SurveyConfig(run.settings, first.vocabulary, run.zones)
+    with ProgressView(run.console) as view, open_executor(options.threads, None, run.side) as executor:
+        beginnings = SurveyBeginnings(config, run.tools(executor, view))
         return admit_recordings(
             request.recordings,
             run.reading,
@@ -233,15 +241,17 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
     return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
 
 
-def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, chosen: ChosenVocabulary) -> Built:
+def _survey(
+    run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, chosen: ChosenVocabulary, told: JobProgress
+) -> Built:
     """Surveys all recordings and joins them to the current map."""
     options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
-        open_executor(options.threads, options.scheduler) as executor,
+        open_executor(options.threads, options.scheduler, run.side) as executor,
     ):
         survey_options = SurveyConfig(settings, chosen.vocabulary, run.zones)
-        tools = run.tools(executor, view)
+        tools = run.tools(executor, view, told)
 
         def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
             return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
@@ -285,19 +295,24 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
     run.times.begin("grid")
-    grid, grid_said = _grid(run, built, {} if parent is None else parent.grid)
+    sessions = layer_sessions(built.taken, built.joined)
+    grid, grid_said = grid_layer(run.settings, sessions, {} if parent is None else parent.grid)
+    run.times.begin("surfels")
+    known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
+    surfels, surfels_said = surfel_layer(run.settings, sessions, known)
     run.times.begin("examining")
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
     archive = encode_archive(survey_map)
     vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
+    held_bytes = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, run.side.peak_rss_bytes if run.side else 0]
     cost = BuildCost(
         vocabulary_bytes=built.vocabulary.download_bytes(len(vocabulary)),
         seconds=time.perf_counter() - run.started_s,
-        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
+        peak_rss_mb=sum(held_bytes) / 1e6,
     )
     report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
-    report = msgspec.structs.replace(report, grid=grid_said)
+    report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said)
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
@@ -310,8 +325,9 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     )
     job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, grid=grid, evidence=evidence, job=job
-    )
+        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, grid=grid, surfels=surfels,
+        evidence=evidence, job=job,
+    )  # fmt: skip
     version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
@@ -326,17 +342,6 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     return draft
 
 
-def _grid(run: _Run, built: Built, before: Tiles) -> tuple[list[bytes], GridReport | None]:
-    """The grid of the version before, with what the recordings saw if that is wanted; its bytes, and words about it."""
-    sessions = []
-    if run.settings.occupancy_grid:
-        places = [trajectory.frame_from_body for trajectory in map_trajectories(built.joined)]
-        sessions = [GridSession(s.entry.name, s.survey, p) for s, p in zip(built.taken, places, strict=True)]
-    tiles, without = grow_grid(before, sessions, run.settings.stereo)
-    blobs = encode_grid(tiles)
-    return blobs, grid_report(blobs, without) if blobs or without else None
-
-
 def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
@@ -345,7 +350,9 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
     trajectories = map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
-    evidence = examine_draft(tiles, camera, built.vocabulary.vocabulary, before, sessions, replayed)
+    drafted = DraftMap(tiles, built.vocabulary.vocabulary, camera)
+    with open_executor(options.threads, None, run.side) as executor:
+        evidence = examine_draft(drafted, before, sessions, replayed, executor)
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
 
@@ -373,8 +380,7 @@ def picture_png(site: str, draft: Draft, built: Built) -> bytes:
     from mapserver.build.plots import draw_survey
 
     # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
-    alone = built.is_first and len(built.taken) == 1
-    loops = built.taken[0].survey.loops if alone else Loops()
+    loops = built.taken[0].survey.loops if built.is_first and len(built.taken) == 1 else Loops()
     report = msgspec.convert(draft.report, BuildReport)
     return draw_survey(f"{site}, version {draft.version}", built.joined.map, loops, built.accuracy, report)
 

@@ -24,10 +24,12 @@ from fleetmap.version_grid import known_grid
 from mapserver.build.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
-from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
-from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread
+from mapserver.quality.figures import Evidence, RigEvidence, Starts, TrajectoryBreaks
+from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread, starts_without_prior
 from mapserver.store import MapStore
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.merge.initial_history import history_of
+from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.survey_map import SurveyMap
 
@@ -57,16 +59,39 @@ class JudgedSession(NamedTuple):
 
 
 def held_out_of(
-    recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey, orb: OrbSettings
+    recording: Recording,
+    selected: Sequence[int],
+    rectifier: Rectifier,
+    survey: Survey,
+    orb: OrbSettings,
+    known: Sequence[HeldOut],
 ) -> list[HeldOut]:
-    """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
+    """Frames of a surveyed recording that did not become keyframes, read again unless they are known. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
-    return _read(recording, selected, numbers, rectifier, orb)
+    there = {frame.number: frame for frame in known if frame.number in numbers}
+    read = _read(recording, selected, [n for n in numbers if n not in there], rectifier, orb)
+    return sorted([*there.values(), *read], key=lambda frame: frame.number)
+
+
+def likely_held_out(odometry: OdometryPass) -> list[int]:
+    """What `held_out_of` will choose if the map takes all frames and keyframes."""
+    keyframes = [k.frame_index for k in odometry.keyframes]
+    return held_out_frames(keyframes, np.ones(len(odometry.estimates), bool), PROBES)
+
+
+def read_held_out(part: Recording, numbers: Sequence[int], rectifier: Rectifier, orb: OrbSettings) -> list[HeldOut]:
+    """The frames with these numbers, which are all that `part` has; closes it."""
+    with part:
+        return _read(part, {number: n for n, number in enumerate(numbers)}, numbers, rectifier, orb)
 
 
 def _read(
-    recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier, orb: OrbSettings
+    recording: Recording,
+    selected: Sequence[int] | dict[int, int],
+    numbers: Sequence[int],
+    rectifier: Rectifier,
+    orb: OrbSettings,
 ) -> list[HeldOut]:
     found = []
     for number in numbers:
@@ -152,24 +177,43 @@ def replayed_probes(
     return probes
 
 
+class DraftMap(NamedTuple):
+    """What robots would get of a draft; camera: that of the map."""
+
+    tiles: Sequence[Tile]
+    vocabulary: Vocabulary
+    camera: StereoCamera
+
+    def view(self) -> MapView:
+        """It as robots see it."""
+        return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
+
+    def starts(self, frames: Sequence[Probe]) -> Starts | None:
+        """See `starts_without_prior`."""
+        return starts_without_prior(self.view(), frames)
+
+
 def examine_draft(
-    tiles: Sequence[Tile],
-    camera: StereoCamera,
-    vocabulary: Vocabulary,
+    drafted: DraftMap,
     before: Before | None,
     sessions: Sequence[JudgedSession],
     replayed: Sequence[Probe],
+    executor: Executor = SERIAL,
 ) -> Evidence:
-    """The findings of probes in the tiles as they are stored; camera: that of the map, whose recordings are `sessions`."""
+    """The findings of probes in the tiles as they are stored; `sessions` are the map's recordings."""
     held_out = [
         x.probe(session.trajectory.frame_from_body) for session in sessions for x in session.held_out[:: len(sessions)]
     ]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
-    stored = [decode_tile(encode_tile(tile)) for tile in tiles]
-    draft = MapView(stored, vocabulary, camera.focal_px)
-    current = None if before is None else MapView(before.tiles, vocabulary, before.survey.camera.focal_px)
-    evidence = examine(draft, current, Probes(held_out, replayed, last), _breaks(sessions))
-    return msgspec.structs.replace(evidence, directions=tile_directions(stored))
+    stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
+    drafted = drafted._replace(tiles=stored)
+    probes = Probes(held_out, replayed, last)
+    beside = executor.beside(drafted.starts, probes.frames)
+    current = None if before is None else DraftMap(before.tiles, drafted.vocabulary, before.survey.camera).view()
+    draft = drafted.view()
+    evidence = examine(draft, current, probes, _breaks(sessions))
+    starts = starts_without_prior(draft, probes.frames) if beside is None else beside.result()
+    return msgspec.structs.replace(evidence, directions=tile_directions(stored), starts=starts)
 
 
 def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:

@@ -3,20 +3,21 @@
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fleetmap.errors import BusyError, disk_errors
+from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.store import JobInfo, MapStore
 from mapserver.store.rows import REQUEST
 
 INTERRUPTED = "interrupted"
 """Key of the report of a job that was ended here."""
 
+_TOLD_EVERY_S = 2.0
 _YOUNG_S = 60.0  # a job is noted before it holds its lock
 
 
@@ -96,10 +97,32 @@ def _opened(path: Path) -> Iterator[int]:
 
 @dataclass(slots=True)
 class Job:
-    """What a job says at its end."""
+    """What a job says at its end. number: None for one that no row of the store stands for."""
 
     message: str = ""
     report: dict[str, Any] = field(default_factory=dict)
+    number: int | None = None
+
+
+class JobProgress:
+    """Tells the store how far a job is, from calls (stage, done, total), at most every two seconds."""
+
+    def __init__(self, maps: MapStore, job: int | None, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._maps, self._job, self._clock_s = maps, job, clock_s
+        self._stage, self._begun_s, self._told_s = "", 0.0, -_TOLD_EVERY_S
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Notes it. A store that is busy costs the page a look, not the build."""
+        now_s = self._clock_s()
+        if stage != self._stage:
+            self._stage, self._begun_s = stage, now_s
+        elif now_s - self._told_s < _TOLD_EVERY_S:
+            return
+        self._told_s = now_s
+        if self._job is not None:
+            stage_s = round(now_s - self._begun_s, 1)
+            with suppress(FleetmapError):
+                self._maps.tell_progress(self._job, {"stage": stage, "done": done, "total": total, "stage_s": stage_s})
 
 
 @contextmanager
@@ -109,7 +132,8 @@ def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
     One that is killed stands as running until the server, or the next job, finds that nobody holds its lock.
     """
     end_interrupted(maps, time.time_ns())
-    job, number = Job(), maps.begin_job(site, kind)
+    number = maps.begin_job(site, kind)
+    job = Job(number=number)
     try:
         with held(maps.folder, number):
             yield job

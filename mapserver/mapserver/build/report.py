@@ -17,6 +17,7 @@ from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, TileDirections
 from mapserver.quality.probes import lookalike_words
+from mapserver.surfels.surfel_map import SurfelReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import Joined
 from mapserver.survey.survey_map import SurveyMap
@@ -40,12 +41,13 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     selected frame that has an estimate and a known truth, after one rigid (similarity) alignment; evaluated_share: their share of the
     selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
     scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
-    in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was corrected. corrections: of the
-    calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the surveys did not
-    hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that is in the map.
+    with that of the process beside it, in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was
+    corrected. corrections: of the calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the
+    surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that
+    is in the map.
     directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
     is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell. grid: that of planners,
-    None without one.
+    surfels: the map that renders; None without one.
     """
 
     recordings: list[str]
@@ -73,6 +75,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     starts: Starts | None = None
     lookalike_recall: float | None = None
     grid: GridReport | None = None
+    surfels: SurfelReport | None = None
 
 
 class Accuracy(msgspec.Struct, frozen=True):

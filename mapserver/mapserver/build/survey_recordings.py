@@ -1,6 +1,6 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,34 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fleetmap.errors import FleetmapError, RecordingError, StoreError, SurveyError
+from fleetmap.config import Section, load_toml
+from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
+from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
 from mapserver.build.admission import checked
 from mapserver.build.draft_evidence import HeldOut, held_out_of
 from mapserver.build.image_spill import KeptFrames
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
+from mapserver.build.survey_beginnings import BegunSurvey, SurveyBeginnings, survey_inputs_of
 from mapserver.build.trajectory import OtherTrajectory, given_poses, with_depths
-from mapserver.build.worker import read_ahead
 from mapserver.calibration import CalibrationParameter
-from mapserver.calibration.problem import CalibrationData
-from mapserver.calibration.recordings import LONGEST_S, Follow, stretch_of_chain
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.quality.figures import RigEvidence
-from mapserver.store import MapStore
-from mapserver.survey.chain import AdjustedChain
 from mapserver.survey.executor import SERIAL
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
+from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import Joined, chained
-from mapserver.survey.pipeline import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.settings import SurveySettings, for_depths
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
+from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.settings import for_depths
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 _SHARED_STRETCHES = 3  # of which a calibration takes one
 
@@ -85,43 +83,6 @@ class Surveyed:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedParts:
-    """The selected frames (F,) of a recording as FrameParts: each part reads files of its own, and carries nothing of the others."""
-
-    recording: Recording
-    indices: NDArray[np.int64]
-
-    @property
-    def stamps_ns(self) -> Stamps:
-        """See FrameParts."""
-        return self.recording.frame_stamps_ns[self.indices]
-
-    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
-        """See FrameParts."""
-        part = self.recording.part(self.indices[first:end])
-        return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
-
-
-@dataclass(frozen=True, slots=True)
-class _Frames:
-    recording: Recording
-
-    def __iter__(self) -> Iterator[CameraFrame]:
-        with self.recording as recording:
-            for index in range(len(recording)):
-                yield recording.read_frame(index)
-
-
-@dataclass(frozen=True, slots=True)
-class BegunSurvey:
-    """A survey up to its loops, with the calibration and the rectifier that it was made with."""
-
-    rig: RigCalibration
-    rectifier: Rectifier
-    chain: AdjustedChain
-
-
-@dataclass(frozen=True, slots=True)
 class Admission:
     """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
 
@@ -134,36 +95,6 @@ class Admission:
     corrections: dict[str, float]
     begun: BegunSurvey | None = None
     given: Trajectory | None = None
-
-
-class SurveyBeginnings:
-    """Begins surveys of recordings as a build's examination needs them; the last one goes on where its calibration is taken.
-
-    A recording that is much longer than the stretch from which its calibration is measured is not worth a survey that may be refused.
-    """
-
-    def __init__(self, settings: SurveySettings, tools: SurveyTools, *, may_begin: bool = True) -> None:
-        """may_begin: else no survey is begun, and calibrations are measured by passes of their own."""
-        self._settings, self._tools, self._may_begin = settings, tools, may_begin
-        self.executor = tools.executor
-        self.last: BegunSurvey | None = None
-
-    def follow(self, recording: Recording, indices: NDArray[np.int64], *, is_given: bool) -> Follow | None:
-        """How the calibration of these frames is to be followed; None where that takes a pass of its own, as with given poses."""
-        self.last = None
-        seconds = np.ptp(recording.frame_stamps_ns[indices]) * 1e-9 if len(indices) else 0.0
-        if not self._may_begin or is_given or seconds > _SHARED_STRETCHES * LONGEST_S:
-            return None
-
-        def followed(rig: RigCalibration) -> CalibrationData:
-            self.last = None
-            rigged = replace(recording, calibration=rig)
-            inputs = _inputs(rigged, indices, Rectifier(rig), None)
-            self.last = BegunSurvey(rig, inputs.rectifier, begin_survey(inputs, self._settings, self._tools))
-            self._tools.progress("examination", 0, 1)
-            return stretch_of_chain(self.last.chain, recording, (rig, inputs.rectifier))
-
-        return followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,11 +242,13 @@ def survey_recording(
     with reading.open(path) as (opened, indices):
         recording = replace(opened, calibration=admission.rig)
         if (begun := admission.begun) is not None:
-            rectifier, done = begun.rectifier, finish_survey(begun.chain, options, tools)
+            rectifier, done = begun.rectifier, begun.finished(options, tools)
+            known = [] if begun.held_out is None else begun.held_out.result()
         else:
+            known = []
             rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
             own = replace(options, settings=for_depths(options.settings, recording.depth_sigma_px))
-            done = survey(_inputs(recording, indices, rectifier, admission.given), own, tools)
+            done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), own, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
@@ -328,16 +261,8 @@ def survey_recording(
             findings=admission.statements,
             calibration=admission.calibration,
             corrections=admission.corrections,
-            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
+            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb, known),
         )
-
-
-def _inputs(
-    recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
-) -> SurveyInputs:
-    frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
-    samples = recording.imu, recording.calibration, rectifier, recording.wheel
-    return SurveyInputs(frames, len(indices), *samples, given, RecordedParts(recording, indices))
 
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
@@ -391,10 +316,10 @@ def map_trajectories(joined: Joined) -> list[Trajectory]:
     return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
 
 
-def begins_site(store: Path, site: str) -> bool:
-    """Whether a site has no version yet, whose camera would be the map's instead of the recording's own."""
-    try:
-        with MapStore.open(store) as maps:
-            return site not in {info.site for info in maps.sites()} or maps.current(site) is None
-    except StoreError:  # there is none; what else is wrong with it is said where it is made
-        return True
+class _ZonesFile(Section, frozen=True):
+    zones: dict[str, object]
+
+
+def read_zones(path: Path | None) -> Zones:
+    """Zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError for anything else. None has no zones."""
+    return Zones() if path is None else zones_of(load_toml(path, _ZonesFile).zones, str(path))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fleetmap.bow import Vocabulary, decode_vocabulary, vocabulary_hash
 from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256, default_vocabulary
-from fleetmap.errors import MapFormatError, UsageError
+from fleetmap.errors import MapFormatError, StoreError, UsageError
 from mapserver.store import MapStore
 from mapserver.survey.loops.vocabulary_evaluation import VocabularyEvaluation, try_own_vocabulary
 from mapserver.survey.pipeline import Survey
@@ -32,11 +32,11 @@ class ChosenVocabulary:
 def choose_vocabulary(maps: MapStore, site: str, file: Path | None) -> ChosenVocabulary:
     """The vocabulary for a new survey of the site. UsageError where the file's is not the one that the site has published."""
     kept = maps.site_vocabulary(site)
-    if file is None:
-        if kept is None:
-            return ChosenVocabulary(default_vocabulary(), "default")
+    if file is None and kept is not None:
         return ChosenVocabulary(decode_vocabulary(kept), "site")
-    given = ChosenVocabulary(read_vocabulary(file), "file")
+    given = _given_or_shipped(file)
+    if file is None:
+        return given
     published = next((info.vocabulary_sha256 for info in maps.sites() if info.site == site), None)
     if published not in (None, given.sha256()):
         raise UsageError(
@@ -44,6 +44,22 @@ def choose_vocabulary(maps: MapStore, site: str, file: Path | None) -> ChosenVoc
             "build without --vocabulary, or under another site's name"
         )
     return given
+
+
+def _given_or_shipped(file: Path | None) -> ChosenVocabulary:
+    if file is None:
+        return ChosenVocabulary(default_vocabulary(), "default")
+    return ChosenVocabulary(read_vocabulary(file), "file")
+
+
+def first_vocabulary(store: Path, site: str, file: Path | None) -> ChosenVocabulary | None:
+    """The same for a site that has no version yet, of a store that may not be there; None for others, whose maps have their own camera."""
+    try:
+        with MapStore.open(store) as maps:
+            is_new = site not in {info.site for info in maps.sites()} or maps.current(site) is None
+            return choose_vocabulary(maps, site, file) if is_new else None
+    except StoreError:  # there is none; what else is wrong with it is said where it is made
+        return _given_or_shipped(file)
 
 
 def judged(chosen: ChosenVocabulary, done: Survey, settings: SurveySettings) -> ChosenVocabulary:

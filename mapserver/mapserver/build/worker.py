@@ -1,26 +1,35 @@
 """Executors for surveys: threads of this process, processes of this machine, or those of a dask cluster elsewhere.
 
-Two cores are served best by threads: the kernels run without the interpreter's lock, and nothing is copied. Processes take over
-where there are many cores, or several machines. What travels between them are pickles, which run code where they are opened:
-processes of this machine are reached by pipes that only their parent holds, a cluster by TLS with certificates on both sides.
+Two cores are served best by threads: the kernels run without the interpreter's lock, and nothing is copied. Long work that needs the
+interpreter goes on in a process beside them. Processes take over where there are many cores, or several machines. What travels between
+them are pickles, which run code where they are opened: processes of this machine are reached by pipes that only their parent holds, a
+cluster by TLS with certificates on both sides.
 """
 
+import gc
 import os
 import pickle
+import resource
 import secrets
+import select
+import signal
+import socket
+import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from threading import Thread
+from typing import Any, Self, TypeVar
 
 import cv2
 
-from fleetmap.errors import UsageError
-from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared
+from fleetmap.errors import FleetmapError, UsageError
+from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared, Work
 
 Item = TypeVar("Item")
 EMBEDDED = "local"
@@ -31,8 +40,8 @@ _CONNECT_WITHIN_S = "20s"
 class Threads:
     """An executor of threads; results are computed ahead of who asks for them."""
 
-    def __init__(self, pool: ThreadPoolExecutor, count: int) -> None:
-        self._pool, self._ahead = pool, _AHEAD * count
+    def __init__(self, pool: ThreadPoolExecutor, count: int, side: "SideProcess | None" = None) -> None:
+        self._pool, self._ahead, self._side = pool, _AHEAD * count, side
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
@@ -44,6 +53,117 @@ class Threads:
     def nearby(self) -> Executor:
         """See Executor."""
         return self
+
+    def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
+        """See Executor."""
+        return None if self._side is None else self._side.submit(function, *arguments)
+
+
+class SideProcess:
+    """A process beside this one for long work, one piece after the other, whose interpreter waits for nobody's lock.
+
+    What it cannot do, or died of, is done here: the answer is the same. It ends when this process does, however that ends. All that
+    travels goes through a pair of sockets, so that nothing is left behind.
+    """
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            try:
+                self._process = _forked(ours, theirs) if _is_one_thread() else _started(theirs)
+            except OSError:
+                ours.close()
+                raise
+        self._socket, self._pipe, self._is_closed = ours, Connection(os.dup(ours.fileno())), False
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="beside")
+        self.peak_rss_bytes = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ends the process, whatever it is at."""
+        self._is_closed = True
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes who waits for an answer
+        with suppress(ProcessLookupError, ChildProcessError):
+            os.kill(self._process, signal.SIGKILL)
+            os.waitpid(self._process, 0)
+        self._pool.shutdown(cancel_futures=True)
+        self._pipe.close()
+        self._socket.close()
+
+    def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """function(*arguments) there, after what was submitted before."""
+        return self._pool.submit(self._ask, function, arguments)
+
+    def _ask(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result:
+        task = pickle.dumps((function, arguments), protocol=5)
+        try:
+            self._pipe.send_bytes(task)
+            is_result, value, self.peak_rss_bytes = pickle.loads(self._pipe.recv_bytes())
+        except (EOFError, OSError):  # it has died
+            is_result, value = False, None
+        if self._is_closed:
+            raise CancelledError
+        if isinstance(value, FleetmapError) and not is_result:
+            raise value
+        return value if is_result else function(*arguments)
+
+
+def _is_one_thread() -> bool:
+    """Whether no other thread can hold a lock that a copy of this process would wait for in vain."""
+    tasks = Path("/proc/self/task")
+    return tasks.is_dir() and len(list(tasks.iterdir())) == 1
+
+
+def _forked(ours: socket.socket, theirs: socket.socket) -> int:
+    """A copy of this process, which has loaded all that it needs."""
+    process = os.fork()
+    if process == 0:
+        try:
+            ours.close()
+            os.setpgid(0, 0)  # Ctrl-C is for this process's own group, which ends the other
+            serve_beside(theirs.detach())
+        finally:
+            os._exit(0)
+    return process
+
+
+def _started(theirs: socket.socket) -> int:
+    """A new process, which finds its socket where input would come from, and loads what it needs while it has nothing to do."""
+    program = f"import mapserver.build.survey_beginnings; from {__name__} import serve_beside; serve_beside(0)"
+    command = [sys.executable, "-c", program]
+    paths = {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
+    into = [(os.POSIX_SPAWN_DUP2, theirs.fileno(), 0)]
+    return os.posix_spawn(sys.executable, command, os.environ | paths, file_actions=into, setpgroup=0)
+
+
+def serve_beside(socket_number: int) -> None:
+    """The process: answers (function, arguments) with (whether this is the result, the result or a FleetmapError, most memory it held)."""
+    Thread(target=_end_with_parent, args=(socket_number,), daemon=True).start()
+    cv2.setNumThreads(1)
+    gc.freeze()
+    pipe = Connection(socket_number)
+    with suppress(EOFError, OSError):
+        while True:
+            function, arguments = pickle.loads(pipe.recv_bytes())
+            try:
+                answer: tuple[bool, Any] = True, function(*arguments)
+            except FleetmapError as error:
+                answer = False, error
+            except Exception:  # raised where it can be seen, when the other process tries the same
+                answer = False, None
+            most_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+            pipe.send_bytes(pickle.dumps((*answer, most_bytes), protocol=5))
+
+
+def _end_with_parent(socket_number: int) -> None:
+    """Ends this process as soon as the other end of its socket is closed, also in the middle of work."""
+    poll = select.poll()
+    poll.register(socket_number, 0)  # hanging up is always reported
+    poll.poll()
+    os._exit(0)
 
 
 class Processes:
@@ -76,6 +196,10 @@ class Processes:
     def nearby(self) -> Executor:
         """See Executor."""
         return SERIAL
+
+    def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
+        """See Executor."""
+        return None
 
 
 class Cluster:
@@ -110,6 +234,10 @@ class Cluster:
         """See Executor."""
         return SERIAL
 
+    def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
+        """See Executor."""
+        return None
+
 
 _unpacked: dict[str, Any] = {}  # in a process of the cluster: what is shared now, by its name
 
@@ -142,13 +270,25 @@ def _in_order(
         yield result(waiting.popleft())
 
 
+def open_side_process(threads: int | None) -> AbstractContextManager[SideProcess | None]:
+    """A process beside this one; none where a survey has but one core, or where the machine has no room for a process."""
+    if _cores(threads) > 1:
+        with suppress(OSError):
+            return SideProcess()
+    return nullcontext()
+
+
+def _cores(threads: int | None) -> int:
+    return threads or len(os.sched_getaffinity(0))
+
+
 @contextmanager
-def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
+def open_executor(threads: int | None, scheduler: str | None, side: SideProcess | None = None) -> Iterator[Executor]:
     """Threads (as many as there are cores, without a number), processes of this machine (`local`), or the cluster of a scheduler.
 
-    Raises UsageError for a scheduler that is not reached by TLS, or that does not answer.
+    side: goes on beside the threads. Raises UsageError for a scheduler that is not reached by TLS, or that does not answer.
     """
-    count = threads or len(os.sched_getaffinity(0))
+    count = _cores(threads)
     if scheduler == EMBEDDED:
         with (
             tempfile.TemporaryDirectory(prefix="fleetmap-") as folder,
@@ -162,7 +302,7 @@ def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Execut
         yield SERIAL
     else:
         with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, _opencv_alone():
-            yield Threads(pool, count)
+            yield Threads(pool, count, side)
 
 
 @contextmanager

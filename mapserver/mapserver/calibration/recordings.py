@@ -17,12 +17,13 @@ from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.survey_data import stretch_of_survey, thinned
 from mapserver.survey.bundle.bundle_rounds import state_of
 from mapserver.survey.chain import AdjustedChain
+from mapserver.survey.executor import Work
 from mapserver.survey.pipeline import begin_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter
-Follow = Callable[[RigCalibration], CalibrationData]
+Follow = Callable[[RigCalibration], Work[CalibrationEstimate]]
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
@@ -50,8 +51,8 @@ def estimate_calibration(
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
-    follow: the stretch of the only recording under a calibration, instead of the first pass here. is_enough: whether an estimate need not
-    be any better, however far the parameters that are named are from the given calibration.
+    follow: the estimate from the only recording under a calibration, instead of the first pass here. is_enough: whether an estimate need
+    not be any better, however far the parameters that are named are from the given calibration.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
     if not recordings:
@@ -69,10 +70,10 @@ def estimate_calibration(
         axes = RigAxes.of(rig, Rectifier(rig))
         current = corrected_rig(rig, axes, before) if before.any() else rig
         if follow is not None and current is rig:
-            stretches = [follow(rig)]
+            estimate = follow(rig).result()
         else:
-            stretches = [followed(r, current, settings, tools or SurveyTools()) for r in recordings]
-        estimate = continued_from(before, estimate_from(stretches))
+            found = estimate_from([followed(r, current, settings, tools or SurveyTools()) for r in recordings])
+            estimate = continued_from(before, found)
         after = estimate.corrections()
         moved = [p for p, limit in _ANEW.items() if abs(after[INDEX[p]] - before[INDEX[p]]) > limit]
         if not moved or is_enough(estimate, moved):

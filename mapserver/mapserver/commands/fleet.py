@@ -83,7 +83,7 @@ def resurvey(
     json: Json = False,
     config: ConfigFile = None,
 ) -> None:
-    """List the tiles that should be surveyed again, the worst first, and why; with --route a route through them."""
+    """List the tiles that should be surveyed again and why, those that people asked for first; with --route a way through them."""
     import time
 
     from mapserver.fleet.resurvey_list import resurvey_list
@@ -99,6 +99,10 @@ def resurvey(
         return
     for concern in found.tiles:
         typer.echo(f"{concern.name}: {'; '.join(concern.reasons)}")
+    for request in found.requests:
+        typer.echo(
+            f"request {request.id} of {request.actor or 'somebody'}: {len(request.corners_map_m)} corners, {request.reason or '-'}"
+        )
     typer.echo(f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints")
 
 
@@ -116,6 +120,44 @@ def _write_route(found: "ResurveyList", path: Path) -> None:
         path.write_text(text, "utf-8")
 
 
+def replay(
+    failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
+    store: StoreFolder,
+    version: Annotated[
+        int | None, typer.Option(metavar="N", help="Version of the map to try; default: the robot's then.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
+    import subprocess
+    import sys
+    from importlib.util import find_spec
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    from fleetmap.errors import StateError
+    from mapserver.store import MapStore
+
+    if find_spec("locclient") is None:
+        raise StateError(
+            "the client of the robots is not installed here; install the distribution `fleetmap` as a whole"
+        )
+    with MapStore.open(store, read_only=True) as maps, TemporaryDirectory() as folder:
+        path = Path(folder) / f"failure-{failure}.mcap"
+        path.write_bytes(maps.fleet.replay(failure))
+        site = maps.fleet.failure(failure).failure.site
+        options = ["--store", str(store), "--site", site, *(["--json"] if json else [])]
+        if version is not None:
+            options += ["--manifest", maps.version(site, version).manifest_sha256]
+        # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md).
+        done = subprocess.run(
+            [sys.executable, "-m", "locclient.cli", "replay-failure", str(path), *options], check=False
+        )
+    if done.returncode:
+        raise typer.Exit(done.returncode)
+
+
 FLEET = Group(
-    "Fleet health: a page, files, tiles to survey again.", {"report": report, "export": export, "resurvey": resurvey}
+    "Fleet health: a page, files, tiles to survey again, failures replayed.",
+    {"report": report, "export": export, "resurvey": resurvey, "replay": replay},
 )

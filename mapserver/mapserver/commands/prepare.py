@@ -37,13 +37,17 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
     from mapserver.config import survey_settings
     from mapserver.grid.site_grid import SessionViews
     from mapserver.store import Actor
+    from mapserver.surfels.expected_view import expected_view, pinhole
+    from mapserver.surfels.surfel_map import Surfels
     from mapserver.survey.settings import SurveySettings
 
     def build(site: str, sensors: SensorSet, settings: SurveySettings | None = None) -> None:
         recording = folder / f"{site}-{sensors}.mcap"
         write_ride(recording, Ride(), sensors)
         with redirect_stderr(io.StringIO()):  # nobody needs to know what so short a survey lacks
-            built = build_map([recording], folder / "store", site, BuildOptions(settings=settings))
+            chosen = settings or survey_settings(None, sensors)
+            chosen = msgspec.structs.replace(chosen, surfel_map=True)
+            built = build_map([recording], folder / "store", site, BuildOptions(settings=chosen))
             if sensors is not SensorSet.MONO:
                 built.publish(force=True, actor=Actor("prepare", "a map that nobody drives in"))
 
@@ -70,6 +74,12 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         camera = StereoCamera(WIDTH_PX, WIDTH_PX / 2, HEIGHT_PX / 2, 0.1, WIDTH_PX, HEIGHT_PX)
         SessionViews().add((disparity, 0.3), camera, np.eye(4), 0.5)
 
+    def draw_view() -> None:
+        camera = StereoCamera(WIDTH_PX, WIDTH_PX / 2, HEIGHT_PX / 2, 0.1, WIDTH_PX, HEIGHT_PX)
+        normals, points = np.array([[0, 0, -1]], np.float32), np.array([[0, 0, 1]], np.float32)
+        surfels = Surfels(points, normals, np.zeros(1, np.uint8), np.zeros(1, np.uint8))
+        expected_view(surfels, pinhole(camera), np.eye(4))
+
     def train() -> None:
         descriptors = np.random.default_rng(0).integers(0, 256, (200, 32), dtype=np.uint8)
         train_vocabulary(descriptors, 4, 2, np.random.default_rng(0))
@@ -82,5 +92,6 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         "survey with a depth camera": lambda: build("depth", SensorSet.RGBD),
         "depth images of another camera": register_depth,
         "grid of planners": look_at_grid,
+        "expected view": draw_view,
         "vocabulary": train,
     }

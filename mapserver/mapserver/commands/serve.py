@@ -212,8 +212,15 @@ def _run(
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
-    from mapserver.serving.background_tasks import BackgroundTask, admission_tasks, run_background_tasks, server_tasks
+    from mapserver.serving.background_tasks import (
+        BackgroundTask,
+        admission_tasks,
+        alert_tasks,
+        run_background_tasks,
+        server_tasks,
+    )
     from mapserver.serving.bus_service import BusService
+    from mapserver.serving.webhook import Webhook
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
@@ -223,6 +230,7 @@ def _run(
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
     bus, robots = guarded_bus
+    webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings)
 
@@ -230,7 +238,7 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        groups = [tasks, admission_tasks(robots)]
+        groups = [tasks, admission_tasks(robots), alert_tasks(maps, fleet, settings.alerts, webhook)]
         if http.shown is not None:  # apart from the others: no robot waits for a viewer
             from mapserver.serving.fleet_viewer import FleetViewer
 
@@ -250,7 +258,7 @@ def _run(
 
     api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey, http.signer)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
-    install_dashboard(app, maps, fleet, api, bus_service.surveys)
+    install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
     config = uvicorn.Config(
         app,
         log_config=None,
@@ -277,6 +285,8 @@ def _run(
     try:
         uvicorn.Server(config).run(sockets=[http.listener])
     finally:
+        if webhook is not None:
+            webhook.close()
         bus_service.close()
         fleet.flush()
 

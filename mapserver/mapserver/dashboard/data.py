@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleetmap.errors import FleetmapError, StateError, UsageError
@@ -13,6 +14,7 @@ from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.dashboard.underlays import floor_picture, grid_picture
+from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request, survey_requests
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
@@ -69,6 +71,10 @@ class MapData:
     def sites(self) -> list[str]:
         """Names of all sites."""
         return [info.site for info in self._store.sites()]
+
+    def sites_with_jobs(self) -> list[str]:
+        """Sites of which there is a job, also those without any version yet."""
+        return self._store.sites_with_jobs()
 
     def chosen_site(self, site: str | None) -> str:
         """`site`, or the first site if none is named; UsageError for an unknown one."""
@@ -175,6 +181,19 @@ class MapData:
         changed = {cell: "changed" for cell in old.keys() & new.keys() if old[cell] != new[cell]}
         added, removed = new.keys() - old.keys(), old.keys() - new.keys()
         return changed | dict.fromkeys(added, "added") | dict.fromkeys(removed, "removed")
+
+    def survey_requests(self, site: str) -> list[SurveyRequest]:
+        """What people asked to survey again."""
+        return survey_requests(self._store, site)
+
+    def ask_for_survey(self, site: str, corners_map_m: Sequence[tuple[float, float]], actor: Actor) -> str:
+        """Puts a polygon on the list of the next survey."""
+        return f"Survey {ask_for_survey(self._store, site, corners_map_m, actor).id} is on the list."
+
+    def end_survey_request(self, site: str, request: str, actor: Actor) -> str:
+        """Takes it off that list."""
+        end_request(self._store, site, request, actor)
+        return f"Survey {request} is done."
 
     def jobs(self, site: str) -> list[JobInfo]:
         """The last jobs of a site, newest first."""

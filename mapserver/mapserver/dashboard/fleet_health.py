@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from scipy.special import bdtr
 
-from mapserver.dashboard.fleet_parts import Trial
+from mapserver.dashboard.fleet_parts import Trial, trial_of
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.canary_test import CanarySettings
@@ -127,8 +127,7 @@ class HealthData:
     def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
         rows = self._store.canaries(site)
         recent = [row for row in rows if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS][:3]
-        findings = [row.outcome or find(self._store, row, self._canary, now_ns).reason for row in recent]
-        return tuple(Trial(row, finding) for row, finding in zip(recent, findings, strict=True))
+        return tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in recent)
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:

@@ -8,6 +8,7 @@ from markupsafe import Markup
 from mapserver.dashboard import bar_chart
 from mapserver.dashboard.bar_chart import Bar
 from mapserver.dashboard.markup import badge, joined, link, share, table
+from mapserver.fleet_statistics.canary_test import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
@@ -31,10 +32,17 @@ class Figure(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A version that some robots try, or tried in the last days, and what is known about it so far."""
+    """A version that some robots try, or tried in the last days, what is known about it so far, and how often both sides failed."""
 
     canary: CanaryRow
     finding: str
+    tried: Rate
+    others: Rate
+
+
+def trial_of(canary: CanaryRow, found: CanaryFinding) -> Trial:
+    """A trial as pages show it; the outcome of one that has ended stays what it was."""
+    return Trial(canary, canary.outcome or found.reason, found.canary, found.others)
 
 
 def figures(found: Iterable[Figure]) -> Markup:
@@ -68,12 +76,20 @@ def trial_notices(trials: Iterable[Trial], moment: Callable[[int | None], str | 
     """The running trial of a version, and how those before it ended; moment: a stamp as people read it."""
     notice = Markup('<div class="notice {}" role="status"><strong>Version {} {}.</strong><br>{}</div>')
     parts = []
-    for canary, finding in trials:
+    for trial in trials:
+        canary, finding = trial.canary, trial.finding
         tone, sentence = _TRIAL_WORDS[canary.state]
         when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
         words = sentence.format(share=share(canary.share), when=when)
         said = f"{finding[:1].upper()}{finding[1:]}." if finding else ""
         parts.append(notice.format(tone, canary.version, words, said))
+        sides = ((f"version {canary.version}", trial.tried), (f"others, version {canary.base_version}", trial.others))
+        name = f"Failures per robot-day with version {canary.version} and with the others"
+        if any(map(is_telling, (trial.tried, trial.others))):
+            drawn = bar_chart.bars([rate_bar(label, rate) for label, rate in sides], name)
+            parts.append(
+                Markup('<figure class="sides">{}<figcaption class="quiet">{}</figcaption></figure>').format(drawn, name)
+            )
     return joined(parts)
 
 

@@ -8,6 +8,7 @@ from fastapi.responses import RedirectResponse
 from nicegui import app as pages
 from nicegui import ui
 
+from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
@@ -27,12 +28,15 @@ from mapserver.dashboard.pages import (
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
+from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import MapStore
 
 PATH = "/dashboard"
 
 
-def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
+def install_dashboard(
+    app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys, bus: Bus
+) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     services = Services(
         MapData(store, settings.gate, settings.canary.share, signer=settings.signer),
@@ -40,6 +44,7 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         LiveRobots(fleet, time.monotonic),
         settings.guard,
         surveys,
+        RobotPlacing(store, fleet, bus),
     )
     for page in (fleet_page, robot_page, map_page, failure_page, survey_page, live_page):
         page.install(services)

@@ -22,6 +22,7 @@ from mapserver.dashboard.map_layers import Layer, box_of, ground
 from mapserver.dashboard.markup import address, joined, link, time_fields
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
+from mapserver.serving.robot_placing import RobotPlacing
 
 T = TypeVar("T")
 
@@ -46,13 +47,14 @@ _SESSION_EVERY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way, robots to be told."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
     guard: GuardSettings
     surveys: LiveSurveys
+    placing: RobotPlacing
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,14 +117,16 @@ async def show(
     """The layout of a page with the content of `build`; a FleetmapError becomes a notice in its place.
 
     knows: query parameters of the page beside the site; others are refused, since a filter that is not applied misleads.
-    The live page knows sites of which the store has nothing yet: those that are being surveyed.
+    Pages of what goes on know sites of which the store has no version yet: those that are being surveyed or built.
     """
     root = str(request.scope.get("root_path", ""))
     _set_look(request)
     try:
         sites = await load(services.maps.sites)
         under_way = services.surveys.sites() if page == "live" else []
-        if page == "live" and site is None and under_way:
+        if page == "surveys":
+            under_way = await load(services.maps.sites_with_jobs)
+        if site is None and under_way and (page == "live" or not sites):
             site = under_way[0]
         chosen = site if site in under_way else await load(services.maps.chosen_site, site)
         zone = zone_of(request.cookies.get(_ZONE_COOKIE))

@@ -1,149 +1,9 @@
 // The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports.
 import { leaflet as L } from "nicegui-leaflet";
+import { Axes, Marks, MarkSet, Trails, words } from "fleetmap-marks";
 import { loadResource } from "../../static/utils/resources.js";
 
-const SHAPES = {
-  circle: "M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0Z",
-  square: "M-5-5H5V5H-5Z",
-  triangle: "M0-6.5L6 5H-6Z",
-  cross: "M-5-5L5 5M-5 5L5-5",
-  arrow: "M-9 0H7M2-4.5L8 0L2 4.5",
-};
-const MOVE_MS = 1000; // robots report every second
-const FRAME_MS = 30;
-const JUMP_M = 6; // who goes further within a second did not drive there
-const NAMED_PX_PER_M = 16;
-const FEW = 12;
-const TRAIL = 60;
 const POINTS_PER_NAME_PX = 7;
-
-const svg = (name, attributes = {}) => {
-  const node = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const key in attributes) node.setAttribute(key, attributes[key]);
-  return node;
-};
-const words = (text) => {
-  const node = document.createElement("span"); // robots and people choose their words: text, never markup
-  node.textContent = text;
-  return node;
-};
-
-// All marks of a layer in one SVG, whose units are leaflet's pixels; nothing is drawn while no mark moves.
-const Marks = L.Layer.extend({
-  initialize() {
-    this.marks = new Map();
-    this.hasTrails = false;
-  },
-  onAdd(map) {
-    this.map = map;
-    this.root = svg("svg", { class: "marks" });
-    this.trails = this.root.appendChild(svg("path", { class: "trails" }));
-    map.getPane("markerPane").appendChild(this.root);
-    map.on("zoomend viewreset", this.redraw, this);
-    for (const mark of this.marks.values()) this.root.appendChild(mark.node);
-    this.redraw();
-  },
-  onRemove(map) {
-    map.off("zoomend viewreset", this.redraw, this);
-    this.root.remove();
-    this.root = undefined;
-  },
-  show(items, isMoving) {
-    const seen = new Set();
-    const still = !isMoving || matchMedia("(prefers-reduced-motion: reduce)").matches;
-    items.forEach((item, n) => {
-      const key = item.name || `${n}`;
-      seen.add(key);
-      let mark = this.marks.get(key);
-      if (!mark || mark.item.address !== item.address) {
-        mark?.node.remove();
-        mark = { x: item.x, y: item.y, path: [] };
-        mark.node = svg(item.address ? "a" : "g", item.address ? { href: item.address } : {});
-        mark.title = mark.node.appendChild(svg("title"));
-        mark.nose = mark.node.appendChild(svg("path", { class: "nose", d: "M5 0H13" }));
-        mark.shape = mark.node.appendChild(svg("path", { class: "shape" }));
-        mark.text = mark.node.appendChild(svg("text", { x: 9, y: -7 }));
-        mark.node.addEventListener("click", (event) => this.map.dragging.moved() && event.preventDefault());
-        this.marks.set(key, mark);
-        this.root?.appendChild(mark.node);
-      }
-      this.dress(mark, item);
-      const far = Math.hypot(item.x - mark.x, item.y - mark.y) > JUMP_M;
-      mark.from = still || far ? undefined : { x: mark.x, y: mark.y, since: performance.now() };
-      if (!mark.from) [mark.x, mark.y] = [item.x, item.y];
-      mark.path.push([item.x, item.y]);
-      if (mark.path.length > TRAIL) mark.path.shift();
-    });
-    for (const [key, mark] of this.marks) if (!seen.has(key)) mark.node.remove(), this.marks.delete(key);
-    this.redraw();
-    if (!this.frame && !still) this.frame = requestAnimationFrame((now) => this.step(now));
-  },
-  dress(mark, item) {
-    const css = `mark ${item.tone} ${item.shape}`;
-    if (mark.css !== css) mark.node.setAttribute("class", (mark.css = css));
-    if (mark.item?.shape !== item.shape) mark.shape.setAttribute("d", SHAPES[item.shape]);
-    if (mark.item?.words !== item.words) {
-      mark.title.textContent = item.words;
-      if (item.address) mark.node.setAttribute("aria-label", item.words);
-    }
-    if (mark.item?.name !== item.name) mark.text.textContent = item.name;
-    const turn = item.heading_rad === null ? "" : `rotate(${((-item.heading_rad * 180) / Math.PI).toFixed(1)})`;
-    if (mark.turn !== turn) {
-      mark.turn = turn;
-      mark.nose.setAttribute("transform", turn);
-      mark.nose.style.display = turn && item.shape !== "arrow" ? "" : "none";
-      if (item.shape === "arrow") mark.shape.setAttribute("transform", turn);
-    }
-    mark.node.dataset.name = item.name;
-    mark.node.dataset.at = `${item.x.toFixed(2)} ${item.y.toFixed(2)}`;
-    mark.item = item;
-  },
-  step(now) {
-    this.frame = undefined;
-    let isMoving = false;
-    if (this.root && now - (this.drawn ?? 0) >= FRAME_MS) {
-      this.drawn = now;
-      for (const mark of this.marks.values()) {
-        if (!mark.from) continue;
-        const share = Math.min(1, (now - mark.from.since) / MOVE_MS);
-        mark.x = mark.from.x + share * (mark.item.x - mark.from.x);
-        mark.y = mark.from.y + share * (mark.item.y - mark.from.y);
-        if (share === 1) mark.from = undefined;
-        this.put(mark);
-      }
-    }
-    for (const mark of this.marks.values()) isMoving ||= mark.from !== undefined;
-    if (this.root && isMoving) this.frame = requestAnimationFrame((then) => this.step(then));
-  },
-  put(mark) {
-    const [x, y] = [mark.x * this.scale - this.origin.x, -mark.y * this.scale - this.origin.y];
-    mark.node.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)})`);
-  },
-  redraw() {
-    if (!this.root) return;
-    this.scale = this.map.options.crs.scale(this.map.getZoom());
-    this.origin = this.map.getPixelOrigin();
-    for (const mark of this.marks.values()) this.put(mark);
-    this.root.classList.toggle("all-names", this.scale >= NAMED_PX_PER_M || this.marks.size <= FEW);
-    const way = ([x, y]) => `${(x * this.scale - this.origin.x).toFixed(1)} ${(-y * this.scale - this.origin.y).toFixed(1)}`;
-    const drawn = this.hasTrails ? [...this.marks.values()].map((mark) => "M" + mark.path.map(way).join("L")) : [];
-    this.trails.setAttribute("d", drawn.join(""));
-  },
-});
-
-const Trails = L.Layer.extend({
-  initialize(marks) {
-    this.marks = marks;
-  },
-  onAdd() {
-    this.marks.hasTrails = true;
-    this.marks.redraw();
-  },
-  onRemove() {
-    this.marks.hasTrails = false;
-    this.marks.redraw();
-  },
-});
 
 const corners = ([x0, y0, x1, y1]) => [[y0, x0], [y1, x1]];
 const places = (points) => points.map(([x, y]) => [y, x]);
@@ -175,7 +35,7 @@ export default {
     await loadResource(window.path_prefix + `${this.resourcePath}/leaflet/leaflet.css`);
     const scene = this.scene;
     this.$el.setAttribute("role", "group");
-    this.$el.setAttribute("aria-label", scene.label);
+    this.$el.setAttribute("aria-label", `${scene.label}; what is marked on it is listed on this page`);
     const map = (this.map = L.map(this.$el, {
       crs: L.CRS.Simple,
       minZoom: -6,
@@ -190,12 +50,17 @@ export default {
     map.on("focus", () => map.scrollWheelZoom.enable()); // until then the wheel scrolls the page
     map.on("blur", () => map.scrollWheelZoom.disable());
     map.fitBounds(corners(scene.box), { padding: [6, 6] });
-    L.control.scale({ imperial: false, position: "bottomleft" }).addTo(map);
+    const marks = new Marks();
+    map.addLayer(new Axes()).addLayer(marks);
+    map.on("click", ({ containerPoint, latlng }) => {
+      if (!marks.nearest(containerPoint)) this.$emit("pick", { x: latlng.lng, y: latlng.lat });
+    });
+    this.$el.marks = () => marks.told(); // a canvas does not say what it shows
     this.layers = {};
     const chosen = {};
     for (const { name, items, shown } of scene.layers) {
       const group = (this.layers[name] = L.layerGroup());
-      group.marks = new Marks();
+      group.marks = new MarkSet(marks);
       group.addLayer(group.marks);
       if (shown) group.addTo(map);
       chosen[name] = group;

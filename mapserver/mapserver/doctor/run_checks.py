@@ -1,15 +1,17 @@
 """Reads the frames that the checks need and runs all of them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, so3_log
 from fleetmap.recordings import Recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from mapserver.calibration import CalibrationEstimate
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import inertial, timing
 from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
@@ -19,8 +21,9 @@ from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo, swapped_cameras
-from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.executor import SERIAL, Executor, Work
 
+_Turns = tuple[CameraTurns, int, list[str]]  # how many frames were tried, and what was wrong with some
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
 TURN_FRAMES = 200
@@ -55,6 +58,14 @@ class _Frames:
             self.errors.append(str(error))
             return None
 
+    def taken(self, turns: CameraTurns, tried: int, errors: list[str]) -> CameraTurns:
+        """The turns of frames that were read elsewhere."""
+        self.tried += tried
+        self.errors += errors
+        for _ in range(tried):
+            self._on_frame()
+        return turns
+
 
 def run_checks(
     recording: Recording,
@@ -84,9 +95,22 @@ def run_checks(
     calibration = MeasuredCalibration([], None)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
     findings += _soon_seen(recording, rectifier, seen)
+    beside: list[Work[_Turns]] = []
+
+    def followed(rig: RigCalibration) -> Work[CalibrationEstimate]:
+        """Turns are looked at once the estimate is on its way."""
+        assert follow is not None
+        work = follow(rig)
+        turns = executor.beside(_turns_alone, _bare(recording), turn_frames) if not beside else None
+        beside.extend([] if turns is None else [turns])
+        return work
+
     if recording.sensor_set in _PAIRS:
-        calibration = measure_calibration(recording, on_frame, executor, follow)
-    turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
+        calibration = measure_calibration(recording, on_frame, executor, None if follow is None else followed)
+    if beside:
+        turns = frames.taken(*beside[0].result())
+    else:
+        turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     findings += [*checked, *calibration.findings, sharpness(seen.variances), _readable(frames)]
     return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
@@ -157,6 +181,20 @@ def _camera_turns(
             ends.append(end_ns)
             rates.append(rate)
     return CameraTurns(np.array(starts, np.int64), np.array(ends, np.int64), np.array(rates).reshape(-1, 3))
+
+
+def _bare(recording: Recording) -> Recording:
+    """What turns are seen in, to be read in another process."""
+    part = recording.part(np.arange(len(recording)))
+    return replace(part, wheel=(), priors=(), ground_truth=None, issues=())
+
+
+def _turns_alone(recording: Recording, count: int) -> _Turns:
+    """The camera's turns in a recording, which is closed then."""
+    with recording:
+        frames = _Frames(recording, lambda: None)
+        rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+        return _camera_turns(recording, frames, rectifier, count, SERIAL), frames.tried, frames.errors
 
 
 def _turn(

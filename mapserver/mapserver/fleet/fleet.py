@@ -26,6 +26,7 @@ from fleetmap.messages import (
 from mapserver.fleet.ingest import Ingest, IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.rejected_reports import RejectedReports, rejection
+from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet.version_assignment import VersionAssignment, read_assignment
 from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import MapStore
@@ -91,6 +92,7 @@ class Fleet:
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
         self._rejected = RejectedReports(store.folder / "refused")
+        self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)
         self._failures = RateLimit(FAILURE_BURST, FAILURES_PER_S, clock_ns)
         self._robots: dict[tuple[str, str], _Robot] = {}
         self.storage_fault = ""

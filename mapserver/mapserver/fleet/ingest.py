@@ -36,6 +36,7 @@ class IngestSettings(Section, frozen=True):
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
     picture_bytes: PositiveInt = 1_000_000_000  # the oldest pictures go as new ones come
+    replay_bytes: PositiveInt = 2_000_000_000  # the oldest recordings of failures go as new ones come
     failures_per_robot: PositiveInt = 5000  # twelve a day for 400 days
     prune_every_s: Positive = 600.0  # between deletions of old rows
     presence_every_s: Positive = 5.0  # between looks at the robots on the bus

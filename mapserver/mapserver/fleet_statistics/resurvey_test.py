@@ -77,10 +77,15 @@ def concerns(
         then = before.get(tile, Counters())
         reasons = [*_rising(now, then, total, settings, tests), *_fading(now, then, settings)]
         if reasons:
-            old, new = kpis(then).landmarks_seen_share, kpis(now).landmarks_seen_share
-            both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
-            found.append(TileConcern(tile, reasons, *both, new, old, f"tile {tile}"))
+            found.append(concern_of(tile, reasons, now, then))
     return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
+
+
+def concern_of(tile: str, reasons: list[str], now: Counters, then: Counters) -> TileConcern:
+    """A tile with what was counted in it, recently and before."""
+    old, new = kpis(then).landmarks_seen_share, kpis(now).landmarks_seen_share
+    both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
+    return TileConcern(tile, reasons, *both, new, old, f"tile {tile}")
 
 
 def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, float]]) -> list[Waypoint]:

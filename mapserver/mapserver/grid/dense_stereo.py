@@ -49,6 +49,12 @@ def dense_disparity(
     return np.where(is_known, disparity, np.float32(np.nan)), DENSE_SIGMA_PX
 
 
+def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[np.float32]:
+    """(H, W) the largest disparity around each pixel, 0 where none is known."""
+    block = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    return np.asarray(cv2.dilate(np.nan_to_num(disparity_px), block), np.float32)
+
+
 def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
     """How far below the camera the floor is, from disparities (H, W) and map_from_cam (4, 4) of some views.
 

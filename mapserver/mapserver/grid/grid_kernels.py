@@ -15,7 +15,7 @@ from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLI
 BELOW_M = 0.15  # what lies deeper is a mirror image in the floor, or a wrong disparity
 HIT_STRIDE, RAY_STRIDE = 2, 4  # pixels
 MAX_HIT_SIGMA_M = 0.08  # of the depth: beyond, points say only what is free before them
-_CLEAR_SIGMAS = 3.0  # and a cell: so far before a point its ray no longer proves a voxel free
+CLEAR_SIGMAS = 3.0  # and a cell: so far before a point its ray no longer proves a voxel free
 _MIN_POINTS = 6  # of a view in a voxel that it hits
 _MOST = 255
 PASSED, HIDDEN = 1, 2
@@ -53,7 +53,7 @@ def cast_view(
                     if v % RAY_STRIDE == 0 and u % RAY_STRIDE == 0 and was_free[row, column] >> level & 1:
                         _walk(camera, end, (1.0, np.inf), HIDDEN, looks)
             if v % RAY_STRIDE == 0 and u % RAY_STRIDE == 0:
-                clear_m = 0.0 if is_near and is_floor else _CLEAR_SIGMAS * sigma_m + CELL_M
+                clear_m = 0.0 if is_near and is_floor else CLEAR_SIGMAS * sigma_m + CELL_M
                 free_m = min(depth_m - clear_m, lens[3] / nearest_px[v, u])
                 if free_m > 0.0:
                     _walk(camera, end, (0.0, free_m / depth_m), PASSED, looks)

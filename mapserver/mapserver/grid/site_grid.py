@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,15 +11,15 @@ from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts, Tiles, whole_grid
-from mapserver.grid.dense_stereo import BLOCK_PX
+from mapserver.grid.dense_stereo import BLOCK_PX, nearest_around
 from mapserver.grid.grid_kernels import RAY_STRIDE, add_view, cast_view
 
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
 # speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
-_HIT, _OCCUPIED, _FREE, _AGAINST = 2, 4, 4, 2
+HIT, OCCUPIED, _FREE, AGAINST = 2, 4, 4, 2
 # A pixel's depth may be that of anything in the block that was matched, and its ray stands for the pixels up to the next one.
-_REACH_PX = (BLOCK_PX + RAY_STRIDE) // 2
+REACH_PX = (BLOCK_PX + RAY_STRIDE) // 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 
@@ -47,8 +46,7 @@ class SessionViews:
         place = np.array([*(at_cells - corner), floor_m])
         turn = np.ascontiguousarray(map_from_cam[:3, :3])
         px, sigma_px = disparity
-        block = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
-        nearest_px = np.asarray(cv2.dilate(np.nan_to_num(px), block), np.float32)
+        nearest_px = nearest_around(px, REACH_PX)
         parts, was_free = list(_parts(corner, size)), np.zeros((size, size), np.uint8)
         for tile, in_tile, in_window in parts:
             if tile in self.before:
@@ -112,10 +110,10 @@ def updated(views: SessionViews) -> Tiles:
     for place, (hits, passes, hidden, heights) in views.tiles.items():
         old = views.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
-        score = _HIT * hits.astype(np.int16) - passes
-        occupied = (score >= _OCCUPIED) | (was_occupied & (score > -_AGAINST))
-        is_hidden = (hidden >= _AGAINST) & (score > -_AGAINST)
-        free = ~occupied & ((score <= -_FREE) | (was_free & (score < _AGAINST) & ~is_hidden))
+        score = HIT * hits.astype(np.int16) - passes
+        occupied = (score >= OCCUPIED) | (was_occupied & (score > -AGAINST))
+        is_hidden = (hidden >= AGAINST) & (score > -AGAINST)
+        free = ~occupied & ((score <= -_FREE) | (was_free & (score < AGAINST) & ~is_hidden))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
         # What stood there in some views alone has left no voxel.

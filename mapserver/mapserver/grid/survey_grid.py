@@ -12,6 +12,7 @@ from fleetmap.version_grid import Counts, Tiles
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
 from mapserver.grid.site_grid import SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
+from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.pipeline import Survey
 
 _FLOOR_VIEWS = 15
@@ -23,6 +24,34 @@ class GridSession(NamedTuple):
     name: str
     survey: Survey
     map_from_body: Array
+
+
+class DepthView(NamedTuple):
+    """A keyframe with its disparities (H, W), their standard deviation, and where it looks from (4, 4)."""
+
+    keyframe: Keyframe
+    disparity_px: NDArray[np.float32]
+    sigma_px: float
+    map_from_cam: Array
+
+
+def measures_depth(survey: Survey) -> bool:
+    """Whether its pictures hold depth: the camera of a survey with one camera may have a baseline too, of the adjustment's own."""
+    if not survey.state.camera.baseline_m > 0:
+        return False
+    frame = survey.odometry.keyframes[0].frame
+    return frame.right is not None or frame.disparity_px is not None
+
+
+def depth_views(session: GridSession, settings: StereoSettings, chosen: slice) -> Iterator[DepthView]:
+    """The chosen keyframes of a session, matched as a whole one after the other."""
+    survey, camera = session.survey, session.survey.state.camera
+    columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
+    yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
+    for keyframe in survey.odometry.keyframes[chosen]:
+        disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
+        map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+        yield DepthView(keyframe, disparity_px - yaw_px, sigma_px, map_from_cam)
 
 
 def grow_grid(
@@ -41,24 +70,16 @@ def grow_grid(
 
 def _views(session: GridSession, settings: StereoSettings, before: Tiles) -> SessionViews | str:
     survey, camera = session.survey, session.survey.state.camera
-    if not camera.baseline_m > 0:
+    if not measures_depth(survey):
         return "one camera measures no depth; a grid needs a stereo pair or a depth camera"
     keyframes = survey.odometry.keyframes
-    columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
-    yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
-
-    def seen(chosen: slice) -> Iterator[tuple[NDArray[np.float32], float, Array]]:
-        for keyframe in keyframes[chosen]:
-            disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
-            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
-            yield disparity_px - yaw_px, sigma_px, map_from_cam
-
     few = slice(None, None, max(1, len(keyframes) // _FLOOR_VIEWS))
-    floor_m = floor_distance_m(((disparity, place) for disparity, _, place in seen(few)), camera)
+    near = depth_views(session, settings, few)
+    floor_m = floor_distance_m(((view.disparity_px, view.map_from_cam) for view in near), camera)
     if floor_m is None:
         return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
     views = SessionViews(before)
-    for disparity_px, sigma_px, map_from_cam in seen(slice(None)):
+    for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
         views.add((disparity_px, sigma_px), camera, map_from_cam, floor_m)
     frames = [keyframe.frame_index for keyframe in keyframes]
     views.add_path((session.map_from_body[frames] @ survey.state.body_from_cam)[:, :3, 3], floor_m)

@@ -21,7 +21,7 @@ from fleetmap.live_survey import NO_PART, LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.build.build import BuildOptions
-from mapserver.build.zones_file import read_zones
+from mapserver.build.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map, open_map
 from mapserver.live.drives import Drive, DueFrame
 from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MakeMap, MappingProcess, thinning

@@ -12,7 +12,7 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized, starts_without_prior
+from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized
 
 _STRETCH_M, _APART_M = 3.0, 1.0
 _BREAK_M, _BREAK_SHARE = 0.15, 0.05
@@ -27,17 +27,22 @@ class Probes:
     replayed: Sequence[Probe]
     last_version: Sequence[Probe]
 
+    @property
+    def frames(self) -> Sequence[Probe]:
+        """Those from recordings, or the keyframes where there are none."""
+        return [*self.held_out, *self.replayed] or self.last_version
+
 
 def examine(draft: MapView, before: MapView | None, probes: Probes, motion: TrajectoryBreaks | None) -> Evidence:
-    """What the probes find in the draft, and in the current version's tiles where there are any."""
-    frames = [*probes.held_out, *probes.replayed] or probes.last_version
+    """What the probes find in the draft, and in the current version's tiles where there are any; starts are left to the caller."""
+    frames = probes.frames
     return Evidence(
         held_out=compare(draft, before, probes.held_out),
         replayed=compare(draft, before, probes.replayed),
         last_version=compare(draft, before, probes.last_version),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
-        starts=starts_without_prior(draft, frames),
+        starts=None,
         motion=motion,
     )
 

@@ -75,6 +75,7 @@ class BusService:
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
+            bus.queryable(robot_key("*", "*", "replays"), self._counted("replay", self._replay)),
             bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
             bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
             bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
@@ -159,6 +160,9 @@ class BusService:
         if ack.refused:
             self._count("failure refused for good", "refused", 0)
         return encode_message(ack)
+
+    def _replay(self, key: str, payload: bytes) -> bytes:
+        return encode_message(self._fleet.replays.take(*self._sender(key), payload))
 
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)

@@ -1,19 +1,20 @@
-"""One version as one file, to carry it to another store or to a robot; fleetmap.version_file describes and reads it."""
+"""One version as one file, to carry it to another store or to a robot; fleetmap.mapformat.version_file describes and reads it."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import cast
 
 from fleetmap.errors import MapFormatError, disk_errors
 from fleetmap.mapformat import Manifest
-from fleetmap.version_file import BlobKind, ExportBlob, ExportHead
+from fleetmap.mapformat.version_file import BlobKind, ExportBlob, ExportHead
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.files import write_atomically
 from mapserver.store.rows import VersionInfo
 
 
 def export_head(
-    info: VersionInfo, manifest: Manifest, blobs: BlobFolder, kept: Sequence[tuple[BlobKind, str]]
+    info: VersionInfo, manifest: Manifest, blobs: BlobFolder, kept: Sequence[tuple[str, str]]
 ) -> ExportHead:
     """What the file of a version holds. kept: kind and address of what robots do not fetch; StoreError where the store lacks it."""
     entries = [ExportBlob(kind="manifest", sha256=info.manifest_sha256, bytes=info.manifest_bytes)]
@@ -21,7 +22,8 @@ def export_head(
     tiles = {tile.sha256: tile.bytes for tile in manifest.tiles}
     entries += [ExportBlob(kind="tile", sha256=sha256, bytes=size) for sha256, size in tiles.items()]
     for kind, sha256 in kept:
-        entries.append(ExportBlob(kind=kind, sha256=sha256, bytes=sum(len(chunk) for chunk in blobs.chunks(sha256))))
+        size = sum(len(chunk) for chunk in blobs.chunks(sha256))
+        entries.append(ExportBlob(kind=cast(BlobKind, kind), sha256=sha256, bytes=size))
     return ExportHead(site=info.site, version=info.version, blobs=tuple(entries))
 
 

@@ -13,7 +13,16 @@ from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
 from mapserver.floor_plan.areas import Areas
 from mapserver.store.database import Transactions
-from mapserver.store.rows import AXES, FailureDetail, FailureFilter, FailureRow, FleetRetention, PictureRow, TraceRow
+from mapserver.store.rows import (
+    AXES,
+    FailureDetail,
+    FailureFilter,
+    FailureReplay,
+    FailureRow,
+    FleetRetention,
+    PictureRow,
+    TraceRow,
+)
 
 CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
@@ -160,6 +169,41 @@ class FleetQueries:
             raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
         return bytes(rows[0]["jpeg"])
 
+    def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
+        """The number of a robot's report, None where it is not kept."""
+        query = "SELECT number FROM failures WHERE site = ? AND robot = ? AND failure_id = ?"
+        rows = self._transactions.query(query, (site, robot, failure_id))
+        return int(rows[0]["number"]) if rows else None
+
+    def add_replay(self, number: int, replay: FailureReplay, keep_bytes: int) -> None:
+        """Keeps a failure's recording, with its pictures among those of the failure; the oldest recordings go, never this one."""
+        with self._transactions.write() as connection:
+            values = (number, replay.summary, replay.mcap)
+            if not connection.execute("INSERT OR IGNORE INTO failure_replays VALUES (?, ?, ?)", values).rowcount:
+                return
+            query = "SELECT coalesce(max(place) + 1, 0) FROM failure_pictures WHERE number = ?"
+            (place,) = connection.execute(query, (number,)).fetchone()
+            connection.executemany(
+                "INSERT INTO failure_pictures VALUES (?, ?, ?, ?, ?)",
+                [(number, place + n, "replay", stamp_ns, jpeg) for n, (stamp_ns, jpeg) in enumerate(replay.pictures)],
+            )
+            self._picture_bytes += sum(len(jpeg) for _, jpeg in replay.pictures)
+            _prune_replays(connection, keep_bytes, number)
+
+    def replay_summary(self, number: int) -> bytes | None:
+        """The summary of a failure's recording, None where there is none, or none any more."""
+        rows = self._transactions.query("SELECT summary FROM failure_replays WHERE number = ?", (number,))
+        return bytes(rows[0]["summary"]) if rows else None
+
+    def replay(self, number: int) -> bytes:
+        """The MCAP file of a failure's recording; UsageError where there is none, or none any more."""
+        rows = self._transactions.query("SELECT mcap FROM failure_replays WHERE number = ?", (number,))
+        if not rows:
+            raise UsageError(
+                f"failure {number} has no recording: its robot sends none ([run] replays), has not sent it yet, or it went to save space"
+            )
+        return bytes(rows[0]["mcap"])
+
     def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
         """Where a robot was, oldest first."""
         return self._transactions.rows(
@@ -258,6 +302,14 @@ def _prune_failures(connection: sqlite3.Connection, robot: tuple[str, str], keep
 
 def _sum_of_pictures(connection: sqlite3.Connection) -> int:
     return int(connection.execute("SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures").fetchone()[0])
+
+
+def _prune_replays(connection: sqlite3.Connection, keep_bytes: int, newest: int) -> None:
+    """The oldest recordings go until keep_bytes stay."""
+    sizes = connection.execute("SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC").fetchall()
+    sums = accumulate(size for _, size in sizes)
+    last = next((number for (number, _), kept in zip(sizes, sums, strict=True) if kept > keep_bytes), None)
+    connection.execute("DELETE FROM failure_replays WHERE number <= ? AND number <> ?", (last, newest))
 
 
 def _prune_pictures(connection: sqlite3.Connection, keep_bytes: float) -> int:

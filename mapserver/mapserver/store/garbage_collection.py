@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
-from mapserver.store.version_rows import set_state, site_releases
+from mapserver.store.version_rows import EXTRA_TABLES, set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000
 
@@ -94,13 +94,13 @@ def _write_down(transactions: Transactions, connection: sqlite3.Connection, garb
         set_state(connection, (site, version), "retired", transactions.now_ns())
         transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))
     for site, version in garbage.removed:
-        for table in ("currents", "verdicts", "evidence", "grid_blobs", "version_blobs", "versions"):
+        for table in ("currents", "verdicts", "evidence", *EXTRA_TABLES.values(), "version_blobs", "versions"):
             connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
         transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))
 
 
 def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
-    tables = ("version_blobs", "grid_blobs")
+    tables = ("version_blobs", *EXTRA_TABLES.values())
     rows = [row for t in tables for row in transactions.query(f"SELECT site, version, sha256 FROM {t}")]
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
     of_sites = "SELECT vocabulary_sha256 sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL UNION SELECT sha256 FROM site_files"

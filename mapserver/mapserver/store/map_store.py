@@ -31,7 +31,7 @@ from fleetmap.mapformat import (
     encode_tile,
 )
 from fleetmap.mapformat.building import BUILDING_KEY
-from fleetmap.version_file import BlobKind, ExportHead, open_export
+from fleetmap.mapformat.version_file import ExportHead, open_export
 from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
     check_no_link,
@@ -59,7 +59,15 @@ from mapserver.store.rows import (
     VersionInfo,
 )
 from mapserver.store.verification import StoreFindings, verify
-from mapserver.store.version_rows import apply_changes, insert_draft, insert_grid, insert_verdict, site_releases
+from mapserver.store.version_rows import (
+    EXTRA_TABLES,
+    apply_changes,
+    extras,
+    insert_draft,
+    insert_extras,
+    insert_verdict,
+    site_releases,
+)
 
 _USUAL_RETENTION = Retention()
 
@@ -135,7 +143,8 @@ class MapStore(StoreQueries):
             entries = sorted((self._put_tile(tile) for tile in content.tiles), key=lambda entry: (entry.x, entry.y))
             vocabulary = BlobEntry(sha256=self._blobs.put(content.vocabulary), bytes=len(content.vocabulary))
             archive_sha256 = None if content.archive is None else self._blobs.put(content.archive)
-            grid = [self._blobs.put(data) for data in content.grid]
+            every = {"grid": content.grid, "surfel": content.surfels}
+            kept = {kind: [self._blobs.put(data) for data in blobs] for kind, blobs in every.items()}
             with self._transactions.write() as connection:
                 connection.execute("INSERT OR IGNORE INTO sites (site) VALUES (?)", (site,))
                 last = connection.execute("SELECT last_version FROM sites WHERE site = ?", (site,)).fetchone()[0]
@@ -152,7 +161,7 @@ class MapStore(StoreQueries):
                 draft = self._draft_row(manifest, archive_sha256, content.job)
                 log = LogEntry("saved", f"draft {manifest.version}", manifest.version, actor)
                 insert_draft(self._transactions, connection, manifest, draft, log)
-                insert_grid(connection, draft, grid)
+                insert_extras(connection, draft, kept)
                 if content.evidence is not None:
                     connection.execute(
                         "INSERT INTO evidence (site, version, figures) VALUES (?, ?, ?)",
@@ -234,9 +243,8 @@ class MapStore(StoreQueries):
         return head, lambda: export_chunks(head, self._blobs)
 
     def _export_head(self, site: str, version: int, *, archive: bool) -> ExportHead:
-        info, query = self.version(site, version), "SELECT sha256 FROM grid_blobs WHERE site = ? AND version = ?"
-        rows = self._transactions.query(query, (site, version)) if archive else []
-        kept: list[tuple[BlobKind, str]] = [("grid", row["sha256"]) for row in rows]
+        info = self.version(site, version)
+        kept = extras(self._transactions, site, version) if archive else []
         if archive and info.archive_sha256 is not None:
             kept.append(("archive", info.archive_sha256))
         return export_head(info, self.manifest(site, version), self._blobs, kept)
@@ -255,7 +263,7 @@ class MapStore(StoreQueries):
             if known is not None:
                 return known
             reader.check_tiles(manifest)
-            grid = [blob.sha256 for blob in reader.head.blobs if blob.kind == "grid"]
+            kept = {kind: [b.sha256 for b in reader.head.blobs if b.kind == kind] for kind in EXTRA_TABLES}
             for number, blob in enumerate(reader.head.blobs):
                 self._blobs.put_chunks(reader.chunks(number), blob.sha256, blob.bytes)
             archive = reader.head.archive()
@@ -265,7 +273,7 @@ class MapStore(StoreQueries):
                 draft = self._draft_row(manifest, None if archive is None else archive.sha256, None)
                 log = LogEntry("saved", f"import as draft {manifest.version}", manifest.version, actor)
                 insert_draft(self._transactions, connection, manifest, draft, log)
-                insert_grid(connection, draft, grid)
+                insert_extras(connection, draft, kept)
         return self.version(manifest.site, manifest.version)
 
     def _building(self, site: str) -> dict[str, Any]:

@@ -248,4 +248,20 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             for column in ("heard_ns INTEGER", "flags TEXT", "frame_ms REAL", "exposure REAL", "sharpness REAL")
         ),
     ),
+    (
+        # The surfels of a version: their index and tiles, which stay on the server.
+        """CREATE TABLE surfel_blobs (
+            site TEXT NOT NULL,
+            version INTEGER NOT NULL,
+            sha256 TEXT NOT NULL,
+            PRIMARY KEY (site, version, sha256),
+            FOREIGN KEY (site, version) REFERENCES versions(site, version)) WITHOUT ROWID""",
+    ),
+    (
+        # The recording of the seconds around a failure, and what stands in its summary.
+        """CREATE TABLE failure_replays (
+            number INTEGER PRIMARY KEY REFERENCES failures(number) ON DELETE CASCADE,
+            summary BLOB NOT NULL,
+            mcap BLOB NOT NULL)""",
+    ),
 )

@@ -160,6 +160,11 @@ class StoreQueries:
         sha256 = self.site_file_sha256(site, kind)
         return None if sha256 is None else self._blobs.get(sha256)
 
+    def site_file_kinds(self, site: str) -> list[str]:
+        """What kinds of files a site keeps, in order."""
+        rows = self._transactions.query("SELECT kind FROM site_files WHERE site = ? ORDER BY kind", (site,))
+        return [row["kind"] for row in rows]
+
     def site_file_sha256(self, site: str, kind: str) -> str | None:
         """The address of what `site_file` reads."""
         rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))
@@ -244,16 +249,45 @@ class StoreQueries:
         )
         return [RobotInfo(**row | {"last_report": json.loads(row["last_report"])}) for row in rows]
 
-    def jobs(self, site: str | None = None, *, before: int | None = None, limit: int = -1) -> list[JobInfo]:
-        """Jobs (of a site), newest first, older than job `before`."""
+    def jobs(
+        self,
+        site: str | None = None,
+        span_ns: tuple[int | None, int | None] = (None, None),
+        *,
+        before: int | None = None,
+        limit: int = -1,
+    ) -> list[JobInfo]:
+        """Jobs (of a site), newest first, older than job `before`; span_ns: begun from when and until before when, by the second."""
+        since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
         return self._jobs(
-            "WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2) ORDER BY id DESC LIMIT ?3",
-            (site, before, limit),
+            """WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR started >= ?3)
+               AND (?4 IS NULL OR started < ?4) ORDER BY id DESC LIMIT ?5""",
+            (site, before, since, until, limit),
         )
+
+    def sites_with_jobs(self) -> list[str]:
+        """Sites of which there is a job, also those without any version yet."""
+        rows = self._transactions.query("SELECT DISTINCT site FROM jobs ORDER BY site")
+        return [row["site"] for row in rows]
+
+    def tell_progress(self, job: int, progress: dict[str, Any]) -> None:
+        """Keeps how far a running job is, in its report; nothing for one that has ended."""
+        with self._transactions.write(durable=False) as connection:
+            connection.execute(
+                "UPDATE jobs SET report = json_set(report, '$.progress', json(?)) WHERE id = ? AND state = 'running'",
+                (json.dumps(progress), job),
+            )
 
     def running_jobs(self) -> list[JobInfo]:
         """Jobs whose row says that they run, oldest first."""
         return self._jobs("WHERE state = 'running' ORDER BY id", ())
+
+    def last_night(self, site: str) -> JobInfo | None:
+        """The site's last nightly job that has ended; None before the first."""
+        found = self._jobs(
+            "WHERE site = ? AND kind = 'nightly' AND state <> 'running' ORDER BY id DESC LIMIT 1", (site,)
+        )
+        return found[0] if found else None
 
     def job(self, number: int) -> JobInfo:
         """One job; raises UsageError where it does not exist."""
@@ -306,5 +340,9 @@ class StoreQueries:
         return next(iter(self._transactions.rows(VersionInfo, query, (site,))), None)
 
     def _now(self) -> str:
-        moment = datetime.fromtimestamp(self._clock_ns() / 1e9, UTC)
-        return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
+        return _iso(self._clock_ns())
+
+
+def _iso(stamp_ns: int) -> str:
+    moment = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
+    return moment.isoformat(timespec="seconds").replace("+00:00", "Z")

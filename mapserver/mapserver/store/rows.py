@@ -133,13 +133,17 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DraftContent:
-    """A new draft. archive: the whole survey; grid: as of `encode_grid`; evidence: for the gate; job: number of the one that made it."""
+    """A new draft. archive: the whole survey; grid, surfels: as of `encode_grid`, `encode_surfels`; evidence: for the gate.
+
+    job: number of the one that made it.
+    """
 
     tiles: Sequence[Tile]
     vocabulary: bytes
     details: DraftDetails
     archive: bytes | None = None
     grid: Sequence[bytes] = ()
+    surfels: Sequence[bytes] = ()
     evidence: Evidence | None = None
     job: int | None = None
 
@@ -194,6 +198,15 @@ class FailureDetail:
     failure: FailureRow
     report: FailureReport
     pictures: list[PictureRow]
+
+
+@dataclass(frozen=True, slots=True)
+class FailureReplay:
+    """A failure's recording: its summary, the MCAP file, and stamps and JPEG files of its left pictures."""
+
+    summary: bytes
+    mcap: bytes
+    pictures: list[tuple[int, bytes]]
 
 
 @dataclass(frozen=True, slots=True)

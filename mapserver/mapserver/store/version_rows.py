@@ -2,12 +2,15 @@
 
 import json
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import FOR_ROBOTS
 from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VerdictRow, VersionInfo
+
+EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
+"""By kind: where the bytes stand that a version has beside those that its robots need."""
 
 # The newest row of a version that was current before the one that is current now.
 _ROLLBACK_TARGET = """
@@ -100,10 +103,21 @@ def insert_draft(
     transactions.log(connection, draft.site, log)
 
 
-def insert_grid(connection: sqlite3.Connection, draft: VersionInfo, addresses: Iterable[str]) -> None:
-    """The bytes of a draft's grid, within a transaction."""
-    rows = [(draft.site, draft.version, sha256) for sha256 in sorted(set(addresses))]
-    connection.executemany("INSERT INTO grid_blobs (site, version, sha256) VALUES (?, ?, ?)", rows)
+def insert_extras(connection: sqlite3.Connection, draft: VersionInfo, extras: Mapping[str, Iterable[str]]) -> None:
+    """The bytes of a draft's grid and surfels, by their kind in EXTRA_TABLES, within a transaction."""
+    for kind, addresses in extras.items():
+        rows = [(draft.site, draft.version, sha256) for sha256 in sorted(set(addresses))]
+        connection.executemany(f"INSERT INTO {EXTRA_TABLES[kind]} (site, version, sha256) VALUES (?, ?, ?)", rows)
+
+
+def extras(transactions: Transactions, site: str, version: int) -> list[tuple[str, str]]:
+    """Kind and address of the bytes of a version's grid and surfels."""
+    query = "SELECT sha256 FROM {} WHERE site = ? AND version = ? ORDER BY sha256"
+    return [
+        (kind, row["sha256"])
+        for kind, table in EXTRA_TABLES.items()
+        for row in transactions.query(query.format(table), (site, version))
+    ]
 
 
 def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:

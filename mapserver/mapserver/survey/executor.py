@@ -5,7 +5,18 @@ from typing import Any, Protocol, TypeVar
 
 Batch = TypeVar("Batch")
 Result = TypeVar("Result")
+Later_co = TypeVar("Later_co", covariant=True)
 Shared = TypeVar("Shared")
+
+
+class Work(Protocol[Later_co]):
+    """Work that goes on beside what asked for it."""
+
+    def done(self) -> bool:
+        """Whether its result is there."""
+
+    def result(self) -> Later_co:
+        """Its result, waited for; or the error that it raised."""
 
 
 class Executor(Protocol):
@@ -19,6 +30,12 @@ class Executor(Protocol):
     @property
     def nearby(self) -> "Executor":
         """For small batches that are waited for: the way to processes and back would cost more than they take over."""
+
+    def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
+        """function(*arguments), which can be pickled, on another core while the caller goes on; what was asked for earlier comes first.
+
+        None where no core is left for that: the caller computes it when it needs it.
+        """
 
 
 class SerialExecutor:
@@ -34,6 +51,10 @@ class SerialExecutor:
     def nearby(self) -> Executor:
         """See Executor."""
         return self
+
+    def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
+        """See Executor."""
+        return None
 
 
 SERIAL = SerialExecutor()

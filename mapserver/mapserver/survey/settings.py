@@ -154,6 +154,7 @@ class SurveySettings(Section, frozen=True):
 
     seed: int = 0
     occupancy_grid: bool = False
+    surfel_map: bool = False
     odometry: OdometrySettings = OdometrySettings()
     orb: OrbSettings = OrbSettings(count=1200)
     stereo: StereoSettings = StereoSettings()

@@ -6,9 +6,9 @@ from pathlib import Path
 import msgspec
 
 from fleetmap.errors import UntrustedError, UsageError, disk_errors
+from fleetmap.mapformat.version_file import open_export
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import TrustedMap, site_role
-from fleetmap.version_file import open_export
 from mapserver.store.files import write_atomically
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 

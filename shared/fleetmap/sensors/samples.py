@@ -94,6 +94,10 @@ class PositionPrior:
     is_revisable: bool = False
 
 
+# What a person's pose leaves unsaid is not known exactly: roll pitch yaw (rad), x y z (m). Yaw, x and y are what RViz sends.
+UNSAID_SIGMAS = np.array([0.05, 0.05, np.radians(15.0), 0.5, 0.5, 0.25])
+
+
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Stamped transforms of the body: stamps_ns (N,) increasing, frame_from_body (N, 4, 4)."""

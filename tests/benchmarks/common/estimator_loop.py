@@ -225,7 +225,7 @@ def run_localizer(
     """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
     nominal = session.session.nominal
     localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
-    localizer._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
+    localizer.perception.odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
     localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1
     localizer._lookalikes = lookalikes
     if prior is not None:

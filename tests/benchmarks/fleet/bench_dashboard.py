@@ -2,9 +2,10 @@
 
     PYTHONPATH=tests python tests/benchmarks/fleet/bench_dashboard.py [--robots 300] [--seconds 60] [--pages 5] [--out FILE.json]
 
-Robots send health at 1 Hz and poses at 2 Hz from a process of their own. Pages are loaded in a browser without anything in its cache
-(cold) and again with it (warm), until their first words are seen. Then the server's CPU and memory are taken for `--seconds` without and
-with so many open fleet pages. Needs Debian's chromium.
+Robots drive at 0.8 m/s and send health at 1 Hz and poses at 2 Hz from a process of their own. Pages are loaded in a browser without
+anything in its cache (cold) and again with it (warm), until their first words are seen. The map of the fleet page is in sight for ten
+seconds: how often the browser draws (requestAnimationFrame), and how often the page paints its robots. Then the server's CPU and memory
+are taken for `--seconds` without and with so many open fleet pages. Needs Debian's chromium.
 """
 
 import argparse
@@ -24,16 +25,20 @@ from playwright.sync_api import BrowserContext, sync_playwright
 from mapserver.api.app import fleetmap_version
 from support.fleet.dashboard_scene import chromium, fill_store, serving
 
-PAGES = ("", "map", "failures", "failures/1", "surveys")
+PAGES = ("", "map", "failures", "failures/1", "robots/tug-7", "surveys", "live")
 _REPEATS = 5
+_FRAMES_S = 10
 _TALK = """
 import sys, time
-from dashboard_scene import speak_all, place_of
+from support.fleet.dashboard_scene import place_of, speak
 from fleetmap.bus import ZenohBus
 with ZenohBus.connect(sys.argv[1]) as bus:
     start_s = time.monotonic()
     for tick in range(1 << 30):
-        speak_all(bus, int(sys.argv[2]), (tick + 1) * 500_000_000, with_health=tick % 2 == 0)
+        for number in range(int(sys.argv[2])):
+            x, y = place_of(number)
+            status = ("TRACKING", "LOST")[number % 20 == 0]
+            speak(bus, f"tug-{number}", (tick + 1) * 500_000_000, (4 + (x + 0.4 * tick) % 56, y), status, with_health=tick % 2 == 0)
         time.sleep(max(0.0, start_s + (tick + 1) * 0.5 - time.monotonic()))
 """
 
@@ -46,6 +51,32 @@ def _load_ms(context: BrowserContext, address: str) -> float:
     took_s = time.perf_counter() - started_s
     page.close()
     return took_s * 1e3
+
+
+_COUNT = """
+window.counted = {drawn: 0, painted: 0};
+const clear = CanvasRenderingContext2D.prototype.clearRect;
+CanvasRenderingContext2D.prototype.clearRect = function (...box) {
+  if (this.canvas.closest('.leaflet-marker-pane')) counted.painted += 1;
+  return clear.apply(this, box);
+};
+const draw = () => { counted.drawn += 1; requestAnimationFrame(draw); };
+requestAnimationFrame(draw);
+"""
+
+
+def _frames_per_s(context: BrowserContext, address: str, robots: int) -> dict[str, float]:
+    page = context.new_page()
+    page.add_init_script(_COUNT)
+    page.goto(address)
+    page.wait_for_function(f"document.querySelector('.site-map')?.marks?.().length === {robots}")
+    page.locator(".site-map").scroll_into_view_if_needed()
+    page.wait_for_timeout(3000)
+    begun, begun_s = page.evaluate("({...counted})"), time.perf_counter()
+    page.wait_for_timeout(_FRAMES_S * 1000)
+    ended, seconds = page.evaluate("({...counted})"), time.perf_counter() - begun_s
+    page.close()
+    return {name: round((ended[name] - begun[name]) / seconds, 1) for name in ended}
 
 
 def _cost(process: int, seconds: float) -> dict[str, float]:
@@ -88,6 +119,10 @@ def measure(robots: int, seconds: float, pages: int) -> dict[str, Any]:
                         "cold_median_ms": round(float(np.median(cold)), 1), "cold_max_ms": round(max(cold), 1),
                         "warm_median_ms": round(float(np.median(warm)), 1),
                     }  # fmt: skip
+                context = browser.new_context(viewport={"width": 1280, "height": 800})
+                frames = _frames_per_s(context, f"{served.http}/dashboard/", robots)
+                context.close()
+                time.sleep(12)  # the server forgets a page that is gone after 10 s
                 without = _cost(served.process, seconds)
                 context = browser.new_context()
                 for _ in range(pages):
@@ -99,7 +134,12 @@ def measure(robots: int, seconds: float, pages: int) -> dict[str, Any]:
                 browser.close()
                 talking.kill()
                 talking.wait()
-    return {"loads": loads, "server_without_pages": without, f"server_with_{pages}_fleet_pages": with_pages}
+    return {
+        "loads": loads,
+        "map_frames_per_s": frames,
+        "server_without_pages": without,
+        f"server_with_{pages}_fleet_pages": with_pages,
+    }
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from fleetmap.mapformat import (
 )
 from fleetmap.mapformat.manifest import Name
 from fleetmap.mapformat.names import NAME_PATTERN
-from fleetmap.version_file import ExportHead
+from fleetmap.mapformat.version_file import ExportHead
 from support.fleet.contracts_documents import REPOSITORY
 
 GOLDEN = REPOSITORY / "tests" / "golden"

@@ -11,7 +11,16 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
-from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from fleetmap.geometry import se3_inverse
+from fleetmap.messages import (
+    FailureAck,
+    FailureReport,
+    InitialPoseMessage,
+    Status,
+    decode_message,
+    encode_message,
+    robot_key,
+)
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
@@ -30,7 +39,8 @@ from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
-from mapserver.store import MapStore
+from mapserver.serving.robot_placing import RobotPlacing
+from mapserver.store import Actor, MapStore
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
@@ -103,6 +113,7 @@ class World:
             robot=robot,
             tile_loader=TileLoader(CachedMap(caches[1], "room"), TileSelectionSettings()),
             outbox=outbox,
+            replays=None,
             publisher=listener,
             server=ServerSync(client, outbox, retry_s=600.0),
             first=client.active(),
@@ -196,6 +207,32 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     assert active is not None
     assert active.version == 2
     assert world.fleet.robots("room")[0].version == 2
+
+
+def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(world: World) -> None:
+    robot, listener = robot_world.new_robot(), Listener()
+    source = ScriptedSource(list(robot_world.bundles(150)), ready=lambda: robot.running is not None)
+    parts = world.parts(source, robot, listener)
+    place = robot_world.truth(60) @ se3_inverse(robot.base_from_body)
+    told = InitialPoseMessage(
+        site="room", robot="r1", x_map_m=float(place[0, 3]) + 6.0, y_map_m=float(place[1, 3]), heading_rad=0.0
+    )
+
+    def tell() -> None:
+        with MemoryBus(world.hub) as server:
+            RobotPlacing(world.store, world.fleet, server).tell(told, Actor("ada", "it was pushed"))
+
+    source.before[60] = tell
+    Runtime(parts, ServiceManager("")).run()
+    assert {one.status for one in listener.estimates[30:60]} == {Status.TRACKING}
+    moved = [n for n, one in enumerate(listener.estimates[60:70], 60) if one.status is Status.DEGRADED]
+    assert moved
+    assert moved[0] <= 63, "within a few frames"
+    off_m = listener.estimates[moved[0]].map_from_body[:2, 3] - robot_world.truth(moved[0])[:2, 3]
+    assert np.linalg.norm(off_m) == pytest.approx(6.0, abs=0.3)
+    assert listener.estimates[-1].status is Status.TRACKING
+    (event,) = [event for event in world.store.events("room") if event.kind == "robot placed"]
+    assert (event.actor, event.reason) == ("ada", "it was pushed")
 
 
 def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
@@ -12,6 +14,7 @@ from fleetmap.mapformat import blob_path
 from fleetmap.messages import (
     FailureAck,
     FailureReport,
+    InitialPoseMessage,
     RobotHealth,
     WantedVersion,
     decode_message,
@@ -282,3 +285,30 @@ def test_tiles_that_a_robot_cannot_read_are_fetched_again(world: World) -> None:
     world.sync.refetch.append(wanted)
     world.step()
     assert list(world.sync.fetched) == [wanted]
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_taken"),
+    [
+        ({}, True),
+        ({"heading_rad": 1.0}, True),
+        ({"robot": "r2"}, False),
+        ({"site": "yard"}, False),
+        ({"x_map_m": float("nan")}, False),
+        ({"sigma_m": 0.0}, False),
+    ],
+)
+def test_a_persons_word_is_a_prior_that_fixes_may_outweigh(
+    world: World, changes: dict[str, object], is_taken: bool
+) -> None:
+    told = msgspec.structs.replace(InitialPoseMessage(site="lab", robot="r1", x_map_m=3.0, y_map_m=-2.0), **changes)
+    with MemoryBus(world.hub) as server:
+        server.publish(robot_key("lab", "r1", "initial_pose"), encode_message(told))
+    assert len(world.sync.priors) == is_taken
+    for prior in world.sync.priors:
+        assert prior.is_revisable
+        assert prior.map_from_base[:3, 3].tolist() == [3.0, -2.0, 0.0]
+        assert np.sqrt(np.diag(prior.cov_rot_trans))[3:5].tolist() == [0.5, 0.5]
+        heading_rad = changes.get("heading_rad")
+        assert np.isfinite(prior.cov_rot_trans[2, 2]) == (heading_rad is not None)
+        assert prior.map_from_base[1, 0] == pytest.approx(np.sin(heading_rad or 0.0))

@@ -11,12 +11,15 @@ import pytest
 from fleetmap.bus import ZenohBus
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
+from locclient.delivery.failure_file import read_failure_file
 from locclient.delivery.outbox import Outbox
 from locclient.identity import MapAddress
 from locclient.maps import connection
 from locclient.maps.connection import connected
 from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import LocalMapSource
 from locclient.replay import run_reporter
+from locclient.replay.failure_replay import compare_failure
 from locclient.replay.replay import ReplayOptions, replay
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
@@ -81,7 +84,13 @@ def test_a_carried_robot_is_on_the_server(server: Server, carried: Path, tmp_pat
     assert (row.robot, row.cause) == ("r1", "carried")
     found = server.store.fleet.failure(row.number)
     assert found.report.wrong_by_m == pytest.approx(2.4, abs=0.1)
-    assert [picture.kind for picture in found.pictures] == ["frame", "frame", "frame", "matches"]
+    kinds = [picture.kind for picture in found.pictures]
+    assert kinds[:4] == ["frame", "frame", "frame", "matches"]
+    assert set(kinds[4:]) == {"replay"}
+    (tmp_path / "failure.mcap").write_bytes(server.store.fleet.replay(row.number))
+    summary, record = read_failure_file(tmp_path / "failure.mcap")
+    assert summary.id == found.report.id
+    assert compare_failure((summary, record), LocalMapSource(server.store.folder, "room")).first_difference_ns is None
     server.fleet.flush()
     total = server.store.fleet.counters("room", "site")["room", ""]
     assert total.position_failures + total.suspected == 1, "counted once, by report and statuses together"

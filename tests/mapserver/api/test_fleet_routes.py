@@ -11,6 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
+from mapserver.store import FailureReplay
 from support.fleet.served_api import Server, check_problem, served_api
 
 
@@ -58,6 +59,20 @@ def test_failures_are_found_by_what_they_are(server: Server) -> None:
     check_problem(server.client.get("/v1/failures/2/pictures/7"), 404, "no picture 7")
 
 
+def test_the_recording_of_a_failure_is_downloaded(server: Server) -> None:
+    server.fleet.take_failure("lab", "r1", failure(1))
+    check_problem(server.client.get("/v1/failures/1/replay.mcap"), 404, "no recording")
+    replay = FailureReplay(b"summary", b"the file", [(5, b"\xff\xd8small\xff\xd9")])
+    server.fleet._store.fleet.add_replay(1, replay, 10**9)
+    answer = server.client.get("/v1/failures/1/replay.mcap")
+    assert (answer.content, answer.headers["content-type"]) == (b"the file", "application/octet-stream")
+    assert answer.headers["content-disposition"] == 'attachment; filename="failure-1.mcap"'
+    assert [picture["kind"] for picture in server.client.get("/v1/failures/1").json()["pictures"]] == [
+        "frame",
+        "replay",
+    ]
+
+
 def test_figures_by_what_they_are_counted_by(server: Server) -> None:
     for number in range(3):
         server.fleet.take_failure("lab", f"r{number}", failure(number, robot=f"r{number}"))
@@ -97,7 +112,8 @@ def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
 
 
 def test_a_resurvey_list_and_its_route(server: Server) -> None:
-    assert server.client.get("/v1/sites/lab/resurvey").json() == {"site": "lab", "version": 1, "tiles": [], "route": []}
+    nothing = {"site": "lab", "version": 1, "tiles": [], "route": [], "requests": []}
+    assert server.client.get("/v1/sites/lab/resurvey").json() == nothing
     assert server.client.get("/v1/sites/lab/resurvey/route").json()["type"] == "FeatureCollection"
     check_problem(server.client.get("/v1/sites/none/resurvey"), 404, "no site none")
 

@@ -107,6 +107,8 @@ def paths_of(client: TestClient) -> list[tuple[str, str]]:
         "after": "2",
         "sha256": "5e" * 32,
         "job": "1",
+        "robot": "r1",
+        "asked": "00000000",
         "number": "1",
     }
     paths = client.app.openapi()["paths"]

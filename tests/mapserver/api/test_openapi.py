@@ -1,5 +1,6 @@
 """The OpenAPI document holds: whatever is asked as it allows (or not), the answers are as it says and never 500."""
 
+import time
 from pathlib import Path
 
 import schemathesis
@@ -11,6 +12,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
+from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.messages import FailureReport, Placement, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
@@ -18,11 +20,13 @@ from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.fleet.fleet import Fleet
-from mapserver.store import MapStore
-from support.storage.map_samples import save_grid_draft, save_sample_draft
+from mapserver.fleet.survey_requests import ask_for_survey
+from mapserver.store import Actor, FailureReplay, MapStore
+from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
 
+POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
 FAILURE = FailureReport(
     site="hall", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
     version=1, tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
@@ -31,7 +35,7 @@ FAILURE = FailureReport(
 )  # fmt: skip
 
 
-def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
+def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[int]:
     """The statuses of the answers to questions made up after the document, some of them about what is there."""
     statuses: list[int] = []
 
@@ -43,9 +47,15 @@ def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
             path["site"] = "hall"
             path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
         path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
+        path |= {"asked": request} if number % 2 and "asked" in path else {}
+        path |= {"robot": "r1"} if number % 2 and "robot" in path else {}
         path |= {"place": 0} if number % 2 and "place" in path else {}
         if number % 2 and isinstance(case.body, dict):
-            case.body = case.body | {"actor": "ada"}  # nobody signs in here
+            where = {name: 1.0 for name in ("x_map_m", "y_map_m") if name in case.body}
+            where |= {"corners_map_m": POLYGON} if "corners_map_m" in case.body else {}
+            if operation.label.endswith("/publish") and number % 4 == 1:  # the gate refuses the draft otherwise
+                where |= {"force": True, "reason": "a test"}
+            case.body = case.body | {"actor": "ada"} | where  # nobody signs in here
         response = case.call(base_url="http://127.0.0.1")
         case.validate_response(response, checks=list(CHECKS))
         statuses.append(response.status_code)
@@ -55,20 +65,26 @@ def ask_operation(operation: schemathesis.APIOperation) -> list[int]:
 
 
 def test_no_question_breaks_the_server(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
+    now_ns = time.time_ns()
+    with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         for seed in range(2):
             save_sample_draft(store, site="hall", seed=seed)
             releases.publish(store, "hall")
-        save_grid_draft(store, site="hall")
+        save_grid_draft(store, site="hall", surfels=wall())
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
-        fleet = Fleet(store)
+        fleet = Fleet(store, clock_ns=lambda: now_ns)  # a robot that was heard stays so
         assert not fleet.take_failure("hall", "r1", FAILURE).refused
+        store.fleet.add_replay(1, FailureReplay(b"summary", b"recording", []), keep_bytes=100)
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
+        asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
         settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})))
-        app = create_app(store, fleet, Metrics(store, fleet), None, None, settings)
+        app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app)
-        asked = {operation.ok().label: ask_operation(operation.ok()) for operation in schema.get_all_operations()}
+        asked = {
+            operation.ok().label: ask_operation(operation.ok(), asked_for.id)
+            for operation in schema.get_all_operations()
+        }
         assert sum(len(statuses) for statuses in asked.values()) >= 100
         for label, statuses in asked.items():
             assert "v1" not in label or "{sha256}" in label or 200 in statuses, f"{label}: {statuses}"

@@ -5,7 +5,10 @@ import signal
 import time
 from pathlib import Path
 
-from mapserver.build.job_lock import INTERRUPTED, end_interrupted, recorded_job
+import pytest
+
+from fleetmap.errors import StoreError
+from mapserver.build.job_lock import INTERRUPTED, JobProgress, end_interrupted, recorded_job
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -55,3 +58,42 @@ def test_the_next_job_ends_it_too(tmp_path: Path) -> None:
             assert [job.state for job in maps.jobs()] == ["running", "failed"]
         assert [job.state for job in maps.jobs()] == ["done", "failed"]
     assert list(tmp_path.glob("job-*.lock")) == []
+
+
+def test_a_job_tells_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
+    """At most every two seconds, each stage at once; also for a site without a version."""
+    now_s = [100.0]
+    with MapStore.open(tmp_path, create=True) as maps:
+        with recorded_job(maps, "new", "build") as job:
+            tell = JobProgress(maps, job.number, lambda: now_s[0])
+            told = []
+            for step_s, stage, done in (
+                (0, "odometry", 1),
+                (1, "odometry", 5),
+                (1.5, "odometry", 8),
+                (0.1, "matching", 0),
+            ):
+                now_s[0] += step_s
+                tell(stage, done, 10)
+                told.append(maps.job(1).report["progress"])
+            assert [(one["stage"], one["done"], one["stage_s"]) for one in told] == [
+                ("odometry", 1, 0.0),
+                ("odometry", 1, 0.0),
+                ("odometry", 8, 2.5),
+                ("matching", 0, 0.0),
+            ]
+            assert maps.sites_with_jobs() == ["new"]
+            job.report = {"version": 1}
+        assert maps.job(1).report == {"version": 1}
+        maps.tell_progress(1, {"stage": "late"})
+        assert maps.job(1).report == {"version": 1}
+        JobProgress(maps, None)("odometry", 1, 2)  # a build that no job stands for
+
+
+def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def busy(*_: object) -> None:
+        raise StoreError("the store is busy")
+
+    with MapStore.open(tmp_path, create=True) as maps, recorded_job(maps, "new", "build") as job:
+        monkeypatch.setattr(maps, "tell_progress", busy)
+        JobProgress(maps, job.number)("odometry", 1, 2)

@@ -80,7 +80,7 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         ):
             expect(page.locator("body")).to_contain_text(words)
         expect(page.locator(".site-map .cell.tile")).to_have_count(2)
-        expect(page.locator(".site-map .mark.warn")).to_have_count(1)
+        page.wait_for_function("document.querySelector('.site-map').marks().some(mark => mark.tone === 'warn')")
         parts = [
             LivePart(start_s=0.0, end_s=5.0, keyframes=25, is_map=True),
             LivePart(start_s=8.0, end_s=12.0, keyframes=10, is_map=False),

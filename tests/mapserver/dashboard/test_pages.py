@@ -1,36 +1,28 @@
 """The dashboard in a real browser: every page, live changes, versions promoted and rolled back, nothing loaded from elsewhere."""
 
 import re
-import time
-from collections.abc import Iterator
 from datetime import datetime, timedelta
-from pathlib import Path
 from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
 from fleetmap.bus import ZenohBus
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
-from mapserver import releases
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (
+    ROBOTS,
     SITE,
-    Seen,
     Served,
-    chromium,
     failure,
-    fill_store,
+    marks,
+    opened,
     place_of,
-    serving,
     talking,
-    watch,
 )
 
-ROBOTS = 300
-expect.set_options(timeout=30_000)  # a busy machine answers late
 PAGES = {
     "": "Robots of hall",
     "map": "Map of hall",
@@ -40,49 +32,6 @@ PAGES = {
     "surveys": "Surveys of hall",
     "live": "Survey of hall",
 }
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    path = chromium()
-    with sync_playwright() as playwright:
-        # The second name is how a page from elsewhere would reach loopback.
-        rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", rules])
-        yield started
-        started.close()
-
-
-@pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("store")
-    fill_store(folder)
-    with serving(folder) as server:
-        with talking(server.zenoh, ROBOTS):
-            deadline_s = time.monotonic() + 30
-            while len(httpx.get(f"{server.http}/v1/robots?limit=1000").json()["robots"]) < ROBOTS:
-                assert time.monotonic() < deadline_s
-                time.sleep(0.2)
-        yield server
-    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
-
-
-@pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(90_000)
-    yield context.new_page()
-    context.close()
-
-
-def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
-    """Opens a page and waits until it is live."""
-    seen = watch(page)
-    asked = "&".join(f"{name}={value}" for name, value in query.items())
-    page.goto(f"{served.http}/dashboard/{path}?{asked}")
-    expect(page.locator("h1")).to_be_visible()
-    page.wait_for_function("window.socket && window.socket.connected")
-    return seen
 
 
 def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page: Page, served: Served) -> None:
@@ -96,6 +45,12 @@ def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{path} is wider than {width}"
             contrast, words = page.evaluate(WEAKEST_CONTRAST)
             assert contrast >= 4.5, f"{path}, {look}: {words}"
+        page.set_viewport_size({"width": 390, "height": 844})
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{path} is wider than a telephone"
+        narrow_px = page.evaluate(
+            "Math.min(999, ...[...document.querySelectorAll('dl.facts dd')].map(dd => dd.offsetWidth))"
+        )
+        assert narrow_px > 100, f"{path}: words are broken into letters"
         page.wait_for_timeout(500)  # for what asks late; the browser's own "networkidle" does not always come
         assert seen.faults == []
         assert len(seen.requests) > 3
@@ -132,23 +87,23 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
     with talking(served.zenoh, ROBOTS) as moved:
         seen = opened(page, served, "")
         expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
-        mark = page.locator(".site-map .mark[data-name='tug-4']")
-        expect(mark).to_have_attribute("data-at", "{:.2f} {:.2f}".format(*place_of(4)))
-        assert page.locator(".site-map .mark").count() == ROBOTS
+        shown = marks(page)
+        assert len(shown) == ROBOTS
+        assert page.locator(".site-map *").count() < ROBOTS / 3, "robots are painted: they cost no elements"
         assert page.evaluate(PLACE_OF, "tug-4") == pytest.approx(place_of(4), abs=0.05), "drawn where it is"
         page.get_by_role("button", name="Zoom in").click()
         page.wait_for_timeout(300)
         assert page.evaluate(PLACE_OF, "tug-4") == pytest.approx(place_of(4), abs=0.05)
         moved["tug-4"] = (40.0, 14.0)
-        expect(mark).to_have_attribute("data-at", "40.00 14.00", timeout=15_000)
-        expect(mark).to_have_class(re.compile("mark bad"), timeout=15_000)
+        at_new_place = "marks => marks.some(m => m.name === 'tug-4' && m.x === 40 && m.y === 14 && m.tone === 'bad')"
+        page.wait_for_function(f"({at_new_place})(document.querySelector('.site-map').marks())", timeout=15_000)
         attention = page.get_by_role("region", name="Robots that need a look")
         expect(page.locator(".attention")).to_contain_text(f"of {ROBOTS} robots need a look")
         attention.get_by_role("link").first.click()
         lost = attention.page.url.rpartition("/")[2].partition("?")[0]
         expect(page.locator("h1")).to_have_text(lost)
         expect(page.locator(".notice.bad")).to_contain_text(re.compile(r"^Lost since \d{4}-"))
-        expect(page.locator(f".site-map .mark[data-name='{lost}']")).to_have_count(1)
+        assert [mark["name"] for mark in marks(page)] == [lost]
         expect(page.get_by_role("table", name="States, the last one first")).to_contain_text("lost")
         opened(page, served, "")
         before = page.evaluate("performance.timeOrigin")
@@ -159,13 +114,48 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         assert seen.faults == []
 
 
-# Where a mark is drawn, in metres: by the picture of the landmarks, whose corners are those of the hall's tiles.
+# Where a mark is drawn, in metres, by the picture of the landmarks, whose corners are those of the hall's tiles; null without paint.
 PLACE_OF = """name => {
-  const picture = document.querySelector('.site-map img.picture').getBoundingClientRect();
-  const shape = document.querySelector(`.mark[data-name="${name}"] .shape`).getBoundingClientRect();
+  const map = document.querySelector('.site-map');
+  const picture = map.querySelector('img.picture').getBoundingClientRect();
+  const [x, y] = map.marks().find(mark => mark.name === name).page;
+  const canvas = map.querySelector('.leaflet-marker-pane canvas'), corner = canvas.getBoundingClientRect();
+  const copy = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  copy.drawImage(canvas, corner.x - x, corner.y - y);
+  const paint = copy.getImageData(0, 0, 1, 1).data;
   const scale = 64 / picture.width;
-  return [(shape.x + shape.width / 2 - picture.x) * scale, (picture.bottom - shape.y - shape.height / 2) * scale];
+  return paint[3] === 255 ? [(x - picture.x) * scale, (picture.bottom - y) * scale] : null;
 }"""
+
+
+def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) -> None:
+    seen = opened(page, served, "")
+    shown = {mark["name"]: mark for mark in marks(page)}
+    page.locator(".site-map").scroll_into_view_if_needed()
+    for _ in range(3):  # until no other robot is within the pointer's reach
+        page.get_by_role("button", name="Zoom in").click()
+    middle = page.evaluate(
+        "(box => [box.x + box.width / 2, box.y + box.height / 2])(document.querySelector('.site-map').getBoundingClientRect())"
+    )
+    shown = {mark["name"]: mark for mark in marks(page)}
+    name = min(shown, key=lambda name: sum(abs(a - b) for a, b in zip(shown[name]["page"], middle, strict=True)))
+    x, y = shown[name]["page"]
+    page.mouse.move(x + 3, y - 3)
+    expect(page.locator(".leaflet-tooltip")).to_have_text(re.compile(f"^{name}: "))
+    page.mouse.move(x + 60, y + 60)
+    page.mouse.click(x + 3, y - 3)
+    expect(page.locator("h1")).to_have_text(name)
+    assert seen.faults == []
+
+
+def test_names_do_not_overlap(page: Page, served: Served) -> None:
+    with talking(served.zenoh, ROBOTS):
+        opened(page, served, "")
+        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
+        named = [mark["page"] for mark in marks(page) if mark["isNamed"]]
+        assert 1 < len(named) < ROBOTS / 2
+        for number, (x, y) in enumerate(named):
+            assert all(abs(x - other_x) > 30 or abs(y - other_y) > 16 for other_x, other_y in named[:number])
 
 
 def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served: Served) -> None:
@@ -208,7 +198,7 @@ def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
         )
         assert not decode_message(answer, FailureAck).refused
     expect(page.locator("tbody")).to_contain_text("glare", timeout=8000)
-    expect(page.locator(".mark.bad")).to_have_count(1)
+    assert [mark["tone"] for mark in marks(page)] == ["bad"]
     assert seen.faults == []
 
 
@@ -224,8 +214,18 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
         expect(content).to_contain_text(words)
     assert [page.locator(f".line.{tone}").count() for tone in ("good", "bad", "quiet")] == [1, 1, 1]
     with MapStore.open(served.folder) as store:
-        store.begin_job(SITE, "convert")
-    expect(page.locator("tbody").first).to_contain_text("convert", timeout=8000)
+        job = store.begin_job(SITE, "convert")
+        expect(page.locator("tbody").first).to_contain_text("convert", timeout=8000)
+        store.tell_progress(job, {"stage": "matching", "done": 30, "total": 120, "stage_s": 60.0})
+        expect(page.locator("tbody").first).to_contain_text("matching: 30 of 120, about 3 min more", timeout=8000)
+        assert page.locator("tbody progress").evaluate("bar => bar.value / bar.max") == 0.25
+        store.update_job(job, "done", "converted", {})
+        new = store.begin_job("yard", "build")
+        store.tell_progress(new, {"stage": "odometry", "done": 1, "total": 10, "stage_s": 1.0})
+        opened(page, served, "surveys", site="yard")
+        expect(page.locator("tbody")).to_contain_text("odometry: 1 of 10")
+        store.update_job(new, "failed", "no frames", {})
+        expect(page.locator("tbody")).to_contain_text("no frames")
     assert seen.faults == []
 
 
@@ -281,69 +281,7 @@ def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:
     assert page.evaluate(chosen)
 
 
-def change(page: Page, words: str, *, name: str | None = "ada") -> None:
-    """Asks for a change and confirms it."""
-    page.get_by_role("button", name=words, exact=True).click()
-    dialog = page.locator(".q-dialog")
-    if name is not None:
-        dialog.get_by_label("Your name").fill(name)
-    dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
-    dialog.get_by_role("button", name=f"Yes: {words}").click()
-
-
-def current(served: Served) -> int:
-    with MapStore.open(served.folder) as store:
-        return store.current(SITE).version
-
-
-def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> None:
-    fill_store(tmp_path)
-    with serving(tmp_path) as served:
-        seen = opened(page, served, "map")
-        page.get_by_role("button", name="Roll back to version 1").click()
-        page.get_by_role("button", name="No, change nothing").click()
-        expect(page.locator(".q-dialog")).to_have_count(0)
-        assert current(served) == 2
-
-        change(page, "Roll back to version 1", name=" ")
-        expect(page.locator(".q-dialog .notice")).to_contain_text("your name")
-        page.keyboard.press("Escape")
-        opened(page, served, "map")
-        change(page, "Roll back to version 1")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 1.")
-        assert current(served) == 1
-        history = page.get_by_role("region", name="History")
-        expect(history).to_contain_text("robots lose themselves in aisle 3")
-        change(page, "Promote version 2")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.")
-        change(page, "Publish draft 3")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 3.")
-        assert current(served) == 3
-        assert seen.faults == []
-
-        # Somebody else acts: the page follows.
-        with MapStore.open(served.folder) as store:
-            releases.roll_back(store, SITE)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.", timeout=10_000)
-
-
 def test_under_another_name_there_is_no_page(page: Page, served: Served) -> None:
     answer = page.goto(f"http://elsewhere.example:{urlsplit(served.http).port}/dashboard/map")
     assert answer.status == 403
     assert "is not called" in page.content()
-
-
-def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:
-    with MapStore.open(served.folder) as store:
-        canary = releases.start_canary(store, SITE, 1, 0.05)
-        seen = opened(page, served, "map")
-        expect(page.locator(".nicegui-content")).to_contain_text("Version 1 is tried by 5.0 % of them")
-        expect(page.get_by_role("button", name="Stop trying version 1")).to_be_visible()
-        expect(page.get_by_role("button", name="Roll back")).to_have_count(0)
-        opened(page, served, "")
-        trial = page.locator(".notice", has_text="Version 1")
-        expect(trial).to_contain_text("Version 1 is tried by 5.0 % of the robots")
-        releases.end_canary(store, canary, promote=False, outcome="it fails more often than the margin allows")
-    expect(trial).to_contain_text("rolled back", timeout=10_000)
-    expect(trial).to_contain_text("It fails more often than the margin allows")
-    assert seen.faults == []

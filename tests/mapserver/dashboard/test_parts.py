@@ -16,8 +16,9 @@ from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.occupancy_grid import OccupancyGrid
+from mapserver import releases
 from mapserver.build.job_lock import recorded_job
-from mapserver.dashboard import bar_chart, map_layers
+from mapserver.dashboard import bar_chart, fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
@@ -29,7 +30,7 @@ from mapserver.dashboard.robot_history import SILENT, stretches
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.kpis import Counters
+from mapserver.fleet_statistics.kpis import Counters, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
@@ -334,3 +335,19 @@ def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
         raise UsageError("cameras are swapped")
     failed = store.jobs(SITE)[0]
     assert (failed.state, failed.message) == ("failed", "cameras are swapped")
+
+
+def test_both_rates_of_a_trial_are_drawn_once_they_tell_something(store: MapStore) -> None:
+    canary = releases.start_canary(store, SITE, 3, 0.5)
+
+    def shown(tried: tuple[int, float], others: tuple[int, float]) -> Markup:
+        trial = fleet_parts.Trial(canary, "it is early", rate(*tried), rate(*others))
+        return fleet_parts.trial_notices([trial], str)
+
+    assert "<svg" not in shown((0, 0.001), (0, 0.001))
+    drawn = shown((12, 4.0), (30, 20.0))
+    assert drawn.count('class="bar"') == 2
+    assert "version 3" in drawn
+    assert "others, version 2" in drawn
+    assert "12 in " in drawn
+    assert "30 in " in drawn

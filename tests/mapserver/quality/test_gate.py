@@ -20,7 +20,7 @@ from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
-from mapserver.build.draft_evidence import Before, HeldOut, JudgedSession, examine_draft
+from mapserver.build.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
@@ -90,7 +90,7 @@ def verdict(
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
     before = Before(manifest(current, 1), done.map, current, []) if has_current else None
     session = JudgedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
-    evidence = examine_draft(tiles, survey_map.camera, done.vocabulary, before, [session], [])
+    evidence = examine_draft(DraftMap(tiles, done.vocabulary, survey_map.camera), before, [session], [])
     said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, None, GateSettings(), evidence)
     return said, evidence
 

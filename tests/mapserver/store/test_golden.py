@@ -11,12 +11,13 @@ import pytest
 
 from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
-from fleetmap.version_file import EXPORT_FORMAT
+from fleetmap.mapformat.version_file import EXPORT_FORMAT
 from fleetmap.version_grid import known_grid
 from mapserver import releases
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 from mapserver.store.migrations import MIGRATIONS
+from mapserver.surfels.surfel_map import known_surfels
 from support.storage.map_samples import save_sample_draft
 
 GOLDEN = Path(__file__).parents[2] / "golden"
@@ -73,6 +74,7 @@ def test_exports(number: int, tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         info = store.import_version(GOLDEN / f"version-{number}.fmex", actor=Actor("ada"))
         assert list(known_grid(store.manifest("lab", 1), store.blob)) == ([(0, 0)] if number >= 2 else [])
+        assert len(known_surfels(store.manifest("lab", 1), store.blob)) == (20 if number >= 3 else 0)
         assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
         assert store.archive("lab", 1) == b"archive 1"
         assert releases.publish(store, "lab") == 1
@@ -118,7 +120,7 @@ def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_pa
     connection.execute("ALTER TABLE failures DROP COLUMN area")
     for name in ("heard_ns", "flags", "frame_ms", "exposure", "sharpness"):
         connection.execute(f"ALTER TABLE traces DROP COLUMN {name}")
-    for name in ("tokens", "sessions", "operators", "site_files", "grid_blobs"):
+    for name in ("tokens", "sessions", "operators", "site_files", "grid_blobs", "surfel_blobs", "failure_replays"):
         connection.execute(f"DROP TABLE {name}")
     connection.execute("PRAGMA user_version = 4")
     connection.close()

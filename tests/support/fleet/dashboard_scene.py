@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from playwright.sync_api import Page, expect
 
 from fleetmap.bus import ZenohBus
 from fleetmap.geometry import se3
@@ -34,6 +35,7 @@ from mapserver.store import Actor, DraftContent, MapStore
 from support.storage.map_samples import draft_details
 
 SITE = "hall"
+ROBOTS = 300
 TILE_M = 16.0
 LENGTH_M, WIDTH_M, AISLE_M = 64.0, 32.0, 8.0
 PROGRAM = ("-m", "mapserver.cli", "serve")
@@ -195,6 +197,8 @@ def speak(
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
     estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
     bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
+    if not with_health:
+        return
     health = RobotHealth(
         site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, metrics={"speed_mps": 0.8}
     )
@@ -311,3 +315,29 @@ def watch(page) -> Seen:  # type: ignore[no-untyped-def]
     page.on("pageerror", lambda error: seen.faults.append(str(error)))
     page.on("response", lambda got: seen.faults.append(f"{got.status} {got.url}") if got.status >= 400 else None)
     return seen
+
+
+def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
+    """Opens a page and waits until it is live."""
+    seen = watch(page)
+    asked = "&".join(f"{name}={value}" for name, value in query.items())
+    page.goto(f"{served.http}/dashboard/{path}?{asked}")
+    expect(page.locator("h1")).to_be_visible()
+    page.wait_for_function("window.socket && window.socket.connected")
+    return seen
+
+
+def marks(page: Page) -> list[dict[str, object]]:
+    """What the map of a page paints: a canvas has no elements to look at."""
+    page.wait_for_function("document.querySelector('.site-map')?.marks?.().length > 0")
+    return page.evaluate("document.querySelector('.site-map').marks()")
+
+
+def change(page: Page, words: str, *, name: str | None = "ada") -> None:
+    """Asks for a change and confirms it."""
+    page.get_by_role("button", name=words, exact=True).click()
+    dialog = page.locator(".q-dialog")
+    if name is not None:
+        dialog.get_by_label("Your name").fill(name)
+    dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")
+    dialog.get_by_role("button", name=f"Yes: {words}").click()

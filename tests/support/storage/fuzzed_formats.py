@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import decode_manifest, decode_tile, pack, unpack
 from fleetmap.mapformat.grid_tile import TILE_CELLS, decode_grid_tile
+from fleetmap.mapformat.version_file import open_export
 from fleetmap.occupancy_grid import OccupancyGrid, map_server_files, read_grid
-from fleetmap.version_file import open_export
 from fleetmap.version_grid import encode_grid
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 

@@ -11,6 +11,8 @@ from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
+from mapserver.surfels.merge_kernels import EDGE_M
+from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
 from mapserver.survey.survey_map import SurveyMap
 
 
@@ -100,16 +102,41 @@ def save_sample_draft(
     return store.save_draft(site, content, actor=actor)
 
 
-def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab") -> int:
-    """A draft with a hall of 4 m x 2 m from (1, 3): free, with a box that reaches from 0.35 m to 0.6 m."""
+def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfels: Surfels | None = None) -> int:
+    """A draft with a hall of 4 m x 2 m from (1, 3): free, with a box that reaches from 0.35 m to 0.6 m; with surfels, if they are given."""
     cells = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
     cells[60:100, 20:100, 1] = 0xFF
     cells[70:80, 40 + seed : 50, 0] = 0b10
     cells[60:100, 20:100, 2:] = 17
     grid = encode_grid({(0, 0): cells})
-    details = draft_details(path_m=12.5, grid=msgspec.to_builtins(grid_report(grid, {})))
+    blobs, said = [], {"grid": msgspec.to_builtins(grid_report(grid, {}))}
+    if surfels is not None:
+        blobs = encode_surfels(surfels)
+        said["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
+    details = draft_details(path_m=12.5, **said)
     tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
-    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", grid=grid)
+    content = DraftContent(
+        tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", grid=grid, surfels=blobs
+    )
+    return store.save_draft(site, content)
+
+
+def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Surfels:
+    """A wall across x at this distance, 4 m wide and 2 m high, that faces the origin; grey apart from a square of 0.4 m that is white."""
+    edge_m = EDGE_M * 2**edge_level
+    y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-2.0, 2.0, edge_m), np.arange(-1.0, 1.0, edge_m)))
+    points = np.column_stack([np.full(len(y), distance_m), y + edge_m / 2, z + edge_m / 2]).astype(np.float32)
+    normals = np.tile(np.array([-1.0, 0.0, 0.0], np.float32), (len(y), 1))
+    greys = np.where((np.abs(points[:, 1]) < 0.2) & (np.abs(points[:, 2]) < 0.2), 250, grey).astype(np.uint8)
+    return Surfels(points, normals, np.full(len(y), edge_level, np.uint8), greys)
+
+
+def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -> int:
+    """A draft with these surfels."""
+    blobs = encode_surfels(surfels)
+    details = draft_details(path_m=12.5, surfels=msgspec.to_builtins(surfel_report(blobs, len(surfels), {})))
+    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
+    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", surfels=blobs)
     return store.save_draft(site, content)
 
 

@@ -80,30 +80,11 @@ class CalibrationMonitor:
         self._job = None
 
     def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
-        """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance; with that
-        also where it may be wrong by more than may pass.
-
-        last_fix_ns: of a confirmed pose. One that no fix holds is not published then, since the odometry is as wrong as the cameras.
-        """
-        state, is_reversed = self.watch.state, self._order is PairOrder.REVERSED
-        if is_reversed:
-            state = CalibrationState(text=REVERSED_TEXT)
-        if not state.is_wrong:
-            return replace(estimate, calibration=state, cov_rot_trans=self._widened(estimate, state))
-        status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
-        cause = Cause.CALIBRATION if estimate.cause in {Cause.NONE, Cause.UNMATCHED} else estimate.cause
-        estimate = replace(estimate, status=status, cause=cause, calibration=state)
-        is_held = last_fix_ns is not None and (estimate.odometry.stamp_ns - last_fix_ns) * 1e-9 <= _HELD_S
-        if is_held and not is_reversed:
-            return replace(estimate, cov_rot_trans=self._widened(estimate, state))
-        status = Status.LOST if was_localized else Status.INITIALISING
-        return replace(estimate, status=status, map_from_body=None, cov_rot_trans=None)
-
-    def _widened(self, estimate: Estimate, state: CalibrationState) -> Array | None:
-        covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
-        if covariance is None or map_from_body is None or state.cov_bias_cam is None:
-            return covariance
-        return covariance + state.cov_bias(map_from_body @ se3_inverse(self._rig.cam_from_body), map_from_body)
+        """As `with_calibration`, by what is known so far."""
+        is_reversed = self._order is PairOrder.REVERSED
+        state = CalibrationState(text=REVERSED_TEXT) if is_reversed else self.watch.state
+        fixed_ns = None if is_reversed else last_fix_ns
+        return with_calibration(estimate, state, self._rig, fixed_ns, was_localized=was_localized)
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:
         assert query.fix is not None
@@ -116,3 +97,30 @@ class CalibrationMonitor:
         if fixes and is_reliable(fixes[0], self._settings.fix):
             yield
             self.watch.handle_unmatched(MapQuery(query.frame, query.odometry, fixes[0], query.relocalizer.view))
+
+
+def with_calibration(
+    estimate: Estimate, state: CalibrationState, rig: Mounting, last_fix_ns: int | None, *, was_localized: bool
+) -> Estimate:
+    """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance; with that
+    also where it may be wrong by more than may pass.
+
+    last_fix_ns: of a confirmed pose, None for a reversed pair. One that no fix holds is not published then, since the odometry is as
+    wrong as the cameras.
+    """
+    if not state.is_wrong:
+        return replace(estimate, calibration=state, cov_rot_trans=_widened(estimate, state, rig))
+    status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
+    cause = Cause.CALIBRATION if estimate.cause in {Cause.NONE, Cause.UNMATCHED} else estimate.cause
+    estimate = replace(estimate, status=status, cause=cause, calibration=state)
+    if last_fix_ns is not None and (estimate.odometry.stamp_ns - last_fix_ns) * 1e-9 <= _HELD_S:
+        return replace(estimate, cov_rot_trans=_widened(estimate, state, rig))
+    status = Status.LOST if was_localized else Status.INITIALISING
+    return replace(estimate, status=status, map_from_body=None, cov_rot_trans=None)
+
+
+def _widened(estimate: Estimate, state: CalibrationState, rig: Mounting) -> Array | None:
+    covariance, map_from_body = estimate.cov_rot_trans, estimate.map_from_body
+    if covariance is None or map_from_body is None or state.cov_bias_cam is None:
+        return covariance
+    return covariance + state.cov_bias(map_from_body @ se3_inverse(rig.cam_from_body), map_from_body)

@@ -14,18 +14,30 @@ from mapserver.store import Actor
 _MAX_NAME, _MAX_REASON = 200, 2000
 
 
+def may_change() -> bool:
+    """Whether whoever opened the page may change anything; without sign-in everybody."""
+    who = _identity()
+    return who is None or Scope.CHANGE in who.scopes
+
+
+def _identity() -> Identity | None:
+    who: Identity | None = getattr(ui.context.client.request.state, "operator", None)
+    return who
+
+
 def change_button(
-    services: Services, words: str, explanation: str, act: Callable[[Actor], str], *, css: str = ""
+    services: Services, words: str, explanation: str | Callable[[], str], act: Callable[[Actor], str], *, css: str = ""
 ) -> None:
     """A button that asks before it acts; the page is reloaded afterwards. css: `forward` or `back`, so that acts cannot be confused.
 
+    explanation: words, or what makes them when the button is pressed.
     act: the change, in the name of an actor; its FleetmapError is shown and changes nothing. Who may only look gets no button.
     """
-    who: Identity | None = getattr(ui.context.client.request.state, "operator", None)
-    if who is not None and Scope.CHANGE not in who.scopes:
+    if not may_change():
         return
+    who = _identity()
     with ui.dialog() as dialog, ui.column().classes("ask-box"):
-        html(Markup("<h2>{}</h2><p>{}</p>").format(f"{words}?", explanation))
+        asked = html("")
         name = None
         if who is None:
             name = ui.input("Your name").props(f"outlined maxlength={_MAX_NAME} autofocus").style("width:100%")
@@ -44,7 +56,13 @@ def change_button(
                 "confirm"
             )
             ui.button("No, change nothing", on_click=dialog.close, color=None).props("no-caps flat").classes("plain")
-    ui.button(words, on_click=dialog.open, color=None).props("no-caps flat").classes(f"plain {css}")
+
+    def ask() -> None:
+        told = explanation if isinstance(explanation, str) else explanation()
+        asked.set_content(str(Markup("<h2>{}</h2><p>{}</p>").format(f"{words}?", told)))
+        dialog.open()
+
+    ui.button(words, on_click=ask, color=None).props("no-caps flat").classes(f"plain {css}")
 
 
 async def _try(services: Services, act: Callable[[Actor], str], name: str | None, reason: str | None) -> str | None:

@@ -274,7 +274,9 @@ def _landmarks(report: FailureReport) -> str | None:
 
 
 def _pictures(context: PageContext, detail: FailureDetail) -> Markup:
-    if not detail.pictures:
+    # Those of the seconds around it are many: they are in the recording.
+    pictures = [picture for picture in detail.pictures if picture.kind != "replay"]
+    if not pictures:
         return Markup(
             '<h2>Pictures</h2><p class="quiet">None: the robot sent none, or they were deleted to save space.</p>'
         )
@@ -289,7 +291,7 @@ def _pictures(context: PageContext, detail: FailureDetail) -> Markup:
             abs(picture.stamp_ns - detail.report.stamp_ns) * 1e-9,
             "after" if picture.stamp_ns >= detail.report.stamp_ns else "before",
         )
-        for picture in sorted(detail.pictures, key=lambda picture: (picture.kind != "matches", picture.stamp_ns))
+        for picture in sorted(pictures, key=lambda picture: (picture.kind != "matches", picture.stamp_ns))
     )
     return Markup('<h2>Pictures</h2><div class="pictures">{}</div>').format(shown)
 

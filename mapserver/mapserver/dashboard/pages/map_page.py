@@ -12,6 +12,7 @@ from mapserver.dashboard.data import SiteHistory, VersionQuality
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
 from mapserver.dashboard.map_layers import Layer, coverage, squares
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, share, size, table
+from mapserver.dashboard.pages import survey_requests
 from mapserver.dashboard.pages.confirm import change_button
 from mapserver.dashboard.plan import Plan
 from mapserver.floor_plan.areas import Areas
@@ -176,7 +177,9 @@ async def _one_version(services: Services, context: PageContext, version: int) -
     with ui.element("div").classes("pair"):
         with ui.element("div"):
             html(Markup("<h2>Coverage of version {}</h2>").format(version))
-            await version_map(services, context, version, [Layer("Tiles", coverage(plan))])
+            requests = await load(maps.survey_requests, context.site)
+            over = [Layer("Tiles", coverage(plan)), *survey_requests.layers(requests)]
+            drawn = await version_map(services, context, version, over)
             html(
                 Markup(
                     '<p class="quiet">Grey: landmarks. Blue dots: places that robots recognise. Squares: tiles, darker with more '
@@ -185,6 +188,7 @@ async def _one_version(services: Services, context: PageContext, version: int) -
             )
         right = Markup("<h2>Quality of version {}</h2>{}{}")
         html(right.format(version, _quality_facts(quality, plan), _verdicts(context, quality)))
+    survey_requests.request_form(services, context, requests, drawn)
     html(one_way(plan, areas))
 
 

@@ -23,6 +23,7 @@ from mapserver.dashboard.live import STATUSES, LiveRobot
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.dashboard.markup import age, badge, facts, joined, link, table
 from mapserver.dashboard.pages.failure_page import failure_marks, failure_table
+from mapserver.dashboard.pages.placing import CHOSEN, place_form
 from mapserver.dashboard.robot_history import SILENT, Stretch, stretches
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import Areas
@@ -72,8 +73,10 @@ async def _page(services: Services, context: PageContext, robot: LiveRobot) -> N
                     Layer("Way", way(rows)),
                     Layer("Failures", failure_marks(context, failures)),
                     Layer("Robots", _mark(robot)),
+                    CHOSEN,
                 ]
                 drawn = await version_map(services, context, version, layers)
+                place_form(services, context, robot.name, drawn)
         told = html(_facts(context, robot))
     html(_range_form(context, robot.name))
     html(_timeline(context, stretches(rows, *shown), shown))

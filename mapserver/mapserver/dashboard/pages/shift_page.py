@@ -9,7 +9,7 @@ from markupsafe import Markup
 from mapserver.api.moments import moment_text
 from mapserver.dashboard import bar_chart, fleet_parts
 from mapserver.dashboard.bar_chart import Bar
-from mapserver.dashboard.fleet_parts import Figure, Trial
+from mapserver.dashboard.fleet_parts import Figure, trial_of
 from mapserver.dashboard.markup import joined, share, table
 from mapserver.fleet.shift_summary import FleetSummary
 from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate, format_rate, is_telling
@@ -29,7 +29,7 @@ def html_page(summary: FleetSummary) -> str:
         heading,
         _figures(summary),
         _unreported(summary.total.unreported_blindness),
-        fleet_parts.trial_notices((Trial(row, row.outcome or found.reason) for row, found in summary.trials), _moment),
+        fleet_parts.trial_notices((trial_of(row, found) for row, found in summary.trials), _moment),
         _by_hour(summary),
         _kpis_table("Robots, the worst first", "Robot", summary.robots),
         _kpis_table("Map versions", "Version", summary.versions),

@@ -11,10 +11,11 @@ from nicegui import ui
 
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
-from mapserver.dashboard.markup import badge, facts, joined, link, table
+from mapserver.dashboard.markup import age, badge, facts, joined, link, table
 from mapserver.store import JobInfo
 
 _REFRESH_S = 3.0
+_TELLING_S = 4.0  # of a stage, before what is left of it can be said
 _LONG_H = 12.0  # a job that is killed cannot say so
 _TONES = {"done": "good", "running": "warn", "failed": "bad"}
 _VERDICTS = {"accepted": "good", "rejected": "bad", "ambiguous": "bad", "gated_out": "quiet"}
@@ -41,7 +42,7 @@ def install(services: Services) -> None:
 
             ui.timer(_REFRESH_S, refresh, immediate=False)
             wanted = number(job, "job")
-            newest = next((j for j in jobs if j.report), None)
+            newest = next((j for j in jobs if j.report and j.state != "running"), None)
             chosen = newest if wanted is None else await load(services.maps.job, wanted)
             if chosen is not None:
                 await _one_job(services, context, chosen)
@@ -57,13 +58,27 @@ def _jobs(context: PageContext, jobs: list[JobInfo]) -> Markup:
             badge(_TONES.get(job.state, "quiet"), _state(job)),
             context.written_moment(job.started),
             context.written_moment(job.finished),
-            job.message,
+            job.message or _progress(job),
         )
         for job in jobs
     ]
     head = ("Job", "Kind", "State", "Started", "Finished", "Result")
     empty = "No jobs yet: `mapserver build` and `mapserver nightly` record theirs here."
     return Markup("<h2>Jobs, newest first</h2>{}").format(table(head, rows, empty=empty, name="Jobs"))
+
+
+def _progress(job: JobInfo) -> Markup | None:
+    """Stage of a running job, how far it is, and how long that stage takes still."""
+    told = job.report.get("progress")
+    if job.state != "running" or not isinstance(told, dict):
+        return None
+    stage: Any = told.get("stage")
+    done, total, stage_s = (float(told.get(name) or 0) for name in ("done", "total", "stage_s"))
+    if total < 2:
+        return Markup("{}").format(stage)
+    bar = Markup('<progress max="{}" value="{}" aria-label="{}"></progress>').format(total, done, stage)
+    left = f", about {age(stage_s * (total - done) / done)} more" if done > 0 and stage_s >= _TELLING_S else ""
+    return Markup("{} {}: {:.0f} of {:.0f}{}").format(bar, stage, done, total, left)
 
 
 def _state(job: JobInfo) -> str:
@@ -76,7 +91,7 @@ def _state(job: JobInfo) -> str:
 async def _one_job(services: Services, context: PageContext, job: JobInfo) -> None:
     html(Markup("<h2>Job {}: {}</h2><p>{}</p>").format(job.id, job.kind, job.message or _state(job)))
     report = _build_of(job.report)
-    html(Markup('<div class="pair">{}{}</div>').format(_doctor(report), _recordings(report)))
+    html(Markup("{}{}").format(_doctor(report), _recordings(report)))
     await _loops(services, context, report)
 
 

@@ -65,6 +65,10 @@ class McapRecordingWriter:
         text = format_calibration(calibration).encode()
         self._writer.add_attachment(0, 0, CALIBRATION_ATTACHMENT, "application/yaml", text)
 
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """A file within the file, which recordings do not look at."""
+        self._writer.add_attachment(0, 0, name, media_type, data)
+
     def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """One frame with its CameraInfo.
 

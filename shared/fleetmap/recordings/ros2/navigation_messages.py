@@ -13,11 +13,9 @@ from fleetmap.geometry import Array, quat_wxyz_from_rotation
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.recordings.ros2.messages import decode_prior, header_of
-from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 
 EMPTY = CdrWriter().byte(0).message()  # a message without fields
-# What a person's pose leaves at zero is not known exactly, but not said: roll pitch yaw (rad), x y z (m). Yaw, x and y are what RViz sends.
-_UNSAID = np.array([0.05, 0.05, np.radians(15.0), 0.5, 0.5, 0.25])
 _TRANS_ROT_FROM_ROT_TRANS = [3, 4, 5, 0, 1, 2]
 
 
@@ -76,7 +74,9 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
             "an initial pose is not used: its covariance is not symmetric and positive; check its order"
         )
     said = np.diag(cov) > 0
-    cov = np.where(said[:, None] & said[None, :], (cov + cov.T) / 2, 0.0) + np.diag(np.where(said, 0.0, _UNSAID**2))
+    cov = np.where(said[:, None] & said[None, :], (cov + cov.T) / 2, 0.0) + np.diag(
+        np.where(said, 0.0, UNSAID_SIGMAS**2)
+    )
     return PositionPrior(0, prior.map_from_base, cov, is_revisable=True)
 
 

@@ -2,11 +2,11 @@
 
     offset  type   content
     0       4 s    magic FMEX
-    4       u16    format number: 2 with a grid, else 1
+    4       u16    format number: 3 with surfels, 2 with a grid, else 1
     6       u16    0
     8       u32    size of the head
     12      ...    head, JSON: site, version, and of every blob its kind, SHA-256 and size
-    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, grid and archive (if they are taken along)
+    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, grid, surfels and archive (if they are taken along)
     end-32  32 s   SHA-256 of everything before
 
 Little-endian. The file names no paths: where bytes go follows from their SHA-256. Reading holds one map blob at a time in
@@ -29,16 +29,17 @@ from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_til
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
 
 EXPORT_MAGIC = b"FMEX"
-EXPORT_FORMAT = 2
-BlobKind = Literal["manifest", "vocabulary", "tile", "grid", "archive"]
+EXPORT_FORMAT = 3
+BlobKind = Literal["manifest", "vocabulary", "tile", "grid", "surfel", "archive"]
 MAX_BLOB_BYTES: dict[BlobKind, int] = {
     "manifest": MAX_MANIFEST_BYTES,
     "vocabulary": 256 << 20,
     "tile": 64 << 20,
     "grid": 64 << 20,
+    "surfel": 256 << 20,
     "archive": 1 << 33,
 }
-_UNNAMED = {"manifest", "archive", "grid"}
+_UNNAMED = {"manifest", "archive", "grid", "surfel"}
 DIGEST_BYTES = 32
 _START = struct.Struct("<4sHHI")
 _MAX_HEAD_BYTES = 64 << 20
@@ -67,7 +68,7 @@ class ExportHead(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def start(self) -> bytes:
         """The bytes of the file before the first blob."""
         text = msgspec.json.encode(self, order="deterministic")
-        number = 2 if any(blob.kind == "grid" for blob in self.blobs) else 1
+        number = max({"grid": 2, "surfel": 3}.get(blob.kind, 1) for blob in self.blobs)
         return _START.pack(EXPORT_MAGIC, number, 0, len(text)) + text
 
     def file_bytes(self) -> int:

@@ -1,0 +1,35 @@
+#!/usr/bin/env bash
+# Pictures of a running dashboard, for people who are not at the machine: fleet.png and map.png.
+#
+#   deploy/dashboard_pictures.sh HTTP OUT SITE
+#
+# HTTP: address of the server. Without Chromium or Chrome it says so and ends well.
+set -euo pipefail
+http=$1 out=$2 site=$3
+WITHIN_S=30
+
+browser=
+for name in chromium chromium-browser google-chrome; do
+  if browser=$(command -v "$name"); then break; fi
+done
+if [[ -z $browser ]]; then
+  printf 'No picture of the dashboard was taken: there is no chromium here. See it with: mapserver serve --store %s/store\n' "$out"
+  exit 0
+fi
+
+profile=$(mktemp -d)
+trap 'rm -rf "$profile"' EXIT
+options=(--headless=new --hide-scrollbars --window-size=1280,1400 --user-data-dir="$profile" --timeout=4000)
+# The browser's own sandbox cannot be had by root; it looks at nothing but the server of this demo.
+((EUID != 0)) || options+=(--no-sandbox)
+for page in fleet map; do
+  path=$page
+  [[ $page != fleet ]] || path=
+  picture=$out/dashboard-$page.png
+  if timeout "$WITHIN_S" "$browser" "${options[@]}" --screenshot="$picture" "$http/dashboard/$path?site=$site" >"$profile/log" 2>&1 \
+    && [[ -s $picture ]]; then
+    printf 'picture of the dashboard: %s\n' "$picture"
+  else
+    printf 'No picture of the page %s was taken: %s\n' "$page" "$(tail -n 1 "$profile/log")"
+  fi
+done

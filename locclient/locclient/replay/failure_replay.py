@@ -1,0 +1,257 @@
+"""Replay of a failure: the present localizer over what the robot perceived, in the map that it had or in another version.
+
+In the robot's own version and by its own code it says the same again, bit for bit. Another version or a newer localizer is given the same
+perception; depth of features is known where the robot measured it or its images were kept, and the odometry, which knows no map, is as it
+was. A newer odometry or extractor is tried on the recording's reduced images: `locclient replay` plays the same file.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import decode_vocabulary
+from fleetmap.errors import LinkError, RecordingError, UsageError
+from fleetmap.failure_definition import BLIND_S, is_blind
+from fleetmap.failure_summary import FailureSummary, Moment
+from fleetmap.features.orb import Features
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.mapformat import check_sha256, decode_manifest
+from fleetmap.messages import WantedVersion
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import ImuSamples, WheelSample
+from locclient.delivery.failure_file import KeptFrameRecord, LocalizerRecord, QueryRecord, moment
+from locclient.localization.calibration.monitor import FinishedQuery, with_calibration
+from locclient.localization.calibration.parameters import NOT_JUDGED
+from locclient.localization.calibration.watch import Mounting
+from locclient.localization.estimate import Estimate
+from locclient.localization.image_quality import ImageQuality
+from locclient.localization.localizer import Localizer
+from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.map_source import MapSource
+from locclient.robot.failure_ring import Said, UsedMap
+
+_NO_IMAGE = np.zeros((0, 0), np.uint8)
+
+
+class KeptFeatures(FrameFeatures):
+    """Features of a frame whose images are gone; the depth that is asked for is the one that was kept."""
+
+    kept_px: Array
+
+    def measured(
+        self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings, prior_px: Array | None = None
+    ) -> Array:
+        """See FrameFeatures."""
+        self.pixels[rows, 2] = self.kept_px[rows]
+        return self.pixels[rows]
+
+
+class KeptPerception:
+    """The perception that was kept, frame by frame."""
+
+    def __init__(self, record: LocalizerRecord) -> None:
+        self._rig = Mounting(se3_inverse(record.body_from_cam), record.base_from_body)
+        self._frame = record.frames[0]
+        self._calibration = NOT_JUDGED
+
+    def show(self, frame: KeptFrameRecord) -> None:
+        """The frame that comes next."""
+        self._frame = frame
+        self._calibration = frame.calibration or self._calibration
+
+    def handle_imu(self, samples: ImuSamples) -> None:
+        """Nothing: the odometry's estimates are kept."""
+
+    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
+        """Nothing: the odometry's estimates are kept."""
+
+    def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
+        """See Perception."""
+        return frame, self._frame.image
+
+    def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
+        """See Perception."""
+        return self._frame.odometry, self._frame.image
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        """See Motion; None for a frame that the robot never asked about."""
+        return self._frame.motions.get(frame_index)
+
+    def will_forget(self, frame_index: int) -> bool:
+        """See Motion."""
+        return self._frame.forgotten.get(frame_index, True)
+
+    def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
+        """See Perception."""
+        return self._frame.is_reversed
+
+    def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
+        """See Perception."""
+        query = self._frame.query
+        if query is None:  # another version asks at another frame than the robot did
+            yield
+            return FrameFeatures(Features.empty(), np.zeros((0, 3)))
+        for _ in range(query.slices):
+            yield
+        return _features(query)
+
+    def add(self, query: FinishedQuery) -> None:
+        """Nothing: what the watch over the calibration said is kept."""
+
+    def give_up(self) -> None:
+        """Nothing, as `add`."""
+
+    def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
+        """See Perception."""
+        fixed_ns = None if self._frame.is_reversed else last_fix_ns
+        return with_calibration(estimate, self._calibration, self._rig, fixed_ns, was_localized=was_localized)
+
+
+def _features(query: QueryRecord) -> FrameFeatures:
+    arrays = query.pixels, query.octaves, query.angles_deg, query.descriptors, query.right_px
+    if any(array is None for array in arrays):
+        raise RecordingError(
+            "a map query without features is over before they are there; was the file made by a robot?"
+        )
+    pixels, octaves, angles_deg, descriptors, right_px = arrays
+    features = Features(pixels, octaves, angles_deg, descriptors)  # type: ignore[arg-type]
+    made = KeptFeatures(features, np.column_stack([features.pixels, np.full(len(features), np.nan)]))
+    made.kept_px = np.asarray(right_px)
+    return made
+
+
+Load = Callable[[UsedMap], LoadedMap]
+"""The map to use in the place of the one that the robot used."""
+
+
+def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
+    """What the present localizer says of every frame. Errors as of `load`."""
+    camera = record.camera
+    rig = RigCalibration((), None, record.base_from_body)
+    localizer = Localizer(rig, camera, record.body_from_cam, 0.0, record.settings)
+    perception = localizer.perception = KeptPerception(record)
+    if record.used is not None:
+        _use(localizer, load(record.used))
+    localizer.restore(record.state)
+    said = []
+    for frame in record.frames:
+        if frame.used is not None:
+            _use(localizer, load(frame.used))
+        if frame.forgets:
+            localizer.forget_pose()
+        for prior in frame.priors:
+            localizer.handle_prior(prior)
+        perception.show(frame)
+        stamp_ns = frame.odometry.stamp_ns
+        estimate = localizer.handle_stereo(RectifiedFrame(stamp_ns, _NO_IMAGE, None, None))
+        said.append(moment(stamp_ns, Said.of(estimate)))
+    return said
+
+
+def _use(localizer: Localizer, loaded: LoadedMap) -> None:
+    tiles, focal_px = loaded.tiles.values(), loaded.manifest.camera.focal_px
+    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What was said then and now, by the same stamps; version: of the map that is used now."""
+
+    summary: FailureSummary
+    version: int | None
+    now: list[Moment]
+
+    @property
+    def first_difference_ns(self) -> int | None:
+        """Stamp of the first frame of which another status or place is said, None where all is the same to the last bit."""
+        pairs = zip(self.summary.moments, self.now, strict=True)
+        return next((then.stamp_ns for then, now in pairs if then != now), None)
+
+    @property
+    def has_same_statuses(self) -> bool:
+        """Whether the sequence of statuses is the same."""
+        return [moment.status for moment in self.summary.moments] == [moment.status for moment in self.now]
+
+    @property
+    def answer(self) -> str:
+        """Whether it would have failed too, in a sentence."""
+        then_s, now_s = (longest_blind_s(moments) for moments in (self.summary.moments, self.now))
+        what = f"version {self.version}" if self.version != self.summary.version else "this client"
+        if self.first_difference_ns is None:
+            return f"{what} says the same of every frame"
+        if now_s > BLIND_S:
+            return f"{what} would have failed too: no position to rely upon for {now_s:.1f} s, then {then_s:.1f} s"
+        if then_s > BLIND_S:
+            return f"{what} would not have failed: at most {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
+        return f"{what} says otherwise: {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
+
+
+def longest_blind_s(moments: Sequence[Moment]) -> float:
+    """The longest time without a position to rely upon, as `is_blind` has it, or before one was found."""
+    longest_s, since_ns = 0.0, None
+    for each in moments:
+        radius_m = float("inf") if each.radius_95_m is None else each.radius_95_m
+        if not (is_blind(each.status, radius_m) or each.status == "INITIALISING"):
+            since_ns = None
+            continue
+        since_ns = each.stamp_ns if since_ns is None else since_ns
+        longest_s = max(longest_s, (each.stamp_ns - since_ns) * 1e-9)
+    return longest_s
+
+
+def phases(moments: Sequence[Moment], began_ns: int) -> Iterator[str]:
+    """Statuses one after the other, each with its time since the failure began."""
+    for status, group in groupby(moments, key=lambda each: each.status):
+        yield f"{(next(group).stamp_ns - began_ns) * 1e-9:+.1f} s {status}"
+
+
+def compare_failure(
+    failure: tuple[FailureSummary, LocalizerRecord], source: MapSource, manifest_sha256: str | None = None
+) -> Comparison:
+    """Then and now, in the robot's map or in the version with that manifest; LinkError where a tile is not to be had.
+
+    Of another version the tiles within the bounds of those that the robot had in memory are used.
+    """
+    summary, record = failure
+    maps: dict[UsedMap, LoadedMap] = {}
+
+    def load(used: UsedMap) -> LoadedMap:
+        if used not in maps:
+            maps[used] = _loaded(source, summary.site, used, manifest_sha256)
+        return maps[used]
+
+    now = replay_failure(record, load)
+    versions = [loaded.version for loaded in maps.values()]
+    return Comparison(summary, versions[0] if versions else None, now)
+
+
+def _loaded(source: MapSource, site: str, used: UsedMap, other_sha256: str | None) -> LoadedMap:
+    sha256 = check_sha256(other_sha256 or used.manifest_sha256)
+    manifest = decode_manifest(source.blob(sha256))
+    if manifest.site != site:
+        raise UsageError(f"the manifest {sha256} is of site {manifest.site}, the failure of {site}")
+    cells = used.cells
+    if sha256 != used.manifest_sha256:
+        columns, rows = ({cell[axis] for cell in used.cells} or {0} for axis in (0, 1))
+        cells = tuple(
+            (tile.x, tile.y)
+            for tile in manifest.tiles
+            if min(columns) <= tile.x <= max(columns) and min(rows) <= tile.y <= max(rows)
+        )
+    found = source.tiles(manifest, cells)
+    missing = [cell for cell in cells if cell not in found.tiles]
+    if missing:
+        reason = found.refused.get(missing[0], "the version does not have it")
+        raise LinkError(f"tile {missing[0]} of version {manifest.version} cannot be had: {reason}")
+    wanted = WantedVersion(site=site, version=manifest.version, manifest_sha256=sha256)
+    vocabulary = decode_vocabulary(source.vocabulary(manifest))
+    return LoadedMap(wanted, manifest, vocabulary, {cell: found.tiles[cell] for cell in cells})

@@ -1,0 +1,54 @@
+"""Expected views of versions in a store: one is drawn at a time, and the surfels around the last place stay in memory."""
+
+import threading
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.mapformat import CameraEntry
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.store import MapStore
+from mapserver.surfels.expected_view import FAR_M, ExpectedView, expected_view, pinhole, resized
+from mapserver.surfels.surfel_map import TILE_SIZE_M, Surfels, surfels_of
+
+_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_REACH_M = min(FAR_M, 25.0)  # around the middle of a tile: what a request may read
+
+
+class ExpectedViews:
+    """Methods may be called from any thread."""
+
+    def __init__(self, store: MapStore) -> None:
+        self._store, self._lock = store, threading.Lock()
+        self._kept: tuple[tuple[str, int, int], Surfels] | None = None
+
+    def view(
+        self, site: str, version: int, map_from_cam: Array, camera: CameraCalibration | None = None, width_px: int = 320
+    ) -> ExpectedView:
+        """What a camera should see at map_from_cam (4, 4), so many pixels wide; None: the camera of the version's survey.
+
+        Raises StateError for a version without surfels; errors as of `MapStore.manifest` and `expected_view`.
+        """
+        manifest = self._store.manifest(site, version)
+        lens = resized(camera or survey_camera(manifest.camera), width_px)
+        x, y = np.floor(map_from_cam[:2, 3] / TILE_SIZE_M).astype(int).tolist()
+        key = (self._store.version(site, version).manifest_sha256, x, y)
+        with self._lock:
+            if self._kept is None or self._kept[0] != key:
+                middle = (np.array([x, y]) + 0.5) * TILE_SIZE_M
+                self._kept = None
+                self._kept = key, surfels_of(manifest, self._store.blob, (float(middle[0]), float(middle[1]), _REACH_M))
+            return expected_view(self._kept[1], lens, map_from_cam)
+
+
+def survey_camera(entry: CameraEntry) -> CameraCalibration:
+    """The rectified left camera of a version's survey, with its axis in the middle, which manifests do not tell."""
+    centre = (entry.width_px - 1) / 2, (entry.height_px - 1) / 2
+    return pinhole(StereoCamera(entry.focal_px, *centre, entry.baseline_m, entry.width_px, entry.height_px))
+
+
+def looking(position_map_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> Array:
+    """map_from_cam (4, 4) of a level camera at a place: yaw counter-clockwise from x of the map, pitch downwards."""
+    turn = so3_exp(np.array([0.0, 0.0, np.radians(yaw_deg)])) @ so3_exp(np.array([0.0, np.radians(pitch_deg), 0.0]))
+    return se3(turn @ _OPTICAL, np.array(position_map_m))

@@ -1,0 +1,144 @@
+"""What a camera should see at a pose, drawn from surfels."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import CalibrationError, UsageError
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.surfels.exposure import lens_factor
+from mapserver.surfels.render_kernels import discs_before, draw_discs
+from mapserver.surfels.surfel_map import Surfels
+
+FAR_M = 40.0
+RADIUS_EDGES = 1.2  # of a disc: more than half of the diagonal of a voxel's face
+MOST_PIXELS = 1 << 21
+_ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # views so near to each other have one exposure
+_MOST_SQUARED = 1.0  # tangent of the angle to the axis up to which a survey's lens is known
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedView:
+    """A picture (H, W) uint8, its depths in m along the rays (H, W), NaN where nothing is known, and where that is (H, W)."""
+
+    picture: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    unknown: NDArray[np.bool_]
+
+
+def pinhole(camera: StereoCamera) -> CameraCalibration:
+    """The left camera of a rectified pair, without its mounting."""
+    intrinsics = np.array([camera.focal_px, camera.focal_px, camera.cx_px, camera.cy_px])
+    return CameraCalibration("radial-tangential", camera.width_px, camera.height_px, intrinsics, np.zeros(0), np.eye(4))
+
+
+def resized(camera: CameraCalibration, width_px: int) -> CameraCalibration:
+    """The same lens with smaller or larger pixels; pixel (0, 0) keeps its corner."""
+    scale = width_px / camera.width_px
+    height_px = round(camera.height_px * scale)
+    fx, fy, cx, cy = camera.intrinsics_px
+    intrinsics = np.array([fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5])
+    return replace(camera, width_px=width_px, height_px=height_px, intrinsics_px=intrinsics)
+
+
+def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array) -> ExpectedView:
+    """What `camera` should see at map_from_cam (4, 4), as bright as the survey's views. Unknown pixels are filled, and told.
+
+    Raises UsageError for a picture that is too large and for a pose that is none.
+    """
+    if camera.width_px * camera.height_px > MOST_PIXELS:
+        raise UsageError(
+            f"a view of {camera.width_px} x {camera.height_px} px; at most {MOST_PIXELS} pixels are drawn, ask for fewer"
+        )
+    rotation = map_from_cam[:3, :3]
+    if not np.isfinite(map_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise UsageError(f"the pose {np.round(map_from_cam[:3], 3).tolist()} is none; give a rotation and metres")
+    rays, pixels_per_rad, cosine = _lens(
+        camera.model, camera.width_px, camera.height_px, tuple(camera.intrinsics_px), tuple(camera.distortion)
+    )
+    cam_from_map = se3_inverse(map_from_cam)
+    numbers, points = np.empty(len(surfels), np.int64), np.empty((len(surfels), 3))
+    count = discs_before(surfels.points_map, surfels.normals, cam_from_map, (cosine, FAR_M), numbers, points)
+    numbers, points = numbers[:count], points[:count]
+    pixels = camera.pixel_from_ray(points)
+    rim_px = 0.1 * camera.width_px
+    low, high = -rim_px, np.array([camera.width_px, camera.height_px]) + rim_px
+    inside = ((pixels > low) & (pixels < high)).all(axis=1)
+    numbers, points, pixels = numbers[inside], points[inside], pixels[inside]
+    drawn = surfels[numbers]
+    edges_m = drawn.edges_m.astype(np.float64)
+    normals = drawn.normals.astype(np.float64) @ cam_from_map[:3, :3].T
+    shape = rays.shape[:2]
+    nearest = np.full(shape, np.inf, np.float32)
+    weight, colour, depth_m = (np.zeros(shape, np.float32) for _ in range(3))
+    draw_discs(
+        pixels, points, normals, RADIUS_EDGES * edges_m, edges_m, drawn.greys.astype(np.float64), rays, pixels_per_rad,
+        nearest, weight, colour, depth_m,
+    )  # fmt: skip
+    unknown = weight <= 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        colour, depth_m = colour / weight, depth_m / weight
+        squared = (rays[..., 0] ** 2 + rays[..., 1] ** 2) / rays[..., 2] ** 2
+    squared = np.nan_to_num(np.where(rays[..., 2] > 0, squared, _MOST_SQUARED), nan=0.0)
+    colour *= lens_factor(np.minimum(squared, _MOST_SQUARED), np.array(surfels.falloff)) * _brightness(
+        surfels, map_from_cam
+    )
+    picture = np.clip(np.round(filled(colour, unknown)), 0, 255).astype(np.uint8)
+    return ExpectedView(picture, depth_m, unknown)
+
+
+def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The picture (H, W) with its unknown pixels made smoothly from those around them; grey without any. Source: Gortler et al. 1996."""
+    known = (~unknown).astype(np.float32)
+    if not known.any():
+        return np.full(picture.shape, 128.0, np.float32)
+    values, weights = [np.where(unknown, np.float32(0.0), picture)], [known]
+    while max(values[-1].shape) > 1:
+        size = (-(-values[-1].shape[1] // 2), -(-values[-1].shape[0] // 2))
+        weights.append(np.asarray(cv2.pyrDown(weights[-1], dstsize=size), np.float32))
+        values.append(np.asarray(cv2.pyrDown(values[-1], dstsize=size), np.float32))
+    coarse = values[-1] / np.maximum(weights[-1], 1e-6)
+    for value, weight in zip(values[-2::-1], weights[-2::-1], strict=True):
+        above = np.asarray(cv2.resize(coarse, value.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+        share = np.minimum(weight, 1.0)
+        coarse = share * value / np.maximum(weight, 1e-6) + (1 - share) * above
+    return np.where(unknown, coarse, picture)
+
+
+def _brightness(surfels: Surfels, map_from_cam: Array) -> float:
+    """That of the drives' views near this place that look this way, as their camera chose it."""
+    if not len(surfels.exposures):
+        return 1.0
+    off_m = np.linalg.norm(surfels.exposures[:, :3] - map_from_cam[:3, 3], axis=1)
+    turn_rad = np.arccos(np.clip(surfels.exposures[:, 3:6] @ map_from_cam[:3, 2], -1.0, 1.0))
+    apart = (off_m / _ALIKE_M) ** 2 + (turn_rad / _ALIKE_RAD) ** 2
+    weights = np.exp(-0.5 * (apart - apart.min()))
+    return float(np.exp((weights * surfels.exposures[:, 6]).sum() / weights.sum()))
+
+
+@lru_cache(maxsize=8)
+def _lens(
+    model: str, width_px: int, height_px: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
+) -> tuple[Array, NDArray[np.float32], float]:
+    """Rays (H, W, 3), the finest pixels per radian around each (H, W), and the cosine of the cone that holds all rays."""
+    camera = CameraCalibration(model, width_px, height_px, np.array(intrinsics), np.array(distortion), np.eye(4))
+    v, u = np.mgrid[0:height_px, 0:width_px].astype(np.float64)
+    rays = camera.ray_from_pixel(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height_px, width_px, 3)
+    finest = np.zeros((height_px, width_px))
+    for axis in (0, 1):
+        step = np.linalg.norm(np.diff(rays, axis=axis), axis=2)
+        per_rad = 1.0 / np.maximum(np.where(np.isfinite(step), step, np.inf), 1e-6)
+        for part in (slice(None, -1), slice(1, None)):
+            where = (part, slice(None)) if axis == 0 else (slice(None), part)
+            finest[where] = np.maximum(finest[where], per_rad)
+    if not np.isfinite(rays).any() or not finest.any():
+        raise CalibrationError(
+            f"no pixel of the {model} camera {width_px} x {height_px} has a ray; check its calibration"
+        )
+    finest[finest == 0] = finest[finest > 0].min()
+    return rays, finest.astype(np.float32), float(np.nanmin(rays[..., 2])) - 0.05

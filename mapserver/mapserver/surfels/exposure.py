@@ -1,0 +1,81 @@
+"""How bright each view of a drive is, and what its lens loses towards the corners, from points that several views show."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, vstack
+from scipy.sparse.linalg import lsmr
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.rectification import StereoCamera
+
+FALLOFF = 3  # coefficients: of the squared tangent of the angle to the axis and of its powers
+_ROUNDS, _HUBER, _MIN_SAMPLES, _PRIOR = 3, 0.1, 200, 1e-2
+
+
+class Sample(NamedTuple):
+    """N looks at points: which point and view (N,), squared tangent of the angle to the axis (N,), logarithm of the grey level (N,)."""
+
+    points: NDArray[np.int64]
+    views: NDArray[np.int64]
+    squared: Array
+    logs: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Logarithms of the views' brightness (K,), whose mean is 0, and coefficients (FALLOFF,) of the lens."""
+
+    logs: Array
+    falloff: Array
+
+    def factor(self, view: int, squared: Array) -> Array:
+        """(N,) by which a view shows pixels brighter than the mean view's axis would."""
+        return np.asarray(np.exp(self.logs[view]) * lens_factor(squared, self.falloff))
+
+
+def squared_tangent(pixels: NDArray[np.float32], camera: StereoCamera) -> Array:
+    """(N,) of the angle to the axis, of pixels (N, 2)."""
+    off = (pixels.astype(np.float64) - np.array([camera.cx_px, camera.cy_px])) / camera.focal_px
+    return np.asarray((off**2).sum(axis=1))
+
+
+def lens_factor(squared: Array, falloff: Array) -> Array:
+    """The share of light that a lens lets through where the squared tangent is this (...,), by its coefficients."""
+    return np.asarray(np.exp(_powers(squared) @ falloff))
+
+
+def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
+    """By least squares on logarithms with Huber's weights; nothing from too few looks.
+
+    Source: Goldman and Chen 2005, vignette and exposure calibration, with the response of the camera taken as linear.
+    """
+    every = Sample(*(np.concatenate([np.zeros(0), *(sample[i] for sample in samples)]) for i in range(4)))
+    count = len(every.logs)
+    if count < _MIN_SAMPLES:
+        return Exposure(np.zeros(views), np.zeros(FALLOFF))
+    points, shown = np.unique(every.points, return_inverse=True)
+    first = FALLOFF + views
+    rows = np.repeat(np.arange(count), FALLOFF + 2)
+    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views, first + shown])
+    values = np.column_stack([_powers(every.squared), np.ones((count, 2))])
+    design = csr_array((values.ravel(), (rows, columns.ravel().astype(np.int64))), (count, first + len(points)))
+    # All views brighter and all points darker would be the same; what is not seen stays at nothing.
+    prior = csr_array((np.full(first, _PRIOR), (np.arange(first), np.arange(first))), (first, design.shape[1]))
+    weights, start = np.ones(count), np.zeros(design.shape[1])
+    start[first:] = every.logs.mean()
+    for _ in range(_ROUNDS):
+        whole = vstack([diags_array(weights) @ design, prior])
+        rest = np.concatenate([weights * every.logs, np.zeros(first)])
+        start = lsmr(whole, rest, atol=1e-6, btol=1e-6, maxiter=200, x0=start)[0]
+        off = np.abs(every.logs - design @ start)
+        weights = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(off, 1e-9)))
+    logs = start[FALLOFF:first]
+    return Exposure(logs - logs.mean(), start[:FALLOFF])
+
+
+def _powers(squared: Array) -> Array:
+    return np.stack([squared ** (n + 1) for n in range(FALLOFF)], axis=-1)

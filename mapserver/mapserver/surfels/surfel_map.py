@@ -1,0 +1,231 @@
+"""The surfels of a version: as arrays, and as bytes (an index, and one blob for each tile; docs/map_format.md)."""
+
+import struct
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import MapFormatError, NewerFormatError, StateError
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.mapformat import Manifest, sha256_hex
+from fleetmap.mapformat.container import pack, unpack
+from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
+from mapserver.surfels.exposure import FALLOFF
+from mapserver.surfels.merge_kernels import EDGE_M, LEVELS
+
+TILE_SIZE_M = 16.0  # the size of the map's own tiles
+SURFEL_MAGIC, SURFEL_FORMAT = b"FMSU", 1
+SURFELS_KEY = "surfels"
+"""In `report` of a manifest, where readers of before pass over it; it names the index."""
+
+NO_FALLOFF = (0.0,) * FALLOFF
+EXPOSURE = 7
+_HEAD = struct.Struct("<iiiI")  # place, height of the lowest surfel in mm, count
+_FLAT_M, _HEIGHT_M, _TURN = TILE_SIZE_M / 65536, 0.001, 127.0
+_COLUMNS = (("<u2", 3), ("i1", 2), ("u1", 1), ("u1", 1))  # position, normal, level, grey
+_BYTES_EACH = sum(np.dtype(kind).itemsize * width for kind, width in _COLUMNS)
+_MOST_BYTES, _ZSTD_LEVEL, _MOST_TILES = 1 << 28, 9, 1 << 16
+_MOST_EXPOSURES = 1 << 14
+
+
+@dataclass(frozen=True, slots=True)
+class Surfels:
+    """N discs in `map`: points_map (N, 3), unit normals (N, 3) towards who saw them, level (N,) of their voxels, grey (N,).
+
+    An edge of their voxels is EDGE_M times two to the power of the level. falloff: of the lens through which they were seen (see exposure),
+    which the greys are freed of. exposures (K, 7): places, directions of view and logarithms of the brightness of the drives' views.
+    """
+
+    points_map: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    levels: NDArray[np.uint8]
+    greys: NDArray[np.uint8]
+    falloff: tuple[float, ...] = NO_FALLOFF
+    exposures: Array = field(default_factory=lambda: np.zeros((0, EXPOSURE)))
+
+    def __len__(self) -> int:
+        return len(self.points_map)
+
+    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Surfels":
+        each = (self.points_map[chosen], self.normals[chosen], self.levels[chosen], self.greys[chosen])
+        return Surfels(*each, self.falloff, self.exposures)
+
+    @property
+    def edges_m(self) -> NDArray[np.float32]:
+        """(N,)."""
+        return np.float32(EDGE_M) * np.exp2(self.levels, dtype=np.float32)
+
+    @classmethod
+    def joined(cls, parts: Iterable["Surfels"]) -> Self:
+        """One after the other, with the lens of the last and its exposures before the others'; none of nothing."""
+        none = Surfels(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.uint8))
+        every = [none, *parts]
+        names = ("points_map", "normals", "levels", "greys")
+        columns = {name: np.concatenate([getattr(part, name) for part in every]) for name in names}
+        exposures = np.concatenate([part.exposures for part in every[::-1]])[:_MOST_EXPOSURES]
+        return cls(**columns, falloff=every[-1].falloff, exposures=exposures)
+
+
+_Row = Annotated[tuple[float, ...], msgspec.Meta(min_length=EXPOSURE, max_length=EXPOSURE)]
+
+
+class SurfelIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the tiles' numbers mean, the lens, and the tiles by place and address; of each `landmarks` counts the surfels."""
+
+    format_version: Positive = SURFEL_FORMAT
+    tile_size_m: float = TILE_SIZE_M
+    edge_m: float = EDGE_M
+    falloff: Annotated[tuple[float, ...], msgspec.Meta(min_length=FALLOFF, max_length=FALLOFF)] = NO_FALLOFF
+    exposures: Annotated[tuple[_Row, ...], msgspec.Meta(max_length=_MOST_EXPOSURES)] = ()
+    tiles: Annotated[tuple[TileEntry, ...], msgspec.Meta(max_length=_MOST_TILES)] = ()
+
+
+class SurfelReport(msgspec.Struct, frozen=True, kw_only=True):
+    """In the report of a build. sha256: of the index, None without surfels; bytes: of it and its tiles; surfels: how many.
+
+    without: by recording, why it adds none.
+    """
+
+    sha256: Sha256 | None = None
+    bytes: int = 0
+    surfels: int = 0
+    without: dict[str, str] = {}
+
+
+def encode_surfels(surfels: Surfels) -> list[bytes]:
+    """The index and then each tile; nothing for no surfels. The same surfels in any order give the same bytes."""
+    places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
+    blobs, entries = [], []
+    order = np.lexsort((places[:, 1], places[:, 0]))
+    starts = np.flatnonzero((np.diff(places[order], axis=0, prepend=places[order][:1] - 1) != 0).any(axis=1))
+    for rows in np.split(order, starts[1:]) if len(order) else []:
+        x, y = places[rows[0]].tolist()
+        data = _encode_tile((x, y), surfels[rows])
+        entries.append(TileEntry(x=x, y=y, sha256=sha256_hex(data), bytes=len(data), landmarks=len(rows)))
+        blobs.append(data)
+    views = tuple(tuple(row) for row in surfels.exposures.round(4).tolist())
+    index = SurfelIndex(falloff=surfels.falloff, exposures=views, tiles=tuple(entries))
+    return [msgspec.json.encode(index, order="deterministic"), *blobs] if blobs else []
+
+
+def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:
+    """Of what `encode_surfels` returned."""
+    sha256 = sha256_hex(blobs[0]) if blobs else None
+    return SurfelReport(sha256=sha256, bytes=sum(map(len, blobs)), surfels=surfels, without=without)
+
+
+def surfels_of(
+    manifest: Manifest, blob: Callable[[str], bytes], near: tuple[float, float, float] | None = None
+) -> Surfels:
+    """The surfels of a version; near: x, y and a distance in m, within which tiles are read. blob: the verified bytes of an address.
+
+    Raises StateError for a version without any, saying why, and MapFormatError or NewerFormatError for bytes that are none.
+    """
+    where = f"version {manifest.version} of site {manifest.site}"
+    report = report_of(manifest)
+    if report is None:
+        raise StateError(f"{where} has no surfels: set `surfel_map = true` in [survey] and build the next version")
+    if report.sha256 is None:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
+        raise StateError(f"{where} has no surfels: {reasons or 'no recording showed anything near'}")
+    parts, index = [], _read_index(blob(report.sha256))
+    for entry in index.tiles:
+        if near is not None:
+            off = np.array([entry.x, entry.y]) * TILE_SIZE_M - near[:2]
+            if np.linalg.norm(np.maximum(np.maximum(off, -off - TILE_SIZE_M), 0.0)) > near[2]:
+                continue
+        place, surfels = _decode_tile(blob(entry.sha256))
+        if place != (entry.x, entry.y) or len(surfels) != entry.landmarks:
+            raise MapFormatError(
+                f"{where}: surfel tile {place} stands in the place of {entry.x}, {entry.y}; it is damaged"
+            )
+        parts.append(surfels)
+    exposures = np.array(index.exposures, np.float64).reshape(-1, EXPOSURE)
+    return replace(Surfels.joined(parts), falloff=index.falloff, exposures=exposures)
+
+
+def known_surfels(manifest: Manifest, blob: Callable[[str], bytes]) -> Surfels:
+    """As `surfels_of`; none for a version without any."""
+    report = report_of(manifest)
+    return Surfels.joined([]) if report is None or report.sha256 is None else surfels_of(manifest, blob)
+
+
+def report_of(manifest: Manifest) -> SurfelReport | None:
+    """What the build said of its surfels, None where it was to make none. MapFormatError for words that are none of ours."""
+    found = manifest.report.get(SURFELS_KEY)
+    try:
+        return None if found is None else msgspec.convert(found, SurfelReport)
+    except msgspec.ValidationError as error:
+        raise MapFormatError(f"manifest of {manifest.site} version {manifest.version}: surfels: {error}") from error
+
+
+def _read_index(data: bytes) -> SurfelIndex:
+    try:
+        index = msgspec.json.decode(data, type=SurfelIndex)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"index of surfels: {error}; it is damaged or not ours") from error
+    if msgspec.structs.replace(index, tiles=(), falloff=NO_FALLOFF, exposures=()) != SurfelIndex():
+        raise NewerFormatError(
+            f"index of surfels of format {index.format_version}: made by another fleetmap; update this one"
+        )
+    return index
+
+
+def _encode_tile(place: tuple[int, int], surfels: Surfels) -> bytes:
+    corner = np.array(place) * TILE_SIZE_M
+    flat = np.clip((surfels.points_map[:, :2] - corner) / _FLAT_M, 0, 65535)
+    height = np.round(surfels.points_map[:, 2].astype(np.float64) / _HEIGHT_M).astype(np.int64)
+    lowest = int(height.min())
+    position = np.column_stack([flat, np.minimum(height - lowest, 65535)]).astype(np.uint16)
+    columns: list[AnyArray] = [position, _octahedron(surfels.normals), surfels.levels[:, None], surfels.greys[:, None]]
+    # Neighbours stand together, by centimetres and then all that tells them apart: other orders give the same bytes.
+    near = [position[:, axis] // step for axis, step in ((0, 256), (1, 256), (2, 64), (0, 32), (1, 32), (2, 8))]
+    every = [column[:, i] for column in columns for i in range(column.shape[1])]
+    order = np.lexsort([*every[::-1], *near[::-1]])
+    parts = [_HEAD.pack(*place, lowest, len(surfels))]
+    for column, (kind, width) in zip(columns, _COLUMNS, strict=True):
+        for i in range(width):
+            data = np.ascontiguousarray(column[order, i], np.dtype(kind))
+            parts += [np.ascontiguousarray(b).tobytes() for b in data.view(np.uint8).reshape(len(data), -1).T]
+    return pack(SURFEL_MAGIC, SURFEL_FORMAT, parts, level=_ZSTD_LEVEL)
+
+
+def _decode_tile(data: bytes) -> tuple[tuple[int, int], Surfels]:
+    _, payload = unpack(SURFEL_MAGIC, SURFEL_FORMAT, data, "surfel tile", _MOST_BYTES)
+    count = _HEAD.unpack_from(payload)[3] if len(payload) >= _HEAD.size else -1
+    if len(payload) != _HEAD.size + _BYTES_EACH * count:
+        raise MapFormatError(f"surfel tile: {len(payload)} bytes for {count} surfels; the bytes are damaged")
+    x, y, lowest, _ = _HEAD.unpack_from(payload)
+    columns, start = [], _HEAD.size
+    for kind, width in _COLUMNS:
+        size = np.dtype(kind).itemsize
+        part = np.frombuffer(payload, np.uint8, width * size * count, start).reshape(width, size, count)
+        columns.append(np.ascontiguousarray(np.moveaxis(part, 1, 2)).view(kind)[..., 0])
+        start += width * size * count
+    position, turned, levels, greys = columns
+    if count and int(levels.max()) >= LEVELS:
+        raise MapFormatError(f"surfel tile {x}, {y}: a level of {int(levels.max())}; the bytes are damaged")
+    points = np.empty((count, 3))
+    points[:, :2] = (position[:2].T + 0.5) * _FLAT_M + np.array([x, y]) * TILE_SIZE_M
+    points[:, 2] = (position[2].astype(np.int64) + lowest) * _HEIGHT_M
+    return (x, y), Surfels(points.astype(np.float32), _normals(turned.T), levels[0].copy(), greys[0].copy())
+
+
+def _octahedron(normals: NDArray[np.float32]) -> NDArray[np.int8]:
+    """(N, 2) of unit vectors (N, 3). Source: Meyer et al. 2010, on floating-point normal vectors."""
+    flat = normals[:, :2] / np.abs(normals).sum(axis=1, keepdims=True)
+    folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)
+    return np.asarray(np.round(np.where(normals[:, 2:] < 0, folded, flat) * _TURN), np.int8)
+
+
+def _normals(turned: NDArray[np.int8]) -> NDArray[np.float32]:
+    flat = turned.astype(np.float32) / np.float32(_TURN)
+    height = 1.0 - np.abs(flat).sum(axis=1)
+    folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)
+    normals = np.column_stack([np.where(height[:, None] < 0, folded, flat), height])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.maximum(length, 1e-6), np.float32)

@@ -1,0 +1,266 @@
+"""What a build's recordings add to the surfels of the version before: their keyframes are looked at again, where the final map has them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.mapformat.grid_tile import CELL_M
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.grid.dense_stereo import nearest_around
+from mapserver.grid.grid_kernels import CLEAR_SIGMAS
+from mapserver.grid.site_grid import AGAINST, HIT, OCCUPIED, REACH_PX
+from mapserver.grid.survey_grid import GridSession, depth_views, measures_depth
+from mapserver.surfels.exposure import Sample, estimate_exposure, squared_tangent
+from mapserver.surfels.merge_kernels import (
+    EDGE_M,
+    LEVELS,
+    MAX_RANGE_M,
+    NORMAL,
+    OFFSET,
+    SEEN,
+    SEEN_THROUGH,
+    STRIDE,
+    SUMS,
+    VIEWS,
+    WEIGHT,
+    fill_slots,
+    look_at,
+    merge_view,
+    voxel_keys,
+)
+from mapserver.surfels.surfel_map import EXPOSURE, Surfels
+from mapserver.survey.keyframes.keyframes import Keyframe
+
+_KEPT_STEP_PX = 4  # of what a view shows every so many pixels are kept, to ask what it sees through
+_BLOCK_M = 4.0  # surfels are judged by the views that are near to their block
+_OWN_LIGHT_M = 2.0
+_DARK, _MIN_ALIKE = 5, 50  # grey levels; voxels of one place that tell how two drives differ
+_SAMPLED, _SATURATED = 16, 250  # one surfel in so many tells the exposure; grey levels from which a pixel tells none
+_MIN_FINER = 2  # voxels of the next finer level that make a coarse one needless
+
+
+class VoxelTable:
+    """Voxels of one recording, which grow view by view."""
+
+    def __init__(self) -> None:
+        self._slots = np.full(1 << 16, -1, np.int32)
+        self._keys = np.zeros(0, np.int64)
+        self._sums = np.zeros((0, SUMS), np.float32)
+        self._views = np.zeros((0, 2), np.int32)
+        self._count = self._added = 0
+
+    def add(
+        self, disparity_px: NDArray[np.float32], sigma_px: float, camera: StereoCamera, map_from_cam: Array
+    ) -> None:
+        """One view, as of `depth_views`."""
+        self._make_room(-(-disparity_px.shape[0] // STRIDE) * -(-disparity_px.shape[1] // STRIDE))
+        self._count = merge_view(
+            disparity_px, sigma_px, camera.lens, np.ascontiguousarray(map_from_cam), self._added,
+            self._slots, self._keys, self._sums, self._views, self._count,
+        )  # fmt: skip
+        self._added += 1
+
+    def surfels(self) -> tuple[Surfels, NDArray[np.int64]]:
+        """The voxels as surfels without a colour, and of how many views each is."""
+        keys, sums = self._keys[: self._count], self._sums[: self._count].astype(np.float64)
+        levels = (keys >> 60).astype(np.uint8)
+        corners = np.stack([(keys >> shift & 0xFFFFF) - (1 << 19) for shift in (40, 20, 0)], axis=1)
+        edges_m = EDGE_M * np.exp2(levels.astype(np.float64))[:, None]
+        points = corners * edges_m + sums[:, OFFSET : OFFSET + 3] / sums[:, WEIGHT, None]
+        length = np.linalg.norm(sums[:, NORMAL : NORMAL + 3], axis=1, keepdims=True)
+        normals = sums[:, NORMAL : NORMAL + 3] / np.maximum(length, 1e-9)
+        greys = np.zeros(len(keys), np.uint8)
+        whole = Surfels(points.astype(np.float32), normals.astype(np.float32), levels, greys)
+        is_sound = length[:, 0] > 1e-9
+        return whole[is_sound], self._views[: self._count, VIEWS].astype(np.int64)[is_sound]
+
+    def _make_room(self, pixels: int) -> None:
+        needed = self._count + pixels
+        if needed > len(self._keys):
+            more = max(needed, 2 * len(self._keys)) - len(self._keys)
+            self._keys = np.concatenate([self._keys, np.zeros(more, np.int64)])
+            self._sums = np.concatenate([self._sums, np.zeros((more, SUMS), np.float32)])
+            self._views = np.concatenate([self._views, np.zeros((more, 2), np.int32)])
+        if 2 * needed > len(self._slots):
+            self._slots = np.full(1 << int(np.ceil(np.log2(4 * needed))), -1, np.int32)
+            fill_slots(self._slots, self._keys, self._count)
+
+
+def grow_surfels(
+    before: Surfels, sessions: Sequence[GridSession], settings: StereoSettings
+) -> tuple[Surfels, dict[str, str]]:
+    """The surfels after all sessions, in their order, and by name why a recording adds nothing."""
+    surfels, without = before, {}
+    for session in sessions:
+        if measures_depth(session.survey):
+            surfels = _grown(surfels, session, settings)
+        else:
+            without[session.name] = "one camera measures no depth; surfels need a stereo pair or a depth camera"
+    return surfels, without
+
+
+class _Look(NamedTuple):
+    """What a keyframe keeps to be asked again: disparities as of `nearest_around`, their standard deviation, where it looks from."""
+
+    nearest_px: NDArray[np.float32]
+    sigma_px: float
+    cam_from_map: Array
+
+
+def _grown(before: Surfels, session: GridSession, settings: StereoSettings) -> Surfels:
+    """After one session: what it saw through is gone, and what it saw as finely as it was known takes its place."""
+    camera, table, looks = session.survey.state.camera, VoxelTable(), list[_Look]()
+    keyframes = session.survey.odometry.keyframes
+    for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
+        table.add(disparity_px, sigma_px, camera, map_from_cam)
+        kept = slice(None, None, _KEPT_STEP_PX), slice(None, None, _KEPT_STEP_PX)
+        nearest = np.where(disparity_px[kept] > 0, nearest_around(disparity_px, REACH_PX)[kept], np.float32(0.0))
+        looks.append(_Look(keyframes[0].images.keep([nearest])[0], sigma_px, se3_inverse(map_from_cam)))
+    new, views = table.surfels()
+    hits, passes = _judged(new, looks, camera)
+    new = new[HIT * np.maximum(hits, views) - passes >= OCCUPIED]
+    new = _coloured(new[~_known_finer(new, new, finer_by=1)], keyframes, looks, camera)
+    hits, passes = _judged(before, looks, camera)
+    old = before[HIT * hits - passes > -AGAINST]
+    new = _as_bright_as(old, new)
+    if len(new.exposures) and len(old.exposures):  # where both drives were, the last one tells how bright a view is
+        gaps_m = cKDTree(new.exposures[:, :3]).query(old.exposures[:, :3])[0]
+        old = replace(old, exposures=old.exposures[gaps_m > _OWN_LIGHT_M])
+    return Surfels.joined([old[~_known_finer(old, new, finer_by=0)], new])
+
+
+def _as_bright_as(old: Surfels, new: Surfels) -> Surfels:
+    """The new surfels at the brightness of the old ones, by the median of those that are of one voxel: each drive has a mean of its own."""
+    (keys, first), (others, second) = (_of_voxels(surfels) for surfels in (old, new))
+    _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
+    before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
+    sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
+    if sure.sum() < _MIN_ALIKE:
+        return new
+    shift = float(np.median(np.log(before[sure] / after[sure])))
+    greys = np.clip(np.round(new.greys * np.exp(shift)), 0, 255).astype(np.uint8)
+    exposures = new.exposures - shift * (np.arange(EXPOSURE) == EXPOSURE - 1)
+    return replace(new, greys=greys, exposures=exposures)
+
+
+def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The voxels of surfels, once each, and the first surfel of each."""
+    keys = np.empty(len(surfels), np.int64)
+    voxel_keys(surfels.points_map.astype(np.float64), surfels.levels, keys)
+    found, first = np.unique(keys, return_index=True)
+    return found, first
+
+
+def _judged(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> tuple[Array, Array]:
+    """(N,) how many views see each surfel, and how many see through it, as the grid of planners counts them."""
+    hits, passes = np.zeros((2, len(surfels)))
+    for number, rows in _near(surfels, looks):
+        marks, weights, _ = _look(surfels, rows, looks[number], camera)
+        hits[rows] += marks == SEEN
+        passes[rows] += weights * (marks == SEEN_THROUGH)
+    return hits, passes
+
+
+def _near(surfels: Surfels, looks: Sequence[_Look]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Every view with the surfels of blocks that it may see, view by view."""
+    places = np.floor(surfels.points_map[:, :2] / _BLOCK_M).astype(np.int64)
+    blocks, order = np.unique(places, axis=0, return_inverse=True)
+    ends = np.cumsum(np.bincount(order, minlength=len(blocks)))
+    parts = np.split(np.argsort(order, kind="stable"), ends[:-1])
+    middles = (blocks + 0.5) * _BLOCK_M
+    for number, look in enumerate(looks):
+        place = -look.cam_from_map[:3, :3].T @ look.cam_from_map[:3, 3]
+        near = np.flatnonzero(np.linalg.norm(middles - place[:2], axis=1) < MAX_RANGE_M + _BLOCK_M)
+        if len(near):
+            yield number, np.concatenate([parts[i] for i in near])
+
+
+def _look(
+    surfels: Surfels, rows: NDArray[np.int64], look: _Look, camera: StereoCamera
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    """Marks, weights and pixels as of `look_at` of these surfels."""
+    marks, weights = np.zeros(len(rows), np.uint8), np.zeros(len(rows), np.float32)
+    pixels = np.zeros((len(rows), 2), np.float32)
+    look_at(
+        surfels.points_map[rows], surfels.levels[rows], look.nearest_px, _KEPT_STEP_PX, look.sigma_px, camera.lens, look.cam_from_map,
+        (CLEAR_SIGMAS, CELL_M), marks, weights, pixels,
+    )  # fmt: skip
+    return marks, weights, pixels
+
+
+def _coloured(surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera) -> Surfels:
+    """The surfels with the colours that views show, the nearest most, freed of exposure and of what the lens darkens."""
+    samples = [
+        Sample(rows[fit], np.full(int(fit.sum()), number), squared_tangent(pixels[fit], camera), np.log(greys[fit]))
+        for number, rows, pixels, greys in _shown(surfels, keyframes, looks, camera, _SAMPLED)
+        for fit in [(greys < _SATURATED) & (greys >= 1)]
+    ]
+    exposure = estimate_exposure(samples, len(looks))
+    sums = np.zeros((2, len(surfels)))
+    for number, rows, pixels, greys in _shown(surfels, keyframes, looks, camera, 1):
+        cam_from_map = looks[number].cam_from_map
+        distances_m = np.linalg.norm(surfels.points_map[rows] + cam_from_map[:3, :3].T @ cam_from_map[:3, 3], axis=1)
+        sums[0, rows] += greys / exposure.factor(number, squared_tangent(pixels, camera)) / distances_m**4
+        sums[1, rows] += 1.0 / distances_m**4
+    known = sums[1] > 0
+    greys = np.clip(np.round(sums[0, known] / sums[1, known]), 0, 255).astype(np.uint8)
+    lights = [
+        [*(-look.cam_from_map[:3, :3].T @ look.cam_from_map[:3, 3]), *look.cam_from_map[2, :3], log]
+        for look, log in zip(looks, exposure.logs, strict=True)
+    ]
+    falloff = tuple(exposure.falloff.round(6).tolist())
+    return replace(surfels[known], greys=greys, falloff=falloff, exposures=np.array(lights).reshape(-1, EXPOSURE))
+
+
+def _shown(
+    surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera, every: int
+) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float32], Array]]:
+    """By view: its number, the surfels that it shows (N,) of every so many, at which pixels (N, 2), and how bright (N,)."""
+    for number, near in _near(surfels, looks):
+        rows = near[near % every == 0]
+        marks, _, pixels = _look(surfels, rows, looks[number], camera)
+        rows, pixels = rows[marks == SEEN], pixels[marks == SEEN]
+        if not len(rows):
+            continue
+        smooth = np.asarray(cv2.blur(keyframes[number].frame.left, (STRIDE + 1, STRIDE + 1)), np.uint8)
+        yield number, rows, pixels, _bilinear(smooth, pixels)
+
+
+def _bilinear(picture: NDArray[np.uint8], pixels: NDArray[np.float32]) -> Array:
+    height, width = picture.shape
+    u, v = np.clip(pixels[:, 0], 0, width - 1.001), np.clip(pixels[:, 1], 0, height - 1.001)
+    column, row = u.astype(np.int64), v.astype(np.int64)
+    right, down = u - column, v - row
+    above = picture[row, column] * (1 - right) + picture[row, column + 1] * right
+    below = picture[row + 1, column] * (1 - right) + picture[row + 1, column + 1] * right
+    return np.asarray(above * (1 - down) + below * down, np.float64)
+
+
+def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[np.bool_]:
+    """(N,) whether `other` has the same place, or the one before or behind it, finer by so many levels or more."""
+    known = np.zeros(len(surfels), bool)
+    for level in range(LEVELS):
+        mine = np.flatnonzero(surfels.levels == level)
+        finer = np.flatnonzero(other.levels >= 0) if not len(mine) else np.flatnonzero(other.levels + finer_by <= level)
+        if not len(mine) or not len(finer):
+            continue
+        held, counts = np.unique(_keys(other.points_map[finer], level), return_counts=True)
+        held = held[counts >= (_MIN_FINER if finer_by else 1)]
+        edge_m = EDGE_M * (1 << level)
+        for step in (-1.0, 0.0, 1.0):
+            moved = surfels.points_map[mine] + np.float32(step * edge_m) * surfels.normals[mine]
+            known[mine] |= np.isin(_keys(moved, level), held)
+    return known
+
+
+def _keys(points_map: NDArray[np.float32], level: int) -> NDArray[np.int64]:
+    keys = np.empty(len(points_map), np.int64)
+    voxel_keys(points_map.astype(np.float64), np.full(len(points_map), level, np.uint8), keys)
+    return keys

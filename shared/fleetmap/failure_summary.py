@@ -1,0 +1,83 @@
+"""What robots tell servers of a failure's seconds: the parts in which a recording of them travels, and the summary in it.
+
+No reader of recordings is needed for either: who only forwards them loads neither OpenCV nor numba.
+"""
+
+from itertools import pairwise
+from math import isfinite
+from typing import Annotated
+
+import msgspec
+
+from fleetmap.errors import RecordingError
+from fleetmap.mapformat.manifest import Name
+
+MAX_FILE_BYTES = 8 << 20
+_MAX_SUMMARY_BYTES, _MAX_MOMENTS = 512 << 10, 2000
+
+Text = Annotated[str, msgspec.Meta(max_length=64)]
+Stamp = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
+
+
+class ReplayPart(msgspec.Struct, frozen=True, kw_only=True):
+    """Some of total_bytes of a failure's recording, from offset on, as they travel; id: of its report."""
+
+    id: Text
+    total_bytes: Annotated[int, msgspec.Meta(ge=1, le=1 << 40)]
+    offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
+    data: bytes
+
+
+class Moment(msgspec.Struct, frozen=True, array_like=True):
+    """What the robot said of one frame; position, heading (of the body's x axis, from x towards y) and radius None without a pose."""
+
+    stamp_ns: Stamp
+    status: Text
+    cause: Text
+    position_map_m: tuple[float, float, float] | None = None
+    heading_rad: float | None = None
+    radius_95_m: float | None = None
+
+    @property
+    def figures(self) -> tuple[float, ...]:
+        """All numbers of the pose."""
+        found = (*(self.position_map_m or ()), self.heading_rad, self.radius_95_m)
+        return tuple(value for value in found if value is not None)
+
+
+class FailureSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """Whose failure it is, and what the robot said meanwhile.
+
+    id: of the report. began_ns: its stamp_ns. version, manifest_sha256: the map that the robot used at the beginning, None without one.
+    client: version of fleetmap. pictures: `full` or `blurred`.
+    """
+
+    site: Name
+    robot: Name
+    id: Text
+    began_ns: Stamp
+    version: int | None
+    manifest_sha256: Text | None
+    client: Text
+    pictures: Text
+    moments: Annotated[tuple[Moment, ...], msgspec.Meta(min_length=1, max_length=_MAX_MOMENTS)]
+
+
+def decode_summary(data: bytes) -> FailureSummary:
+    """The summary; RecordingError for bytes that are none."""
+    if len(data) > _MAX_SUMMARY_BYTES:
+        raise RecordingError(f"a failure's summary of {len(data)} bytes; the limit is {_MAX_SUMMARY_BYTES}")
+    try:
+        summary = msgspec.msgpack.decode(data, type=FailureSummary)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise RecordingError(
+            f"the failure's summary cannot be read ({error}); was it made by another fleetmap?"
+        ) from error
+    stamps = [moment.stamp_ns for moment in summary.moments]
+    if any(later <= earlier for earlier, later in pairwise(stamps)):
+        raise RecordingError(
+            "the moments of the failure's summary are not in the order of time; was it made by a robot?"
+        )
+    if not all(isfinite(value) for moment in summary.moments for value in moment.figures):
+        raise RecordingError("a moment of the failure's summary is nowhere; was it made by a robot?")
+    return summary

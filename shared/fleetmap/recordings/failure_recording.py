@@ -1,0 +1,33 @@
+"""A failure's recording: an MCAP file of the seconds around a failure, as robots keep them and servers take them.
+
+It is a recording like any other, with reduced images, and has two attachments more: a summary, which everybody reads, and the state and
+perception of the localizer, which only a client of the robot reads (locclient.delivery.failure_file).
+"""
+
+from pathlib import Path
+
+from fleetmap.errors import RecordingError
+from fleetmap.failure_summary import MAX_FILE_BYTES
+from fleetmap.recordings.mcap.scan import McapScan
+
+SUMMARY, LOCALIZER = "failure.msgpack", "localizer.msgpack.zst"
+
+
+def attachments_of(path: Path) -> dict[str, bytes]:
+    """Both attachments of a failure's recording; RecordingError for a file without one of them, or that is damaged."""
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise RecordingError(f"{path} has {size} bytes; a failure's recording has at most {MAX_FILE_BYTES}")
+    with path.open("rb") as file:
+        scan = McapScan(path, file)
+        for _ in scan.messages():
+            pass
+    damage = scan.damage.all()
+    if damage:
+        raise RecordingError(f"{path} is damaged: {damage[0].what} {damage[0].detail}; fetch it again")
+    missing = [name for name in (SUMMARY, LOCALIZER) if name not in scan.attachments]
+    if missing:
+        raise RecordingError(
+            f"{path} is no failure's recording: {missing[0]} is missing; `locclient replay` plays others"
+        )
+    return {name: scan.attachments[name] for name in (SUMMARY, LOCALIZER)}

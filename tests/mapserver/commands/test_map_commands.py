@@ -1,0 +1,42 @@
+"""Surfels of a version as a file of Gaussians, read by another program."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from fleetmap.geometry import quat_wxyz_from_rotation
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> tuple[str, ...]:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store)
+        save_surfel_draft(store, wall())
+    return ("--site", "lab", "--store", str(tmp_path / "store"))
+
+
+def test_another_reader_finds_the_wall(run, site, tmp_path: Path) -> None:
+    assert f"{len(wall())} surfels of version 2" in run("map", "splats", *site, 2, tmp_path / "a.ply")
+    vertices = PlyData.read(tmp_path / "a.ply")["vertex"]
+    assert len(vertices) == len(wall())
+    np.testing.assert_allclose(vertices["x"], 2.0, atol=1e-3)
+    assert set(np.round((0.5 + 0.28209479 * vertices["f_dc_1"]) * 255).astype(int)) == {120, 250}
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertices["opacity"])), 0.98, atol=1e-4)
+    scales = np.exp(np.stack([vertices[f"scale_{i}"] for i in range(3)], axis=1))
+    assert (scales[:, 2] < 0.2 * scales[:, 0]).all()
+    # The thin axis of each Gaussian is the wall's normal: z of its rotation, up to the sign.
+    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    rotations = np.stack([vertices[f"rot_{i}"] for i in range(4)], axis=1)
+    wanted = quat_wxyz_from_rotation(turned)
+    assert np.abs(rotations @ wanted).min() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
+    assert "surfel_map = true" in run("map", "splats", *site, 1, tmp_path / "a.ply", status=2)
+    assert "has no version 7" in run("map", "splats", *site, 7, tmp_path / "a.ply", status=2)
+    assert "must end in .ply" in run("map", "splats", *site, 2, tmp_path / "a.obj", status=2)
+    assert not list(tmp_path.glob("a.*"))

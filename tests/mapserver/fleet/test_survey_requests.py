@@ -1,0 +1,114 @@
+"""Surveys that people ask for: kept with the site, first on the list, and gone when they are done."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from fleetmap.errors import StateError, UsageError
+from mapserver import releases
+from mapserver.cli import app
+from mapserver.fleet import survey_requests as requests
+from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request, survey_requests
+from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.store import Actor, MapStore
+from support.fleet.dashboard_scene import SITE, fill_store
+from support.fleet.served_api import check_problem, served_api
+from support.storage.map_samples import save_sample_draft
+
+ADA = Actor("ada", "racks were moved")
+AISLE = [(14.0, 2.0), (20.0, 2.0), (20.0, 10.0), (14.0, 10.0)]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[MapStore]:
+    fill_store(tmp_path / "store")
+    with MapStore.open(tmp_path / "store") as opened:
+        yield opened
+
+
+@pytest.mark.parametrize(
+    ("corners", "tiles"),
+    [
+        (AISLE, [(0, 0), (1, 0)]),
+        ([(1.0, 1.0), (1.5, 1.0), (1.2, 1.4)], [(0, 0)]),
+        ([(-1.0, -1.0), (17.0, -1.0), (-1.0, 17.0)], [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 0), (1, -1)]),
+    ],
+)
+def test_tiles_of_a_polygon(corners: list[tuple[float, float]], tiles: list[tuple[int, int]]) -> None:
+    assert SurveyRequest("0", 0, "", "", [list(corner) for corner in corners]).tiles(16.0) == tiles
+
+
+def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_path: Path) -> None:
+    def listed() -> list[tuple[str, str]]:
+        found = resurvey_list(store, SITE, ResurveySettings(), store.now_ns())
+        assert {point.tile for point in found.route} == {concern.tile for concern in found.tiles}
+        return [(concern.tile, "; ".join(concern.reasons)) for concern in found.tiles]
+
+    assert listed() == []
+    made = ask_for_survey(store, SITE, AISLE, ADA)
+    assert [tile for tile, _ in listed()] == ["0,0", "1,0"]
+    assert all("ada asked for it on " in why and "racks were moved" in why for _, why in listed())
+    shown = CliRunner().invoke(app, ["fleet", "resurvey", "--site", SITE, "--store", str(tmp_path / "store")])
+    assert f"request {made.id} of ada: 4 corners, racks were moved" in shown.output
+    with MapStore.open(tmp_path / "store") as again:
+        assert survey_requests(again, SITE) == [made], "another process sees it"
+    sha256 = store.site_file_sha256(SITE, requests.KIND + made.id)
+    assert store.served_kind(sha256) is None, "no robot fetches it"
+    assert store.collect_garbage().files == 0 or survey_requests(store, SITE) == [made]
+    assert survey_requests(store, SITE) == [made]
+    end_request(store, SITE, made.id, ADA)
+    assert (listed(), survey_requests(store, SITE)) == ([], [])
+    assert [(event.kind, event.actor) for event in store.events(SITE)[-2:]] == [
+        (f"survey request {made.id}", "ada")
+    ] * 2
+    with pytest.raises(UsageError, match="may be done already"):
+        end_request(store, SITE, made.id, ADA)
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ([(0.0, 0.0), (1.0, 1.0)], "corners"),
+        ([(0.0, 0.0), (4.0, 4.0), (4.0, 0.0), (0.0, 4.0)], "cross"),
+        ([(0.0, 0.0), (900.0, 0.0), (0.0, 9.0)], "draw several"),
+        ([(float(n), float(n * n)) for n in range(300)], "3 to 200"),
+    ],
+)
+def test_what_is_no_polygon_is_refused(store: MapStore, corners: list[tuple[float, float]], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        ask_for_survey(store, SITE, corners, ADA)
+    assert survey_requests(store, SITE) == []
+
+
+def test_limits(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(requests, "MOST_REQUESTS", 1)
+    ask_for_survey(store, SITE, AISLE, ADA)
+    with pytest.raises(StateError, match="not done"):
+        ask_for_survey(store, SITE, AISLE, ADA)
+    save_sample_draft(store, site="yard")
+    with pytest.raises(StateError, match="no published map"):
+        ask_for_survey(store, "yard", AISLE, ADA)
+    with pytest.raises(UsageError, match="no site nowhere"):
+        ask_for_survey(store, "nowhere", AISLE, ADA)
+    releases.publish(store, "yard")
+    assert survey_requests(store, "yard") == []
+
+
+def test_over_http(tmp_path: Path) -> None:
+    path = "/v1/sites/lab/resurvey"
+    with served_api(tmp_path) as server:
+        asked = {"actor": "ada", "reason": "seen", "corners_map_m": [[1, 1], [3, 1], [3, 3]]}
+        made = server.client.post(f"{path}/requests", json=asked).json()
+        assert made["corners_map_m"] == asked["corners_map_m"]
+        found = server.client.get(path).json()
+        assert [request["id"] for request in found["requests"]] == [made["id"]]
+        assert found["tiles"][0]["tile"] == "0,0"
+        check_problem(
+            server.client.post(f"{path}/requests", json=asked | {"corners_map_m": [[1, 1]]}), 422, "corners_map_m"
+        )
+        check_problem(server.client.post(f"{path}/requests/00000000/end", json={"actor": "ada"}), 404, "may be done")
+        assert server.client.post(f"{path}/requests/{made['id']}/end", json={"actor": "ada"}).json() == {"status": "ok"}
+        assert server.client.get(path).json()["requests"] == []

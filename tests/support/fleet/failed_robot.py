@@ -1,0 +1,77 @@
+"""A robot that fails in the painted room, and the recording of its failure. Made once."""
+
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+
+from fleetmap.failure_summary import FailureSummary, Moment
+from fleetmap.messages import FailureReport
+from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY
+from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sources.sensor_bundle import SensorBundle
+from locclient.delivery.failure_file import failure_file
+from locclient.maps.loaded_map import LoadedMap
+from locclient.robot.failure_report import RobotProfile, failure_report
+from locclient.robot.robot import Robot
+from support.recordings.recording_samples import calibration
+from support.worlds import robot_world
+
+
+def profile(robot: Robot) -> RobotProfile:
+    rig = robot_world.rectifier()
+    mounting = (robot.base_from_body, rig.body_from_cam, rig.camera)
+    return RobotProfile("room", "r1", *mounting, robot_world.SETTINGS, calibration().imu, rig.imu_minus_cam_s)
+
+
+def failed(
+    ride: Iterable[SensorBundle], loaded: LoadedMap, pictures: str = "full"
+) -> tuple[FailureReport, bytes, list[str]] | None:
+    """The first failure of a ride: its report, its recording, and what the robot said of each frame that this holds."""
+    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    robot.use(loaded)
+    context, said = None, {}
+    for bundle in ride:
+        outcome = robot.handle(bundle)
+        said[outcome.estimate.stamp_ns] = outcome.estimate.status.value
+        context = context or outcome.failure
+        if context is not None and context.cut is not None and context.cut.segments is not None:
+            break
+    if context is None:
+        return None
+    robot.ring.finish()
+    stamps = [frame.stamp_ns for segment in context.cut.segments for frame in segment.frames]
+    report = failure_report(context, profile(robot), report_id="f1", wall_ns=10**18)
+    data = failure_file(context.cut, report, profile(robot), pictures)
+    return report, data, [said[stamp_ns] for stamp_ns in stamps]
+
+
+@lru_cache(maxsize=1)
+def _jpeg() -> bytes:
+    import cv2
+    import numpy as np
+
+    size = calibration().cameras[0]
+    image = np.random.default_rng(0).integers(0, 255, (size.height_px, size.width_px), np.uint8)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 30])[1].tobytes()
+
+
+def small_file(path: Path, *, jpegs: list[bytes] | None = None, attached: bool = True, **named: object) -> bytes:
+    """A recording as a server sees it: the summary counts, the localizer's part is not looked at."""
+    moments = tuple(
+        Moment(k * 10**8, "LOST" if k > 2 else "TRACKING", "", (0.1 * k, 0.0, 0.0), 0.0, 0.05) for k in range(6)
+    )
+    given = {"site": "lab", "robot": "r1", "id": "f1"} | named
+    summary = FailureSummary(
+        began_ns=3 * 10**8, version=1, manifest_sha256="0" * 64, client="1", pictures="full", moments=moments, **given
+    )
+    with McapRecordingWriter(path, calibration(has_imu=False)) as writer:
+        if attached:
+            writer.attach(SUMMARY, "application/msgpack", msgspec.msgpack.encode(summary))
+            writer.attach(LOCALIZER, "application/zstd", b"for robots")
+        for number, jpeg in enumerate([_jpeg()] * 3 if jpegs is None else jpegs):
+            image = StoredImage("file", jpeg)
+            writer.write_frame(StoredFrame((2 * number) * 10**8, image, image))
+    return path.read_bytes()

@@ -1,0 +1,51 @@
+"""What surveys of the box room hand on, without surveying it."""
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from mapserver.grid.survey_grid import GridSession
+from mapserver.survey.keyframes.keyframes import MemoryImageStore
+from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
+from support.worlds.box_room import ROOM_M, points_seen, stereo_pair
+
+CAMERA = StereoCamera(FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, BASELINE_M, WIDTH, HEIGHT)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    frame: RectifiedFrame
+    frame_index: int
+    images: MemoryImageStore = field(default_factory=MemoryImageStore)
+
+
+def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth: bool = False) -> GridSession:
+    """What a survey hands on of keyframes at these map_from_body."""
+    keyframes = []
+    for number, map_from_body in enumerate(places):
+        pair, disparity = stereo_pair(map_from_body, number), None
+        if has_depth:
+            map_from_cam = map_from_body @ BODY_FROM_CAM0
+            pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 2)
+            depth_m = (points_seen(map_from_cam, pixels) - map_from_cam[:3, 3]) @ map_from_cam[:3, 2]
+            disparity = (FOCAL * BASELINE_M / depth_m).reshape(HEIGHT, WIDTH).astype(np.float32)
+        right = None if has_depth else pair.right
+        keyframes.append(Seen(RectifiedFrame(number, pair.left, right, disparity), number))
+    survey = SimpleNamespace(
+        odometry=SimpleNamespace(keyframes=keyframes),
+        state=SimpleNamespace(camera=camera, body_from_cam=BODY_FROM_CAM0),
+        stereo_yaw=SimpleNamespace(correction_px=0.0),
+    )
+    return GridSession("ride", survey, np.array(places))  # type: ignore[arg-type]
+
+
+def ride(height_m: list[float]) -> list[Array]:
+    """Along x at these heights over the floor, looking at the wall at y = 3, down by 0.2 rad."""
+    down = so3_exp(np.array([0, 0, np.pi / 2])) @ so3_exp(np.array([0, 0.2, 0]))
+    return [
+        se3(down, np.array([-1.0 + 0.2 * n, 0.4 + 0.05 * n, ROOM_M[0, 2] + height]))
+        for n, height in enumerate(height_m)
+    ]
