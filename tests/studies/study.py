@@ -10,7 +10,6 @@ import io
 import json
 import os
 import platform
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,11 +40,16 @@ def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[i
     kept = json.loads(path.read_text()) if path.exists() and not os.environ.get("FRESH") else {}
     rows = {row["case"]: row for row in kept.get("rows", []) if row["case"] in cases}
     for case in track([c for c in cases if c not in rows], name, console=Console(stderr=True), disable=len(cases) < 2):
-        begin_s = time.process_time()
+        begin_s = _cpu_s()
         row = cases[case]()
-        rows[case] = {"case": case, **row, "cpu_s": round(time.process_time() - begin_s, 2)}
+        rows[case] = {"case": case, **row, "cpu_s": round(_cpu_s() - begin_s, 2)}
         _keep(path, [rows[c] for c in cases if c in rows], seeds)
     return [rows[case] for case in cases]
+
+
+def _cpu_s() -> float:
+    """Of this process and of those that it waited for."""
+    return sum(os.times()[:4])
 
 
 def _keep(path: Path, rows: list[Row], seeds: Sequence[int]) -> None:
@@ -66,19 +70,23 @@ def table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
     return "\n".join(lines)
 
 
+def between_marks(text: str, content: str, path: Path) -> str:
+    """The text of a page with this between its two marks; ValueError where it has none."""
+    before, _, rest = text.partition(_BEGIN)
+    if _END not in rest:
+        raise ValueError(f"{path} lacks the lines {_BEGIN} and {_END}; add them where the tables belong")
+    return "\n\n".join([before + _BEGIN, content, _END + rest.partition(_END)[2]])
+
+
 def publish(name: str, tables: Sequence[str], figure: Figure | None) -> None:
     """Writes the tables between the marks of the study's page and the picture beside it, and prints the tables."""
     page = PAGES / f"{name}.md"
-    before, _, rest = page.read_text().partition(_BEGIN)
-    if _END not in rest:
-        raise ValueError(f"{page} lacks the lines {_BEGIN} and {_END}; add them where the tables belong")
     about = json.loads((PAGES / f"{name}.json").read_text())
     hours = sum(row["cpu_s"] for row in about["rows"]) / 3600
     made = ", ".join(f"{what} {value}" for what, value in about["about"].items())
     seeds = f"Seeds {', '.join(map(str, about['seeds']))}. " if about["seeds"] else ""
     note = f"{seeds}{hours:.2g} CPU hours. {made}."
-    text = "\n\n".join([_BEGIN, *tables, note, _END])
-    page.write_text(before + text + rest.partition(_END)[2])
+    page.write_text(between_marks(page.read_text(), "\n\n".join([*tables, note]), page))
     print("\n\n".join([*tables, note]))
     if figure is not None:
         buffer = io.BytesIO()
