@@ -107,3 +107,13 @@ def test_a_cross_aisle_is_free_and_its_sides_are_guarded() -> None:
         assert (guards & (np.abs(x - place) < 1e-6)).sum() == 2, place
     assert len(layout.packing_stations_m()) == 2
     assert (x < layout.dock_m).any()
+
+
+def test_a_moved_rack_row_takes_its_faces_along_and_no_others() -> None:
+    before, after = (World(Layout(aisles=1, bays=4, moved_rows=moved), seed=5) for moved in ((), ((1, -0.4),)))
+    old, new = (world.detailed_faces(0, 0).quads[:, 1] for world in (before, after))
+    shift = np.round(new - old, 9)
+    assert set(np.unique(shift).tolist()) == {-0.4, 0.0}
+    row_y = before.layout.row_y_m(1)
+    assert np.abs(old[shift != 0] - row_y).max() < 1.0
+    assert (shift != 0).sum() > 100

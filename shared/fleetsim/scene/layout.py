@@ -16,7 +16,7 @@ class Layout(Section, frozen=True):
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
     floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
-    restock_per_day: share of slots.
+    restock_per_day: share of slots. moved_rows: rack rows that stand elsewhere than the plan says: number, and metres along y.
     """
 
     aisles: int = 3
@@ -30,6 +30,7 @@ class Layout(Section, frozen=True):
     are_aisles_identical: bool = False
     restock_per_day: float = 0.125
     empty_share: float = 0.1
+    moved_rows: tuple[tuple[int, float], ...] = ()
 
     bay_m: ClassVar[float] = 2.7
     rack_depth_m: ClassVar[float] = 1.1
@@ -70,7 +71,8 @@ class Layout(Section, frozen=True):
     def row_y_m(self, row: int) -> float:
         """Centre line of a rack row."""
         side = -1.0 if row % 2 else 1.0
-        return self.aisle_y_m(row // 2) + side * (self.aisle_width_m + self.rack_depth_m) / 2
+        moved_m = dict(self.moved_rows).get(row, 0.0)
+        return self.aisle_y_m(row // 2) + side * (self.aisle_width_m + self.rack_depth_m) / 2 + moved_m
 
     def bay_x_m(self, bay: int) -> float:
         """Low x of a bay."""
