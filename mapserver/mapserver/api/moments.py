@@ -29,6 +29,12 @@ def moment_text(stamp_ns: int | None, zone: tzinfo | None) -> str | None:
     return f"{at:%Y-%m-%d %H:%M:%S} {at.tzname()}"
 
 
+def clock_text(stamp_ns: int, zone: tzinfo | None) -> str:
+    """The time of day of a stamp by a zone's clock, to a tenth of a second."""
+    at = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).astimezone(zone)
+    return f"{at:%H:%M:%S}.{stamp_ns // 100_000_000 % 10}"
+
+
 def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_end: bool = False) -> int | None:
     """Nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone, None: the machine's own. None for no text.
 

@@ -1,11 +1,14 @@
 """Fleet health for the pages: rates with their intervals, failures, versions on trial."""
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from scipy.special import bdtr
 
+from fleetmap.errors import RecordingError
+from fleetmap.failure_summary import FailureSummary, decode_summary
 from mapserver.dashboard.fleet_parts import Trial, trial_of
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
@@ -14,6 +17,7 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore, TraceRow
 
+_log = logging.getLogger(__name__)
 DAY_H = 24
 DAYS_SHOWN = 14
 FAILURES_SHOWN = 50
@@ -88,6 +92,17 @@ class HealthData:
     def failure(self, number: int) -> FailureDetail:
         """One failure."""
         return self._store.fleet.failure(number)
+
+    def replay(self, number: int) -> FailureSummary | None:
+        """What the robot said in the seconds around a failure; None without a recording, and for one of another fleetmap."""
+        found = self._store.fleet.replay_summary(number)
+        if found is None:
+            return None
+        try:
+            return decode_summary(found)
+        except RecordingError as error:
+            _log.warning("failure %d is shown without its recording: %s", number, error)
+            return None
 
     def choices(self, site: str) -> FilterChoices:
         """Filters of the site's failures."""

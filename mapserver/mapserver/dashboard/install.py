@@ -19,6 +19,7 @@ from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.pages import (
     failure_page,
+    failures_page,
     fleet_page,
     live_page,
     map_page,
@@ -46,7 +47,7 @@ def install_dashboard(
         surveys,
         RobotPlacing(store, fleet, bus),
     )
-    for page in (fleet_page, robot_page, map_page, failure_page, survey_page, live_page):
+    for page in (fleet_page, robot_page, map_page, failures_page, failure_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
     _install_pictures(services, store)

@@ -18,7 +18,7 @@ from mapserver.api.moments import moment_text, read_moment, read_range, zone_of
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.map_layers import Layer, box_of, ground
+from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
 from mapserver.dashboard.markup import address, joined, link, time_fields
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
@@ -151,15 +151,23 @@ def _check_query(request: Request, knows: Sequence[str]) -> None:
 
 
 async def version_map(
-    services: Services, context: PageContext, version: int, over: Sequence[Layer], *, is_small: bool = False
+    services: Services,
+    context: PageContext,
+    version: int,
+    over: Sequence[Layer],
+    *,
+    is_small: bool = False,
+    places_m: Sequence[tuple[float, float]] = (),
 ) -> SiteMap:
-    """A version's map with layers over it; their items may change."""
+    """A version's map with layers over it; their items may change. places_m: what is in sight first, everything without them."""
     plan = await load(services.maps.plan, context.site, version)
     below = await load(services.maps.underlays, context.site, version, context.root)
     areas = await load(services.maps.areas, context.site)
     layers = [*ground(plan, context.plan_picture(version), areas, below), *over]
     with ui.element("div"):
-        return SiteMap(f"Map of {context.site}, version {version}", box_of(plan), layers, is_small=is_small)
+        return SiteMap(
+            f"Map of {context.site}, version {version}", box_around(places_m, box_of(plan)), layers, is_small=is_small
+        )
 
 
 def notice(tone: str, words: object) -> Markup:

@@ -17,6 +17,7 @@ from mapserver.floor_plan.areas import Areas
 
 _WEAK = 0.5  # of the tracked points agree: below, a person should look
 _HEAT_CELL_M, _HEAT_SIGMA_M, _HEAT_CELLS = 0.5, 2.0, 1000
+_MARGIN_M, _SMALLEST_M = 3.0, 10.0  # of what is in sight around places
 _HEAT_BGR = (32, 60, 220)
 _DIRECTIONS_RAD = {"E": 0.0, "N": np.pi / 2, "W": np.pi, "S": -np.pi / 2}
 Box = tuple[float, float, float, float]
@@ -106,6 +107,20 @@ class Layer:
 def box_of(plan: Plan) -> Box:
     """Corners of a plan."""
     return (*plan.low_m, *plan.high_m)
+
+
+def box_around(places_m: Sequence[tuple[float, float]], box: Box) -> Box:
+    """The part of a map's box around places, with room beside them; all of it where none of them lies in it."""
+    inside = [(x, y) for x, y in places_m if box[0] <= x <= box[2] and box[1] <= y <= box[3]]
+    if not inside:
+        return box
+    sides = []
+    for axis in (0, 1):
+        low, high = (bound(place[axis] for place in inside) for bound in (min, max))
+        half_m = max((high - low) / 2 + _MARGIN_M, _SMALLEST_M / 2)
+        sides.append(((low + high) / 2 - half_m, (low + high) / 2 + half_m))
+    (x0, x1), (y0, y1) = sides
+    return (x0, y0, x1, y1)
 
 
 def ground(plan: Plan, picture_address: str, areas: Areas, below: Sequence[Layer] = ()) -> list[Layer]:

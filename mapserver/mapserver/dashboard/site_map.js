@@ -100,10 +100,10 @@ export default {
       }
       group.marks.show(items.filter((item) => item.kind === "mark"), isMoving);
     },
-    show(name, items) {
+    show(name, items, isMoving = true) {
       const group = this.layers?.[name];
       if (!group) return; // the map is not there yet: the next report is soon
-      this.fill(group, items, true);
+      this.fill(group, items, isMoving);
       this.nameAreas();
       if (this.follows && !this.touched) this.grow(items);
     },

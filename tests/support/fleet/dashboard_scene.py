@@ -135,9 +135,9 @@ def build_report() -> dict[str, object]:
     }
 
 
-def picture(words: str) -> bytes:
-    """A JPEG with words in it."""
-    image = np.full((120, 160), 70, np.uint8)
+def picture(words: str, width_px: int = 160) -> bytes:
+    """A JPEG with words in it, three quarters as high as wide."""
+    image = np.full((width_px * 3 // 4, width_px), 70, np.uint8)
     cv2.putText(image, words, (8, 64), cv2.FONT_HERSHEY_SIMPLEX, 0.6, 255, 1)
     return cv2.imencode(".jpg", image)[1].tobytes()
 

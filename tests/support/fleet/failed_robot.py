@@ -6,8 +6,8 @@ from pathlib import Path
 
 import msgspec
 
-from fleetmap.failure_summary import FailureSummary, Moment
-from fleetmap.messages import FailureReport
+from fleetmap.failure_summary import FailureSummary, Moment, ReplayPart
+from fleetmap.messages import PART_BYTES, FailureReport, encode_message
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -16,6 +16,7 @@ from locclient.delivery.failure_file import failure_file
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.robot import Robot
+from mapserver.fleet.fleet import Fleet
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
@@ -58,20 +59,34 @@ def _jpeg() -> bytes:
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 30])[1].tobytes()
 
 
-def small_file(path: Path, *, jpegs: list[bytes] | None = None, attached: bool = True, **named: object) -> bytes:
-    """A recording as a server sees it: the summary counts, the localizer's part is not looked at."""
-    moments = tuple(
-        Moment(k * 10**8, "LOST" if k > 2 else "TRACKING", "", (0.1 * k, 0.0, 0.0), 0.0, 0.05) for k in range(6)
-    )
-    given = {"site": "lab", "robot": "r1", "id": "f1"} | named
-    summary = FailureSummary(
-        began_ns=3 * 10**8, version=1, manifest_sha256="0" * 64, client="1", pictures="full", moments=moments, **given
-    )
+def small_file(
+    path: Path,
+    *,
+    jpegs: list[bytes] | None = None,
+    attached: bool = True,
+    moments: tuple[Moment, ...] | None = None,
+    stamps_ns: tuple[int, ...] = (0, 2 * 10**8, 4 * 10**8),
+    **named: object,
+) -> bytes:
+    """A recording as a server sees it: the summary counts, the localizer's part is not looked at. stamps_ns: of the pictures."""
+    if moments is None:
+        moments = tuple(
+            Moment(k * 10**8, "LOST" if k > 2 else "TRACKING", "", (0.1 * k, 0.0, 0.0), 0.0, 0.05) for k in range(6)
+        )
+    given = {"site": "lab", "robot": "r1", "id": "f1", "began_ns": 3 * 10**8} | named
+    summary = FailureSummary(version=1, manifest_sha256="0" * 64, client="1", pictures="full", moments=moments, **given)
     with McapRecordingWriter(path, calibration(has_imu=False)) as writer:
         if attached:
             writer.attach(SUMMARY, "application/msgpack", msgspec.msgpack.encode(summary))
             writer.attach(LOCALIZER, "application/zstd", b"for robots")
-        for number, jpeg in enumerate([_jpeg()] * 3 if jpegs is None else jpegs):
+        for stamp_ns, jpeg in zip(stamps_ns, [_jpeg()] * 3 if jpegs is None else jpegs, strict=False):
             image = StoredImage("file", jpeg)
-            writer.write_frame(StoredFrame((2 * number) * 10**8, image, image))
+            writer.write_frame(StoredFrame(stamp_ns, image, image))
     return path.read_bytes()
+
+
+def send_replay(fleet: Fleet, site: str, robot: str, report_id: str, data: bytes) -> None:
+    """Gives a server a failure's recording, as a robot sends it."""
+    for offset in range(0, len(data), PART_BYTES):
+        part = ReplayPart(id=report_id, total_bytes=len(data), offset=offset, data=data[offset : offset + PART_BYTES])
+        assert not fleet.replays.take(site, robot, encode_message(part)).refused

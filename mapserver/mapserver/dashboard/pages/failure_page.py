@@ -1,12 +1,16 @@
-"""The failure pages: the list by robot, version, tile and cause, and one failure with its whole report."""
+"""The page of one failure: the answer in a sentence, its pictures, the seconds around it, and the robot's whole report."""
+
+from dataclasses import dataclass
 
 from fastapi import Request
 from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.errors import FleetmapError
+from fleetmap.failure_summary import Moment
 from fleetmap.messages import Cause, FailureKind, FailureReport
-from mapserver.dashboard.fleet_health import FAILURES_SHOWN, FilterChoices
+from mapserver.dashboard.failure import story
+from mapserver.dashboard.failure.player import LAYER, FailurePlayer, mark_of
 from mapserver.dashboard.layout import (
     RESPONSE_TIMEOUT_S,
     PageContext,
@@ -19,15 +23,13 @@ from mapserver.dashboard.layout import (
     show,
     version_map,
 )
-from mapserver.dashboard.live import STATUSES
-from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.markup import badge, choices, facts, joined, link, table
-from mapserver.store import FailureDetail, FailureFilter, FailureRow
+from mapserver.dashboard.map_layers import Layer, Mark
+from mapserver.dashboard.markup import facts, joined, link, table
+from mapserver.dashboard.pages.failures_page import tone_of
+from mapserver.dashboard.site_map import SiteMap
+from mapserver.store import FailureDetail, PictureRow
 
-_REFRESH_S = 3.0
-_KNOWN = ("robot", "version", "area", "tile", "cause", "since", "until", "before")
-_PICTURES = {"frame": "Left camera image", "matches": "Matches: the image and the landmarks expected in it"}
-_KINDS = {FailureKind.NOT_FOUND: "does not find itself"}
+_LEFT, _MATCHES = "Left camera image", "The image, and the landmarks expected in it"
 _ADVICE = {
     Cause.CARRIED: "The robot was carried: what it sees ended between two images, and its fixes agree on another place.",
     Cause.ALIASED: "Several places of the map look like what the robot sees. Something that differs, a dock or a coarse position tells "
@@ -39,47 +41,55 @@ _ADVICE = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """A failure with what its recording says: moments and pictures, none without one; clock: for their stamps."""
+
+    context: PageContext
+    detail: FailureDetail
+    clock: story.FailureClock
+    moments: list[Moment]
+    pictures: list[PictureRow]
+
+    @property
+    def found_ns(self) -> int | None:
+        """When the robot had found itself again, None where the recording does not show it."""
+        blind = story.blind_time(self.moments, self.clock.began_ns)
+        return None if blind is None else blind.found_ns
+
+    def address(self, picture: PictureRow) -> str:
+        """Of a picture."""
+        return f"{self.context.root}/pictures/{self.detail.failure.number}/{picture.place}.jpg"
+
+
 def install(services: Services) -> None:
-    """Adds the pages."""
-
-    @ui.page("/failures", title="Failures – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
-    async def failures_page(request: Request, site: str | None = None) -> None:
-        async def build(context: PageContext) -> None:
-            query = request.query_params
-            since_ns, until_ns = context.time_range()
-            wanted = FailureFilter(
-                site=context.site,
-                robot=query.get("robot") or None,
-                version=number(query.get("version"), "version"),
-                tile=query.get("tile") or None,
-                cause=query.get("cause") or None,
-                area=query.get("area") or None,
-                since_ns=since_ns,
-                until_ns=until_ns,
-            )
-            html(Markup("<h1>Failures of {}</h1>").format(context.site))
-            html(_filters(context, wanted, await load(services.health.choices, context.site)))
-            await _list(services, context, wanted, number(query.get("before"), "failure"))
-
-        await show(services, request, "failures", site, build, _KNOWN)
+    """Adds the page."""
 
     @ui.page("/failures/{failure}", title="Failure – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
     async def failure_page(request: Request, failure: str, site: str | None = None) -> None:
         found = await load(_site_of, services, failure, site)
 
         async def build(context: PageContext) -> None:
-            detail = await load(services.health.failure, number(failure, "failure") or 0)
+            shown = await load(_shown, services, context, number(failure, "failure") or 0)
             html(back_link(context, "failures", "All failures"))
-            html(Markup("<h1>Failure {} of {}</h1>").format(detail.failure.number, detail.failure.robot))
-            html(_answer(context, detail))
-            with ui.element("div").classes("pair"):
-                html(_summary(context, detail))
-                with ui.element("div"):
-                    await _position(services, context, detail)
-            html(_pictures(context, detail))
-            html(_fixes(detail.report))
+            html(Markup("<h1>Failure {} of {}</h1>").format(shown.detail.failure.number, shown.detail.failure.robot))
+            html(_answer(shown))
+            html(_pictures(shown))
+            html(_match_view(shown))
+            await _seconds(services, shown)
+            if shown.moments:
+                html(_summary(shown))
+            html(_fixes(shown.detail.report))
 
         await show(services, request, "failures", found, build)
+
+
+def _shown(services: Services, context: PageContext, failure: int) -> _Shown:
+    detail = services.health.failure(failure)
+    began_ns = detail.report.stamp_ns
+    moments = story.moments_near(services.health.replay(failure), began_ns)
+    clock = story.FailureClock(began_ns, detail.failure.happened_ns, context.zone)
+    return _Shown(context, detail, clock, moments, story.pictures_near(detail.pictures, began_ns))
 
 
 def _site_of(services: Services, failure: str, site: str | None) -> str | None:
@@ -90,118 +100,49 @@ def _site_of(services: Services, failure: str, site: str | None) -> str | None:
         return site
 
 
-def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) -> Markup:
-    return Markup(
-        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}{}{}'
-        '<button type="submit">Show</button> <a href="{}">Show all</a></form>'
-    ).format(
-        f"{context.root}/failures",
-        context.site,
-        choices("robot", "Robot", known.robots, wanted.robot),
-        choices("version", "Map version", known.versions, None if wanted.version is None else str(wanted.version)),
-        choices("area", "Area", known.areas, wanted.area) if known.areas or wanted.area else "",
-        choices("tile", "Tile", known.tiles, wanted.tile),
-        choices("cause", "Cause", known.causes, wanted.cause),
-        context.range_fields(),
-        context.to("failures"),
-    )
-
-
-async def _list(services: Services, context: PageContext, wanted: FailureFilter, before: int | None) -> None:
-    """The map and the table; the newest page is refreshed when failures arrive."""
-    shown = await load(services.health.failures, wanted, before)
-    version = wanted.version or await load(services.maps.current_version, context.site)
-    shown_map = None
-    if version is not None:
-        box = box_of(await load(services.maps.plan, context.site, version))
-        layers = [
-            Layer("Density", heat(_places(shown), box), shown=False),
-            Layer("Failures", failure_marks(context, shown)),
-        ]
-        shown_map = await version_map(services, context, version, layers)
-    listed = html(_rows(context, shown))
-
-    async def refresh() -> None:
-        nonlocal shown
-        found = await load(services.health.failures, wanted, None)
-        if found != shown:
-            shown = found
-            listed.set_content(str(_rows(context, found)))
-            if shown_map is not None:
-                shown_map.show("Failures", failure_marks(context, found))
-                shown_map.show("Density", heat(_places(found), box))
-
-    if before is None:
-        ui.timer(_REFRESH_S, refresh, immediate=False)
-
-
-def _places(shown: list[FailureRow]) -> list[tuple[float, float]]:
-    return [(row.x_map_m, row.y_map_m) for row in shown if row.x_map_m is not None and row.y_map_m is not None]
-
-
-def failure_marks(context: PageContext, shown: list[FailureRow]) -> list[Mark]:
-    """Crosses at the failures that have a position."""
-    found = []
-    for row in reversed(shown):
-        if row.x_map_m is not None and row.y_map_m is not None:
-            words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
-            found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", words, to_failure))
-    return found
-
-
-def _tone(row: FailureRow) -> str:
-    return "warn" if row.kind == FailureKind.SUSPECTED else "bad"
-
-
-def _kind(row: FailureRow) -> Markup:
-    return badge(_tone(row), _KINDS.get(FailureKind(row.kind), row.kind) if row.kind in set(FailureKind) else row.kind)
-
-
-def _rows(context: PageContext, found: list[FailureRow]) -> Markup:
-    shown = found[:FAILURES_SHOWN]
-    listed = failure_table(context, shown, "No failures match these filters.")
-    if len(found) <= FAILURES_SHOWN:
-        return listed
-    filters = {name: context.query.get(name) for name in _KNOWN}
-    older = context.to("failures", **(filters | {"before": shown[-1].number}))
-    return Markup("{}<p>{}</p>").format(listed, link(older, "Older failures"))
-
-
-def failure_table(context: PageContext, shown: list[FailureRow], empty: str) -> Markup:
-    """Failures as a table; empty: the sentence where there are none."""
-    rows = [
-        (
-            link(context.to(f"failures/{row.number}"), f"Failure {row.number}"),
-            context.moment(row.happened_ns),
-            link(context.to(f"robots/{row.robot}"), row.robot),
-            row.cause.replace("_", " "),
-            _kind(row),
-            row.version,
-            row.where,
-            f"{row.duration_s:.0f} s",
-        )
-        for row in shown
-    ]
-    head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Where", "Duration")
-    return table(head, rows, empty=empty, name="Failures")
-
-
-def _answer(context: PageContext, detail: FailureDetail) -> Markup:
+def _answer(shown: _Shown) -> Markup:
     """What happened, in a sentence."""
-    row, report = detail.failure, detail.report
+    row = shown.detail.failure
     kind = "suspects a failure" if row.kind == FailureKind.SUSPECTED else "failed"
     where = f" in {row.area}" if row.area else f" in tile {row.tile}" if row.tile else ""
-    state = STATUSES.get(row.status, (row.status.lower(),))[0]
-    off = f", and was {report.wrong_by_m:.1f} m from where it believed to be" if report.wrong_by_m is not None else ""
-    lasted = f"{state} for {row.duration_s:.1f} s when it reported"
-    words = (
-        f"{row.robot} {kind} at {context.moment(row.happened_ns)}{where}: {row.cause.replace('_', ' ')}, {lasted}{off}."
+    words = story.answer(shown.detail, shown.moments, shown.clock)
+    return notice(tone_of(row), f"{row.robot} {kind} at {shown.context.moment(row.happened_ns)}{where}: {words}.")
+
+
+def _figure(shown: _Shown, picture: PictureRow, what: str, kind: str = "") -> Markup:
+    words = f"{what}: {shown.clock.since(picture.stamp_ns)}"
+    return Markup(
+        '<figure class="{0}"><img src="{1}" alt="{2}" loading="lazy"><figcaption>{2}</figcaption></figure>'
+    ).format(kind, shown.address(picture), words)
+
+
+def _pictures(shown: _Shown) -> Markup:
+    """Before, at and after, from the recording; the report's own where there is none."""
+    chosen = story.before_at_after(shown.pictures, shown.clock.began_ns, shown.found_ns)
+    if not chosen:
+        own = [picture for picture in shown.detail.pictures if picture.kind == "frame"]
+        chosen = [(_LEFT, picture) for picture in sorted(own, key=lambda picture: picture.stamp_ns)]
+    if not chosen:
+        return Markup(
+            '<h2>Pictures</h2><p class="quiet">None: the robot sent none, or they were deleted to save space.</p>'
+        )
+    figures = joined(_figure(shown, picture, title) for title, picture in chosen)
+    return Markup('<h2>Pictures</h2><div class="pictures row">{}</div>').format(figures)
+
+
+def _match_view(shown: _Shown) -> Markup:
+    views = [
+        _figure(shown, picture, _MATCHES, "matches") for picture in shown.detail.pictures if picture.kind == "matches"
+    ]
+    return (
+        Markup('<h2>What the map expected</h2><div class="pictures">{}</div>').format(joined(views))
+        if views
+        else Markup()
     )
-    return notice(_tone(row), words)
 
 
-def _summary(context: PageContext, detail: FailureDetail) -> Markup:
-    row, report = detail.failure, detail.report
+def _summary(shown: _Shown) -> Markup:
+    context, row, report = shown.context, shown.detail.failure, shown.detail.report
 
     def figure(value: float | None, unit: str = "") -> str | None:
         if value is None:
@@ -216,7 +157,7 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
     doubt = (
         "The robot suspects a failure because its fixes contradict its position. Suspected failures are an estimate."
     )
-    return Markup("<div><h2>What happened</h2>{}{}{}</div>").format(
+    return Markup("<div><h2>What the robot reported</h2>{}{}{}</div>").format(
         notice("warn", doubt) if suspected else "",
         "" if advice is None else notice("", advice),
         facts(
@@ -225,7 +166,7 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
                 ("Duration when reported", f"{row.duration_s:.1f} s"),
                 ("Cause", row.cause.replace("_", " ")),
                 ("Calibration", report.calibration or "–"),
-                ("State of the robot", STATUSES.get(row.status, (row.status,))[0]),
+                ("State of the robot", story.status_words(row.status)),
                 ("Robot", link(context.to(f"robots/{row.robot}"), row.robot)),
                 ("Map version", same("version", row.version)),
                 ("Area", same("area", row.area) or "–"),
@@ -243,28 +184,65 @@ def _summary(context: PageContext, detail: FailureDetail) -> Markup:
     )
 
 
-async def _position(services: Services, context: PageContext, detail: FailureDetail) -> None:
-    """The position on the map, and the fixes before the failure."""
-    row = detail.failure
+async def _seconds(services: Services, shown: _Shown) -> None:
+    """The map around the failure, beside the seconds of its recording or the report's figures."""
+    html(Markup("<h2>{}</h2>").format("The seconds around it" if shown.moments else "Where it was"))
+    with ui.element("div").classes("pair"):
+        with ui.element("div"):
+            site_map = await _position(services, shown)
+        if not shown.moments:
+            html(_summary(shown))
+            return
+        with ui.element("div"):
+            pictures = [(shown.address(picture), shown.clock.at(picture.stamp_ns)) for picture in shown.pictures]
+            instants = story.instants(shown.moments, shown.pictures, shown.clock)
+            FailurePlayer(instants, pictures, _first(shown), site_map)
+            html(_download(shown))
+
+
+def _first(shown: _Shown) -> int:
+    """The moment at which the failure begins."""
+    return min(range(len(shown.moments)), key=lambda n: abs(shown.moments[n].stamp_ns - shown.clock.began_ns))
+
+
+def _download(shown: _Shown) -> Markup:
+    """The way to the recording; relative, since whatever stands before the server may add to its addresses."""
+    failure = shown.detail.failure.number
+    return Markup(
+        '<p><a class="plain button" href="../../v1/failures/{0}/replay.mcap" download>Download these seconds (MCAP)</a></p>'
+        '<p class="quiet">Foxglove opens it; <code>mapserver fleet replay {0}</code> says what another map version would have done.</p>'
+    ).format(failure)
+
+
+async def _position(services: Services, shown: _Shown) -> SiteMap | None:
+    """The map around the failure: what the robot believed in these seconds, and its fixes."""
+    context, row = shown.context, shown.detail.failure
     version = row.version or await load(services.maps.current_version, context.site)
     known = {info.version for info in (await load(services.maps.history, context.site)).versions}
     if version is None or version not in known:
         html(notice("warn", "The map version is no longer in the store; the position cannot be shown."))
-        return
+        return None
     found = [
         Mark(fix.position_map_m[0], fix.position_map_m[1], "accent", "circle", f"fix, {fix.refused or 'used'}")
-        for fix in detail.report.fixes
+        for fix in shown.detail.report.fixes
         if fix.position_map_m is not None
     ]
     if row.x_map_m is not None and row.y_map_m is not None:
-        found.append(Mark(row.x_map_m, row.y_map_m, _tone(row), "cross", "believed position"))
-    html(Markup("<h2>Position</h2>"))
-    await version_map(services, context, version, [Layer("Failure", found)], is_small=True)
-    html(
-        Markup(
-            '<p class="quiet">Cross: where the robot believed to be when it began. Dots: fixes until the report. Map version {}.</p>'
-        ).format(version)
-    )
+        found.append(Mark(row.x_map_m, row.y_map_m, tone_of(row), "cross", "believed position"))
+    way = story.path(shown.moments, shown.clock)
+    instants = story.instants(shown.moments, [], shown.clock)
+    layers = [Layer("Failure", found)]
+    if instants:
+        layers = [Layer("Path", way), *layers, Layer(LAYER, mark_of(instants[_first(shown)]))]
+    places_m = [(mark.x, mark.y) for mark in found] + [place for line in way for place in line.points]
+    drawn = await version_map(services, context, version, layers, is_small=True, places_m=places_m)
+    words = "Cross: where the robot believed to be when it began. Dots: fixes until the report."
+    if instants:
+        words += " Line: where it believed to be in these seconds, in the colour of its state."
+    else:
+        words += " There is no recording of the seconds around it: the robot sends none, has not sent it yet, or it went to save space."
+    html(Markup('<p class="quiet">{} Map version {}.</p>').format(words, version))
+    return drawn
 
 
 def _landmarks(report: FailureReport) -> str | None:
@@ -273,34 +251,11 @@ def _landmarks(report: FailureReport) -> str | None:
     return f"{report.landmarks_expected} expected, {report.landmarks_seen} seen"
 
 
-def _pictures(context: PageContext, detail: FailureDetail) -> Markup:
-    # Those of the seconds around it are many: they are in the recording.
-    pictures = [picture for picture in detail.pictures if picture.kind != "replay"]
-    if not pictures:
-        return Markup(
-            '<h2>Pictures</h2><p class="quiet">None: the robot sent none, or they were deleted to save space.</p>'
-        )
-    shown = joined(
-        Markup(
-            '<figure class="{}"><img src="{}" alt="{}" loading="lazy"><figcaption>{}, {:.1f} s {} the beginning</figcaption></figure>'
-        ).format(
-            picture.kind if picture.kind in _PICTURES else "",
-            f"{context.root}/pictures/{detail.failure.number}/{picture.place}.jpg",
-            _PICTURES.get(picture.kind, picture.kind),
-            _PICTURES.get(picture.kind, picture.kind),
-            abs(picture.stamp_ns - detail.report.stamp_ns) * 1e-9,
-            "after" if picture.stamp_ns >= detail.report.stamp_ns else "before",
-        )
-        for picture in sorted(pictures, key=lambda picture: (picture.kind != "matches", picture.stamp_ns))
-    )
-    return Markup('<h2>Pictures</h2><div class="pictures">{}</div>').format(shown)
-
-
 def _fixes(report: FailureReport) -> Markup:
     rows = [
         (
             f"{(fix.stamp_ns - report.stamp_ns) * 1e-9:+.1f} s",
-            STATUSES.get(fix.status, (fix.status,))[0],
+            story.status_words(fix.status),
             fix.inliers,
             None
             if fix.innovation is None

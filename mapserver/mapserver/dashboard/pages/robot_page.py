@@ -22,7 +22,7 @@ from mapserver.dashboard.layout import (
 from mapserver.dashboard.live import STATUSES, LiveRobot
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.dashboard.markup import age, badge, facts, joined, link, table
-from mapserver.dashboard.pages.failure_page import failure_marks, failure_table
+from mapserver.dashboard.pages.failures_page import failure_marks, failure_table
 from mapserver.dashboard.pages.placing import CHOSEN, place_form
 from mapserver.dashboard.robot_history import SILENT, Stretch, stretches
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS

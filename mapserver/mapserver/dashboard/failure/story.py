@@ -1,0 +1,202 @@
+"""Story of a failure: what the robot said in the seconds around it, in words and on the map. Pure.
+
+Robots choose the stamps and places that they send: what lies far from the failure is left out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import tzinfo
+from itertools import groupby, pairwise
+from math import hypot
+
+from fleetmap.failure_definition import is_blind, is_usable
+from fleetmap.failure_summary import FailureSummary, Moment
+from fleetmap.messages import Cause, Status
+from mapserver.api.moments import clock_text
+from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.map_layers import Line
+from mapserver.store import FailureDetail, PictureRow
+
+_NEAR_NS = 60_000_000_000
+_BEFORE_NS, _AFTER_NS = 1_000_000_000, 2_000_000_000  # of the pictures, where the robot did not find itself again
+_JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot drives so
+_FARTHEST_M = 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class FailureClock:
+    """The robot's stamps by the clock of whoever looks. began_ns: the failure's beginning by the robot, happened_ns: by the server."""
+
+    began_ns: int
+    happened_ns: int
+    zone: tzinfo | None
+
+    def at(self, stamp_ns: int) -> str:
+        """The time of day, to a tenth of a second."""
+        return clock_text(self.happened_ns + stamp_ns - self.began_ns, self.zone)
+
+    def since(self, stamp_ns: int) -> str:
+        """How long before or after the beginning."""
+        off_s = (stamp_ns - self.began_ns) * 1e-9
+        return f"{abs(off_s):.1f} s {'after' if off_s >= 0 else 'before'} the beginning"
+
+
+@dataclass(frozen=True, slots=True)
+class BlindTime:
+    """When a robot had no position to rely upon. blind_s: all of it, in so many parts.
+
+    before_ns: the last moment before, found_ns: the first one with such a position behind; None where the recording does not have them.
+    """
+
+    since_ns: int
+    until_ns: int
+    blind_s: float
+    parts: int
+    before_ns: int | None
+    found_ns: int | None
+
+
+def moments_near(summary: FailureSummary | None, began_ns: int) -> list[Moment]:
+    """What the robot said within a minute of the beginning; nothing without a recording."""
+    return [] if summary is None else [each for each in summary.moments if abs(each.stamp_ns - began_ns) <= _NEAR_NS]
+
+
+def pictures_near(pictures: Sequence[PictureRow], began_ns: int) -> list[PictureRow]:
+    """The pictures of the recording within a minute of the beginning, the oldest first."""
+    near = [each for each in pictures if each.kind == "replay" and abs(each.stamp_ns - began_ns) <= _NEAR_NS]
+    return sorted(near, key=lambda each: each.stamp_ns)
+
+
+def blind_time(moments: Sequence[Moment], began_ns: int) -> BlindTime | None:
+    """The parts without a position to rely upon that end at or after the beginning, as one; None where there are none."""
+    parts, first = [], 0
+    for is_without, group in groupby(moments, key=_is_without):
+        end = first + len(list(group))
+        if is_without and moments[end - 1].stamp_ns >= began_ns:
+            parts.append((first, end))
+        first = end
+    if not parts:
+        return None
+    last = len(moments) - 1
+    times = [(moments[first].stamp_ns, moments[min(end, last)].stamp_ns) for first, end in parts]
+    begin, end = parts[0][0], parts[-1][1]
+    is_found = end <= last and is_usable(moments[end].status, _radius_m(moments[end]))
+    return BlindTime(
+        since_ns=times[0][0],
+        until_ns=times[-1][1],
+        blind_s=sum(until_ns - since_ns for since_ns, until_ns in times) * 1e-9,
+        parts=len(parts),
+        before_ns=moments[begin - 1].stamp_ns if begin else None,
+        found_ns=moments[end].stamp_ns if is_found else None,
+    )
+
+
+def _radius_m(moment: Moment) -> float:
+    return float("inf") if moment.radius_95_m is None else moment.radius_95_m
+
+
+def _is_without(moment: Moment) -> bool:
+    return moment.status == Status.INITIALISING or is_blind(moment.status, _radius_m(moment))
+
+
+def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock) -> str:
+    """What happened, as one sentence's end: by the recording where it shows it, else by the report alone."""
+    row, report = detail.failure, detail.report
+    cause = row.cause.replace("_", " ") or "no cause known"
+    off = ""
+    if report.wrong_by_m is not None:
+        off = f"; its later fixes put it {report.wrong_by_m:.1f} m from where it believed to be"
+    blind = blind_time(moments, report.stamp_ns)
+    if blind is None:
+        return f"{cause}, {status_words(row.status)} for {row.duration_s:.1f} s when it reported{off}"
+    ends = f"not found again until the recording ends at {clock.at(blind.until_ns)}"
+    if blind.found_ns is not None:
+        ends = f"found again after {(blind.found_ns - report.stamp_ns) * 1e-9:.1f} s"
+    # The images of a robot that is carried end with the last frame before; where it was put down shows when it is found.
+    seen_ns = max((each.stamp_ns for each in moments if each.stamp_ns < report.stamp_ns), default=None)
+    if row.cause == Cause.CARRIED and report.wrong_by_m is not None and seen_ns is not None:
+        until = f"between {clock.at(seen_ns)} and {clock.at(blind.found_ns)}" if blind.found_ns is not None else ""
+        return f"carried {report.wrong_by_m:.1f} m, by its own fixes, {until or f'after {clock.at(seen_ns)}'}, {ends}"
+    since = f"from {clock.at(blind.since_ns)} until {clock.at(blind.until_ns)}"
+    if blind.parts > 1:
+        since = f"for {blind.blind_s:.1f} s in {blind.parts} parts {since}"
+    elif blind.before_ns is None:
+        since = f"since before {clock.at(blind.since_ns)}"
+    return f"{cause}, no position to rely upon {since}, {ends}{off}"
+
+
+def status_words(status: str) -> str:
+    """A status as people know it; one that this version does not know as it is."""
+    return STATUSES.get(status, (status.lower(), ""))[0]
+
+
+def before_at_after(
+    pictures: Sequence[PictureRow], began_ns: int, found_ns: int | None
+) -> list[tuple[str, PictureRow]]:
+    """The pictures a second before the beginning, nearest to it, and where the robot was found again or two seconds later, with titles."""
+    if not pictures:
+        return []
+    at = min(pictures, key=lambda each: abs(each.stamp_ns - began_ns))
+    before = [each for each in pictures if each.stamp_ns <= min(began_ns - _BEFORE_NS, at.stamp_ns - 1)]
+    wanted_ns = began_ns + _AFTER_NS if found_ns is None else found_ns
+    later = [each for each in pictures if each.stamp_ns > at.stamp_ns]
+    after = [each for each in later if each.stamp_ns >= wanted_ns] or later[-1:]
+    is_found = bool(after) and found_ns is not None and after[0].stamp_ns >= found_ns
+    title = "Found again" if is_found else "After"
+    return [*(("Before", each) for each in before[-1:]), ("As it began", at), *((title, each) for each in after[:1])]
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A moment as the player shows it. x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none."""
+
+    clock: str
+    since: str
+    words: str
+    tone: str
+    x: float | None
+    y: float | None
+    heading_rad: float | None
+    picture: int
+
+
+def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[Instant]:
+    """All moments; pictures: the oldest first."""
+    found, picture = [], -1
+    for each in moments:
+        while picture + 1 < len(pictures) and pictures[picture + 1].stamp_ns <= each.stamp_ns:
+            picture += 1
+        words = ", ".join(filter(None, (status_words(each.status), each.cause.replace("_", " "))))
+        x, y = _place(each) or (None, None)
+        tone = STATUSES.get(each.status, ("", "warn"))[1]
+        found.append(
+            Instant(clock.at(each.stamp_ns), clock.since(each.stamp_ns), words, tone, x, y, each.heading_rad, picture)
+        )
+    return found
+
+
+def _place(moment: Moment) -> tuple[float, float] | None:
+    position_m = moment.position_map_m
+    if position_m is None or max(abs(value) for value in position_m) > _FARTHEST_M:
+        return None
+    return round(position_m[0], 3), round(position_m[1], 3)
+
+
+def path(moments: Sequence[Moment], clock: FailureClock) -> list[Line]:
+    """Where the robot believed to be, in the colour of its state; where an estimate was corrected, a thin line says by how much."""
+    found: list[Line] = []
+    for last, each in pairwise(moments):
+        there, here = _place(last), _place(each)
+        if there is None or here is None:
+            continue
+        step_m, step_s = hypot(here[0] - there[0], here[1] - there[1]), (each.stamp_ns - last.stamp_ns) * 1e-9
+        if step_m > max(_JUMP_M, _JUMP_MPS * step_s):
+            words = f"its position was corrected by {step_m:.1f} m at {clock.at(each.stamp_ns)}"
+            found.append(Line([there, here], "quiet", words, 1.2))
+            continue
+        words, tone = status_words(each.status), STATUSES.get(each.status, ("", "warn"))[1]
+        if found and found[-1].words == words and found[-1].points[-1] == there:
+            found[-1].points.append(here)
+        else:
+            found.append(Line([there, here], tone, words, 3.5))
+    return found

@@ -1,0 +1,205 @@
+"""The page of a failure: its answer says what the recording shows and no more, and its seconds can be stepped through."""
+
+import re
+from collections.abc import Iterator
+from datetime import UTC
+from pathlib import Path
+
+import httpx
+import msgspec
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from fleetmap.failure_summary import Moment
+from fleetmap.messages import FailureReport
+from mapserver.dashboard.failure import story
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
+from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving
+from support.fleet.failed_robot import send_replay, small_file
+from support.fleet.whole_page import assert_whole
+
+BEGAN_NS = 50_000_000_000
+AT_NS = 1_790_000_000_000_000_000  # by the server's clock: 2026-09-21 14:13:20 UTC
+
+
+def told(status: str, since_s: float, until_s: float, x_m: float | None, cause: str = "") -> list[Moment]:
+    """What a robot says every 0.1 s, driving along x."""
+    said = []
+    for tenth in range(round(10 * since_s), round(10 * until_s)):
+        place = None if x_m is None else (x_m + 0.05 * (tenth - 10 * since_s), 6.0, 0.0)
+        said.append(Moment(BEGAN_NS + tenth * 10**8, status, cause, place, 0.0, None if place is None else 0.05))
+    return said
+
+
+CARRIED = (
+    *told("TRACKING", -5, 0, 17.5),
+    *told("LOST", 0, 1.9, None, "odometry lost"),
+    *told("TRACKING", 1.9, 5, 25.0),
+)
+
+
+def detail(**changes: object) -> FailureDetail:
+    report = msgspec.structs.replace(failure("tug-7", "f"), **changes)
+    row = FailureRow(
+        1,
+        SITE,
+        "tug-7",
+        "f",
+        AT_NS,
+        AT_NS,
+        report.duration_s,
+        report.kind,
+        report.cause,
+        report.status,
+        2,
+        "1,0",
+        20.0,
+        6.0,
+    )
+    return FailureDetail(row, report, [])
+
+
+def answer(moments: tuple[Moment, ...], **changes: object) -> str:
+    return story.answer(detail(**changes), moments, story.FailureClock(BEGAN_NS, AT_NS, UTC))
+
+
+def test_a_robot_that_was_carried() -> None:
+    words = answer(CARRIED, cause="carried", wrong_by_m=5.0)
+    assert words == "carried 5.0 m, by its own fixes, between 14:13:19.9 and 14:13:21.9, found again after 1.9 s"
+    words = answer(CARRIED[:60], cause="carried", wrong_by_m=5.0)
+    assert words == (
+        "carried 5.0 m, by its own fixes, after 14:13:19.9, not found again until the recording ends at 14:13:20.9"
+    )
+
+
+def test_the_answer_says_what_the_recording_shows_and_no_more() -> None:
+    assert answer(()) == "dark, lost for 3.5 s when it reported"
+    assert answer((), wrong_by_m=2.0).endswith("; its later fixes put it 2.0 m from where it believed to be")
+    assert answer(CARRIED) == "dark, no position to rely upon from 14:13:20.0 until 14:13:21.9, found again after 1.9 s"
+    always = tuple(told("TRACKING", -5, 5, 17.5))
+    assert answer(always, status="TRACKING") == "dark, localised for 3.5 s when it reported", "it never said otherwise"
+    before = (*told("LOST", -5, -3, None), *told("TRACKING", -3, 0, 17.5), *told("LOST", 0, 5, None))
+    words = answer(before)
+    assert "from 14:13:20.0 until 14:13:24.9" in words, "what was over before the failure is another matter"
+    assert "not found again until the recording ends at 14:13:24.9" in words
+    unsure = [msgspec.structs.replace(each, radius_95_m=0.4) for each in told("DEGRADED", 0, 2, 20.0)]
+    parts = (*told("TRACKING", -5, 0, 17.5), *unsure, *told("TRACKING", 2, 3, 21.0), *told("LOST", 3, 4, None))
+    words = answer((*parts, *told("NEW_WORD", 4, 5, 22.0)))
+    assert "for 3.0 s in 2 parts from 14:13:20.0 until 14:13:24.0, not found again" in words
+    assert "since before 14:13:15.0" in answer(tuple(told("INITIALISING", -5, 5, None)), kind="not_found")
+
+
+def test_moments_and_pictures_of_another_time_are_left_out() -> None:
+    far = PictureRow(9, "replay", 1 << 61, 10)
+    near = [PictureRow(n, "replay", BEGAN_NS + k * 10**8, 10) for n, k in enumerate((-50, -9, -2, 4, 19, 23))]
+    assert story.pictures_near([far, *near[::-1]], BEGAN_NS) == near
+
+    def chosen(found_ns: int | None, of: list[PictureRow]) -> list[tuple[str, int]]:
+        return [(title, each.place) for title, each in story.before_at_after(of, BEGAN_NS, found_ns)]
+
+    assert chosen(BEGAN_NS + 19 * 10**8, near) == [("Before", 0), ("As it began", 2), ("Found again", 4)]
+    assert chosen(None, near) == [("Before", 0), ("As it began", 2), ("After", 5)]
+    assert chosen(BEGAN_NS + 40 * 10**8, near)[-1] == ("After", 5)
+    assert chosen(None, near[2:3]) == [("As it began", 2)]
+    assert chosen(None, []) == []
+
+
+def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
+    lines = story.path(CARRIED, story.FailureClock(BEGAN_NS, AT_NS, None))
+    assert [(line.tone, len(line.points)) for line in lines] == [("good", 50), ("good", 31)]
+    at_once = (*CARRIED[:50], *CARRIED[69:])
+    lines = story.path(
+        tuple(msgspec.structs.replace(each, stamp_ns=BEGAN_NS + n * 10**8) for n, each in enumerate(at_once)),
+        story.FailureClock(BEGAN_NS, AT_NS, None),
+    )
+    assert [(line.tone, len(line.points)) for line in lines] == [("good", 50), ("quiet", 2), ("good", 31)]
+    assert "corrected by 5.1 m" in lines[1].words
+
+
+def report(name: str, **changes: object) -> FailureReport:
+    return msgspec.structs.replace(failure(name, f"of-{name}"), **changes)
+
+
+@pytest.fixture(scope="module")
+def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm."""
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with MapStore.open(folder) as store:
+        fleet = Fleet(store)
+        jpegs = [picture(f"{n}", 320) for n in range(20)]
+        harm = (Moment(-(1 << 62), "LOST", "<b>x</b>"), *CARRIED[40:60], Moment(1 << 61, "<i>", "", (1e300, 0.0, 0.0)))
+        harm = (
+            *harm[:1],
+            msgspec.structs.replace(harm[1], position_map_m=(1e300, -1e300, 0.0), cause="<b>y</b>"),
+            *harm[2:],
+        )
+        for name, moments in (("tug-3", CARRIED), ("tug-4", harm)):
+            assert not fleet.take_failure(SITE, name, report(name, cause="carried", wrong_by_m=5.0)).refused
+            stamps_ns = tuple(BEGAN_NS + k * 5 * 10**8 for k in range(-10, 10))
+            given = {"site": SITE, "robot": name, "id": f"of-{name}", "began_ns": BEGAN_NS, "stamps_ns": stamps_ns}
+            file = small_file(folder / "failure.mcap", jpegs=jpegs, moments=moments, **given)
+            send_replay(fleet, SITE, name, f"of-{name}", file)
+        fleet.flush()
+    with serving(folder) as server:
+        yield server
+    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
+
+
+def test_the_seconds_are_stepped_through(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures/3")
+    expect(page.locator(".notice.bad")).to_contain_text(
+        re.compile(
+            r"^tug-3 failed at .* in tile 1,0: carried 5.0 m, by its own fixes, between .*, found again after 1.9 s\.$"
+        )
+    )
+    expect(page.locator(".pictures.row figcaption")).to_have_text(
+        [
+            re.compile("^Before: 1.0 s before"),
+            re.compile("^As it began: 0.0 s after"),
+            re.compile("^Found again: 2.0 s after"),
+        ]
+    )
+    player = page.locator(".player")
+    expect(player.locator("p").first).to_have_text(
+        re.compile(r"^lost, odometry lost at \d\d:\d\d:\d\d\.\d, 0.0 s after")
+    )
+    slider = page.get_by_role("slider", name="Moment")
+    first = player.locator("img").get_attribute("src")
+    slider.press("ArrowLeft")
+    expect(player.locator("p").first).to_have_text(re.compile("^localised at .*, 0.1 s before"))
+    at = "document.querySelector('.site-map').marks().find(mark => mark.words.endsWith(': localised'))?.x"
+    page.wait_for_function(f"Math.abs({at} - 19.95) < 1e-6")
+    slider.press("End")
+    expect(slider).to_have_attribute("aria-valuetext", re.compile("4.9 s after the beginning: localised$"))
+    page.wait_for_function(f"Math.abs({at} - 26.5) < 1e-6")
+    assert player.locator("img").get_attribute("src") != first
+    page.wait_for_function(
+        "[...document.querySelectorAll('.player img')].every(i => i.complete && i.naturalWidth === 320)"
+    )
+    assert page.locator("path.line.good").count() == 2
+    assert_whole(page)
+    with page.expect_download() as download:
+        page.get_by_role("link", name=re.compile("MCAP")).click()
+    assert Path(download.value.path()).read_bytes() == httpx.get(f"{served.http}/v1/failures/3/replay.mcap").content
+    assert seen.faults == []
+    assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures/1")
+    expect(page.locator(".pictures.row img")).to_have_count(1)
+    expect(page.locator(".nicegui-content")).to_contain_text("no recording of the seconds around it")
+    assert page.locator(".player").count() == 0
+    assert any(mark["shape"] == "cross" for mark in marks(page))
+    assert seen.faults == []
+
+
+def test_a_recording_made_to_harm_is_shown_as_words(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures/4")
+    page.get_by_role("slider", name="Moment").press("Home")
+    expect(page.locator(".player strong")).to_have_text("localised, <b>y</b>")
+    assert page.locator(".player b").count() == 0
+    assert all(abs(mark["x"]) < 100 for mark in marks(page))
+    assert seen.faults == []
