@@ -40,7 +40,7 @@ demo-recording:
 	@deploy/demo.sh --check "$(RECORDING)"
 
 test: $(DEV_STAMP)
-	$(BIN)/python -m pytest $(TESTS) --ignore=$(BENCHMARKS) --numprocesses=auto --dist=loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(TESTS) --ignore=$(BENCHMARKS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .
