@@ -26,8 +26,11 @@ class ReplayQueue:
 
     def add(self, report: FailureReport, cut: FailureCut | None) -> None:
         """A failure that was reported."""
-        if cut is not None:
-            self._pending.append((report, cut))
+        if cut is None:
+            return
+        if len(self._pending) == _MAX_PENDING:
+            _log.warning("failures follow each other too fast: %s goes without its recording", self._pending[0][0].id)
+        self._pending.append((report, cut))
 
     def work(self) -> None:
         """Writes recordings that are complete; one that cannot be written or is too large is lost, and its report is not."""

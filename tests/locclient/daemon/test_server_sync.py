@@ -10,8 +10,10 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError
+from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import (
+    PART_BYTES,
     FailureAck,
     FailureReport,
     InitialPoseMessage,
@@ -48,6 +50,8 @@ class World:
     table: list[str] = field(default_factory=list)
     lose_answers: bool = False
     refuse: str = ""
+    takes_parts: bool = False
+    parts: list[int] = field(default_factory=list)
 
     def take_failure(self, key: str, payload: bytes) -> bytes:
         report = decode_message(payload, FailureReport)
@@ -60,6 +64,13 @@ class World:
             self.hub.reachable = False
             return encode_message(FailureAck(id="lost on its way"))
         return encode_message(FailureAck(id=report.id))
+
+    def take_part(self, _key: str, payload: bytes) -> bytes:
+        part = decode_message(payload, ReplayPart)
+        if not self.takes_parts:
+            return encode_message(FailureAck(id=part.id))
+        self.parts.append(part.offset)
+        return encode_message(FailureAck(id=part.id, received_bytes=part.offset + len(part.data)))
 
     def step(self, seconds: float = 0.1) -> None:
         self.clock["s"] += seconds
@@ -86,7 +97,11 @@ def world(tmp_path: Path) -> Iterator[World]:
         def take(key: str, payload: bytes) -> bytes:  # before the service's own table: what arrives is looked at here
             return made_late[0].take_failure(key, payload)
 
+        def take_part(key: str, payload: bytes) -> bytes:
+            return made_late[0].take_part(key, payload)
+
         bus.queryable(robot_key("*", "*", "failures"), take)
+        bus.queryable(robot_key("*", "*", "replays"), take_part)
         service = BusService(store, fleet, bus, lambda *_: None)
         client = MapClient(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
         outbox = Outbox(tmp_path / "outbox", max_bytes=10**6)
@@ -312,3 +327,27 @@ def test_a_persons_word_is_a_prior_that_fixes_may_outweigh(
         heading_rad = changes.get("heading_rad")
         assert np.isfinite(prior.cov_rot_trans[2, 2]) == (heading_rad is not None)
         assert prior.map_from_base[1, 0] == pytest.approx(np.sin(heading_rad or 0.0))
+
+
+def test_a_recording_travels_a_part_a_second_and_behind_all_reports(world: World, tmp_path: Path) -> None:
+    replays = world.sync.replays = Outbox(tmp_path / "replays", max_bytes=10**7)
+    replays.put(QueuedReport("f1", bytes(5 * PART_BYTES // 2)))
+    world.step()
+    adopt(world)
+    assert not world.parts, "a server that takes none is asked again half a minute later"
+    world.takes_parts = True
+    world.step(31.0)
+    assert world.parts == [0]
+    for _ in range(5):
+        world.step(0.1)
+    assert world.parts == [0], "the radio is for maps and reports"
+    world.outbox.put(report("f2"))
+    world.refuse = "later"
+    world.step(1.0)
+    assert world.parts == [0], "a report waits"
+    world.refuse = ""
+    for _ in range(40):
+        world.step(1.0)
+    assert world.parts == [0, PART_BYTES, 2 * PART_BYTES]
+    assert world.table == ["f2"]
+    assert replays.counts()["delivered"] == 1
