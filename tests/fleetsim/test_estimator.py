@@ -13,7 +13,7 @@ from fleetsim.scene.world import World
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import HiddenErrors
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession
+from support.estimator.simulated_run import EstimatorSession, Smudge
 from support.estimator.statistics import FeatureStatistics, FlowStatistics
 
 
@@ -154,3 +154,37 @@ def test_odometry_and_localizer_live_on_it() -> None:
     tracking = [e.status.value == "TRACKING" for e in estimates]
     assert np.mean(tracking[20:]) > 0.8
     assert np.median(estimator_loop.position_errors_m(estimates[20:], robot.map_from_body[20:])) < 0.03
+
+
+def test_a_person_hides_what_the_painter_no_longer_shows() -> None:
+    order = Order("clip", robot="tote-1", faults=(Fault("person-in-front", 1.0, 3.0),))
+    session, alone = prepare(order), _session(CLIP)
+    try:
+        crowded, frame = EstimatorSession(session), 30
+        shot = session.renderer.shoot(session.frame_times_s[frame])
+    finally:
+        session.renderer.close()
+    before, seen, without = alone.sighting(frame), crowded.sighting(frame), _session(order).sighting(10)
+    is_hidden = ~np.isin(before.ids, seen.ids)
+    column, row = np.rint(before.pixels[:, :2]).astype(int).T
+    depth_m = alone.camera.focal_px * alone.camera.baseline_m / (before.pixels[:, 0] - before.pixels[:, 2])
+    is_covered = shot.depth_m[np.clip(row, 0, 479), np.clip(column, 0, 639)] < 0.8 * depth_m
+    assert is_hidden.mean() > 0.1
+    assert (is_hidden == is_covered).mean() > 0.95
+    of_person = ~np.isin(seen.ids, before.ids)
+    assert of_person.any()
+    assert (seen.distances_m[of_person] < 1.6).all()
+    np.testing.assert_array_equal(without.ids, alone.sighting(10).ids)  # not there yet
+    assert (np.diff(seen.ids.astype(np.int64)) > 0).all()
+
+
+def test_nothing_is_found_behind_a_smudge() -> None:
+    session = prepare(CLIP)
+    session.renderer.close()
+    smudged, clean = (
+        EstimatorSession(session, smudge=Smudge(300.0, 200.0, 100.0)).sighting(20),
+        _session(CLIP).sighting(20),
+    )
+    off_px = np.hypot(clean.pixels[:, 0] - 300.0, clean.pixels[:, 1] - 200.0)
+    np.testing.assert_array_equal(smudged.ids, clean.ids[off_px > 100.0])
+    assert (off_px < 100.0).any()

@@ -53,11 +53,11 @@ class StereoRenderer:
         self._groups, self._key, self.faults = np.array(LIGHT_STATES[options.light]), options.key, options.faults
         self.imu_minus_cam_s = rig.cameras[0].imu_minus_cam_s
         self._exposure = AutoExposure()
-        movers = options.movers
+        self.movers = options.movers
         if any(fault.name == "person-in-front" for fault in self.faults.faults):
-            movers = (*movers, Apparition("person", self._person_in_front))
+            self.movers = (*self.movers, Apparition("person", self._person_in_front))
         optics = [make_optics(camera) for camera in rig.cameras]
-        self._painters = [Painter(world, each, options.look, number, movers) for number, each in enumerate(optics)]
+        self._painters = [Painter(world, each, options.look, number, self.movers) for number, each in enumerate(optics)]
         self._workers = ThreadPoolExecutor(len(self._painters))
         self._last_right: Image | None = None
 

@@ -14,7 +14,7 @@ from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior, Trajectory
-from fleetsim.recorder import Order, prepare
+from fleetsim.recorder import Order, Session, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
 from mapserver.build.draft_evidence import PROBES
@@ -24,7 +24,7 @@ from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M
 from support.estimator.landmarks import LandmarkField
-from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting
+from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting, Smudge
 
 RIGHT_M, WRONG_M = 0.5, 0.3
 WHOLE_SITE = LocalizerSettings(track=TrackSettings(is_whole_site_mapped=True))
@@ -34,10 +34,8 @@ _EVERY_M = 0.8
 class RememberingSession(EstimatorSession):
     """A session that looks at each frame once, however many starts go through it."""
 
-    def __init__(self, order: Order, field: LandmarkField | None) -> None:
-        session = prepare(order)
-        session.renderer.close()
-        super().__init__(session, field=field)
+    def __init__(self, session: Session, field: LandmarkField | None, smudge: Smudge | None = None) -> None:
+        super().__init__(session, field=field, smudge=smudge)
         self.field = field
         self._sightings: dict[int, Sighting] = {}
         self._found: dict[int, Found] = {}
@@ -90,7 +88,9 @@ def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways"
     session.renderer.close()
     field = LandmarkField(session.world)
     survey = EstimatorSession(session, field=field)
-    robot = RememberingSession(Order(scenario, seed=seed, robot="runner-1"), field)
+    drive = prepare(Order(scenario, seed=seed, robot="runner-1"))
+    drive.renderer.close()
+    robot = RememberingSession(drive, field)
     (whole_tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=_EVERY_M)
     tile = within_budget(whole_tile, survey.camera, survey.body_from_cam)
     view = estimator_loop.map_view(robot, [tile], vocabulary)

@@ -1,11 +1,12 @@
 """A run without pictures: the measurements of an estimator, landmark by landmark, at many times real time.
 
 The world, its stock, the motion, IMU, wheels, priors and dropped frames are those of the rendered run; the landmarks
-lie on the same surfaces and hide behind the same boxes. Movers and faults of the pictures other than darkness have no
-effect here.
+lie on the same surfaces and hide behind the same boxes, those of people and forklifts too. Of the pictures' faults darkness has its
+effect here, over-exposure hides everything, and a smudge hides what lies behind it; light has none.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetsim.recorder import Session
 from support.estimator import landmark_kernels, noise_kernels
 from support.estimator.landmarks import LandmarkField, Landmarks
+from support.estimator.mover_landmarks import MoverLandmarks
 from support.estimator.statistics import PITCH_PX, FeatureStatistics, FlowStatistics
 
 _STATION_M, _STATION_RAD = 0.5, 0.15
@@ -25,6 +27,14 @@ _FLOOR_M = 0.05
 _FINEST_OCTAVES = 4.0  # what the flow's corners are found on
 
 Ids = NDArray[np.uint64]
+
+
+class Smudge(NamedTuple):
+    """Dirt on the left lens: a disc of the picture in which nothing is found, in pixels."""
+
+    u_px: float
+    v_px: float
+    radius_px: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +82,10 @@ class EstimatorSession:
         flow: FlowStatistics | None = None,
         features: FeatureStatistics | None = None,
         field: LandmarkField | None = None,
+        smudge: Smudge | None = None,
     ) -> None:
         self.session = session
+        self._movers, self._smudge = MoverLandmarks(session.renderer.movers), smudge
         self._flow, self._features = flow or FlowStatistics(), features or FeatureStatistics()
         self._field = field or LandmarkField(session.world)
         rectifier = Rectifier(session.nominal)
@@ -154,8 +166,9 @@ class EstimatorSession:
         return Found(rows[:total], found.pixels[:total], found.octaves[:total], descriptors)
 
     def _look(self, frame: int) -> Sighting:
-        landmarks, camera = self._landmarks(frame), self.camera
-        if self.session.renderer.faults.has("camera-dark", self.session.frame_times_s[frame]):
+        landmarks, camera, time_s = self._landmarks(frame), self.camera, self.session.frame_times_s[frame]
+        landmarks = self._movers.around(time_s, (self.map_from_body[frame] @ self.body_from_cam)[:3, 3], landmarks)
+        if any(self.session.renderer.faults.has(fault, time_s) for fault in ("camera-dark", "over-exposure")):
             landmarks = landmarks.take(np.zeros(0, np.int64))
         size = len(landmarks)
         pixels, octaves, distances = np.empty((size, 3)), np.empty(size), np.empty(size)
@@ -166,8 +179,12 @@ class EstimatorSession:
         view, reach_per_m = (rect_from_map, pinhole), camera.focal_px / PITCH_PX
         points, sizes = landmarks.points_map, landmarks.sizes_m
         count = landmark_kernels.project(points, sizes, *view, reach_per_m, pixels, octaves, distances, rows)
-        seen = landmarks.take(rows[:count])
-        columns = (pixels[:count], octaves[:count], distances[:count])
+        inside = np.arange(count)
+        if self._smudge is not None:
+            off_px = np.hypot(pixels[:count, 0] - self._smudge.u_px, pixels[:count, 1] - self._smudge.v_px)
+            inside = np.flatnonzero(off_px > self._smudge.radius_px)
+        seen = landmarks.take(rows[inside])
+        columns = (pixels[inside], octaves[inside], distances[inside])
         return Sighting(seen.keys[:, 2], seen.points_map, seen.normals_map, seen.keys, *columns)
 
     def _landmarks(self, frame: int) -> Landmarks:

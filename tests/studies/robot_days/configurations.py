@@ -1,0 +1,36 @@
+"""The whole system, and the system with one decision taken away at a time."""
+
+from dataclasses import dataclass
+from math import inf
+
+import msgspec
+
+from benchmarks.robot.aliased_starts import WHOLE_SITE
+from locclient.localization.settings import LocalizerSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """What is taken away from the system. day: nights since the survey on every trip, None for each trip's own."""
+
+    settings: LocalizerSettings = WHOLE_SITE
+    has_imu: bool = True
+    day: int | None = None
+
+
+def _tracks(**changes: float) -> LocalizerSettings:
+    return msgspec.structs.replace(WHOLE_SITE, track=msgspec.structs.replace(WHOLE_SITE.track, **changes))
+
+
+_TAKES_BEST = {
+    "rival_share": inf, "rival_hit_share": inf, "strong_twin_share": inf, "confirming_fixes": 1, "confirming_distance_m": 0.0,
+}  # fmt: skip
+FULL = "the whole system"
+CONFIGURATIONS = {
+    FULL: Configuration(),
+    "no IMU, no wheels": Configuration(has_imu=False),
+    "map 7 nights old": Configuration(day=7),
+    "no AMBIGUOUS": Configuration(_tracks(**_TAKES_BEST)),
+    "no covariance gate": Configuration(_tracks(innovation_limit=inf)),
+    "all of these": Configuration(_tracks(**_TAKES_BEST, innovation_limit=inf), has_imu=False, day=7),
+}
