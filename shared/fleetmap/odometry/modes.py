@@ -1,40 +1,29 @@
 """The modes of the odometry, one class each: vision alone, starting (vision that looks for gravity), and stereo-inertial."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, interpolate_se3, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
-from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.filter.sliding_window import SlidingWindow
+from fleetmap.odometry.imu_inputs import ImuInputs
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
-from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
-from fleetmap.odometry.sensor_buffer import SensorBuffer
+from fleetmap.odometry.odometry_checks import ZeroVelocityDetector
+from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
-_IMU_GAP_NS = 50_000_000  # a longer time without samples is bridged as without an IMU
-
-
-@dataclass(frozen=True, slots=True)
-class ImuInputs:
-    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the monitor of its faults."""
-
-    samples: SensorBuffer
-    noise: ImuNoise
-    weighing_noise: ImuNoise
-    monitor: DivergenceMonitor
 
 
 class Step(NamedTuple):
@@ -178,8 +167,12 @@ class VisualMode(WindowMode):
             self._cam_from_previous = cam_from_odom @ window.filter.state.odom_from_body @ rig.body_from_cam
         body_from_next = rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ rig.cam_from_body
         duration_s = window.seconds_since(window.filter.clone_ids[-1])
-        sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
+        sigmas = self._rotation_sigma_rad(body_from_next, duration_s), settings.free_translation_sigma_m
         window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, self._measured_motion_cov(tracked))
+
+    def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
+        """Of a predicted motion (4, 4), without the images."""
+        return self._rig.settings.filter.free_rotation_sigma_rad
 
     def _measured_motion_cov(self, tracked: Tracked) -> Array | None:
         """Covariance (6, 6), in the body's axes, that holds the state near the motion from all points of the last two frames.
@@ -213,6 +206,16 @@ class StartingMode(VisualMode):
         super().__init__(window, cam_from_previous)
         self._imu, self.not_before_ns = imu, not_before_ns
         self._trajectory: list[tuple[int, Array]] = []
+        self._turned: Array | None = None
+
+    def predict(self, stamp_ns: int) -> None:
+        """See Mode; the motion to expect is the last one, turned as the gyro says: in a turn that begins the last one is far off."""
+        self._turned = self._imu.samples.rotation_between(self.stamp_ns, stamp_ns, self._imu.noise)
+        if self._turned is not None:
+            body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
+            body_from_next[:3, :3] = self._turned
+            self._cam_from_previous = self._rig.cam_from_body @ se3_inverse(body_from_next) @ self._rig.body_from_cam
+        super().predict(stamp_ns)
 
     def begin(self, stamp_ns: int) -> Mode:
         """See Mode: stereo-inertial at once where the IMU rested before the first frame."""
@@ -234,6 +237,15 @@ class StartingMode(VisualMode):
         mode.window.seed(frame_index, tracked)
         change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
         return Step(mode, step.used, change)
+
+    def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
+        """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""
+        settings = self._rig.settings
+        free_rad = settings.filter.free_rotation_sigma_rad
+        sigma_rad = max(settings.start.steady_gyro_mean_radps * duration_s, _ROTATION_SIGMA_RAD)
+        if self._turned is None or rotation_angle_rad(self._turned.T @ body_from_next[:3, :3]) > 2.0 * sigma_rad:
+            return free_rad
+        return min(sigma_rad, free_rad)
 
     def _static_start(self, stamp_ns: int) -> InitialState | None:
         since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
@@ -302,7 +314,7 @@ class InertialMode(WindowMode):
         self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
         gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
-        if gap_ns > _IMU_GAP_NS and len(window.filter.clone_ids) > 1:
+        if gap_ns > IMU_GAP_NS and len(window.filter.clone_ids) > 1:
             self._bridge_gap(end_ns)
         else:
             window.rate_body_radps = window.filter.propagate(
@@ -374,14 +386,3 @@ class InertialMode(WindowMode):
         window.seed(frame_index, tracked)
         self._imu.monitor.begin_again()
         return StartingMode(window, self._imu, self._frame_ns, motion)
-
-
-def imu_inputs(rig: OdometryRig, noise: ImuNoise, samples: SensorBuffer) -> ImuInputs:
-    """The inputs of an IMU whose noise is weighed as wider than its data sheet says."""
-    settings = rig.settings.filter
-    weighing = replace(
-        noise,
-        gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
-        accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
-    )
-    return ImuInputs(samples, noise, weighing, DivergenceMonitor(settings.time_offset_sigma_s))

@@ -12,7 +12,8 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.modes import Mode, StartingMode, VisualMode, imu_inputs
+from fleetmap.odometry.imu_inputs import imu_inputs
+from fleetmap.odometry.modes import Mode, StartingMode, VisualMode
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracker

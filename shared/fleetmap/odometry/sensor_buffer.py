@@ -5,9 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.inertial import preintegrate
 from fleetmap.odometry import sensor_kernels
+from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, Stamps, WheelSample
 
+IMU_GAP_NS = 50_000_000  # a longer time without samples is bridged as without an IMU
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
 
 
@@ -66,6 +69,12 @@ class SensorBuffer:
             end += len(batch)
         self._pending.clear()
         self._end = sensor_kernels.drop_spikes(*_columns(self._room), self._first, known, end)
+
+    def rotation_between(self, start_ns: int, end_ns: int, noise: ImuNoise) -> Array | None:
+        """earlier_from_later (3, 3) of the body by the gyro, its bias included; None where samples are missing."""
+        if sensor_kernels.longest_gap_ns(self.imu.stamps_ns, start_ns, end_ns) > IMU_GAP_NS:
+            return None
+        return preintegrate(self.imu, start_ns, end_ns, np.zeros(3), np.zeros(3), noise).delta_rotation
 
     def wheel_between(self, start_ns: int, end_ns: int) -> list[WheelSample]:
         """The wheel samples from start_ns until end_ns that are still there; none is taken."""

@@ -64,13 +64,15 @@ def align(
     gravity_slack: float,
     steps: int,
 ) -> Alignment | None:
-    """The alignment after so many Gauss-Newton steps; None where what fits is no gravity or too large a bias.
+    """The alignment after so many Gauss-Newton steps; None where what fits is no gravity or too large a bias of either sensor.
 
     gravity_slack: how many times the settings' error gravity's size may have in the linear step.
     """
     gyro_bias = np.zeros(3)
     for _ in range(2):
         gyro_bias = gyro_bias + _gyro_bias_step(motion, imu, noise, gyro_bias)
+    if not _is_bias(gyro_bias, settings):
+        return None
     terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
     gravity = _free_gravity(motion, terms)
     max_error = gravity_slack * settings.start.max_gravity_error_mps2
@@ -116,6 +118,11 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     covariance = 4.0 * to_error @ solved @ to_error.T
     floor = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
     return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]))
+
+
+def _is_bias(gyro_bias: Array, settings: OdometrySettings) -> bool:
+    """Whether a gyro may read that at rest. A larger difference is pictures that were followed wrongly."""
+    return bool(np.linalg.norm(gyro_bias) < settings.start.steady_gyro_mean_radps)
 
 
 def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:

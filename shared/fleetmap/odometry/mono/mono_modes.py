@@ -13,17 +13,16 @@ from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import msckf_kernels
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.imu_inputs import ImuInputs, imu_inputs
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import (
-    ImuInputs,
     InertialMode,
     Mode,
     StartingMode,
     Step,
     VisualMode,
     WindowMode,
-    imu_inputs,
 )
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.odometry import Odometry

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, rotation_angle_rad, se3, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.init.static_initialization import polynomial_rate
 from fleetmap.odometry.modes import StartingMode
@@ -15,6 +15,7 @@ from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, view
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 SPEEDING_UP_MPS2 = 0.8  # as a tote robot drives off
 FRAME_NS, IMU_NS, FRAMES = 50_000_000, 5_000_000, 28
+TURN_NS, TURN_RADPS = 100_000_000, 3.0
 _RIGHT_FROM_LEFT = se3(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
 
 
@@ -101,3 +102,31 @@ def test_rates_are_those_of_the_polynomial(degree: int, value: float) -> None:
     np.testing.assert_allclose(rate, [value, 0.0, 0.0], atol=1e-6)
     assert polynomial_rate(samples[:6], degree) is None  # too short to say
     assert polynomial_rate([], degree) is None
+
+
+def off_in_a_turn_deg(*, by_gyro: bool) -> float:
+    """How far the rotation since the first picture is off at worst, of a robot that begins to turn when it has seen two."""
+    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    stamps_ns = np.arange(0, 10 * TURN_NS, IMU_NS)
+    gyro = np.where((stamps_ns >= 2 * TURN_NS)[:, None], [0.0, 0.0, TURN_RADPS], 0.0)
+    force = np.tile([0.0, 0.0, 9.81], (len(stamps_ns), 1))
+    samples, fed_ns, off_rad = ImuSamples(stamps_ns, gyro, force), 0, []
+    for number in range(1, 9):
+        until_ns = number * TURN_NS + 1
+        if by_gyro:
+            odometry.handle_imu(samples.between(fed_ns, until_ns))
+        fed_ns, yaw = until_ns, TURN_RADPS * max(number - 2, 0) * TURN_NS * 1e-9
+        truth = se3(so3_exp(np.array([0.0, 0.0, yaw])), np.array([0.3, 0.2, 0.1]))
+        left = truth @ BODY_FROM_CAM
+        seen = odometry.handle_stereo(RectifiedFrame(number * TURN_NS, view(left), view(left @ _RIGHT_FROM_LEFT), None))
+        assert not seen.inertial
+        if number == 1:
+            first = seen.odom_from_body[:3, :3]
+        off_rad.append(rotation_angle_rad((first.T @ seen.odom_from_body[:3, :3]).T @ truth[:3, :3]))
+    return float(np.degrees(max(off_rad)))
+
+
+def test_the_gyro_leads_the_eye_through_a_turn_at_the_start() -> None:
+    """Before gravity is known, too: a turn that begins is nothing like the motion before, and flow follows the wrong points."""
+    assert off_in_a_turn_deg(by_gyro=True) < 2.0
+    assert off_in_a_turn_deg(by_gyro=False) > 5.0  # the danger that it averts
