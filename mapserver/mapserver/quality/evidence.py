@@ -39,12 +39,19 @@ def examine(draft: MapView, before: MapView | None, probes: Probes, motion: Traj
     return Evidence(
         held_out=compare(draft, before, probes.held_out),
         replayed=compare(draft, before, probes.replayed),
-        last_version=compare(draft, before, probes.last_version),
+        last_version=compare(draft, before, _known(before, probes.last_version)),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
         starts=None,
         motion=motion,
     )
+
+
+def _known(before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:
+    """Those that the current version finds in its own tiles: a draft cannot lose what robots do not have."""
+    if before is None:
+        return probes
+    return [probe for probe in probes if relocalized(before, probe, probe.map_from_cam) is not None]
 
 
 def compare(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Compared | None:

@@ -24,6 +24,7 @@ PRIOR_RADIUS_M = 3.0
 ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
 _SAME_WAY_COSINE = 0.5
 _ROBOTS = RelocalizerSettings()
+_ENOUGH_LANDMARKS = 4 * _ROBOTS.fix.min_inliers  # robots get a part of them, and match a part of that
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +93,14 @@ def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
 def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
     """At most `count` keyframes of a version, with its own landmarks as features, from its archive, without images.
 
-    They reach all of the site, and the place of each is what robots are told today.
+    They reach all of the site, and the place of each is what robots are told today. Those of later nights observe what was new
+    then, often a few landmarks: no robot could tell its place by so little.
     """
     order = np.argsort(survey_map.obs_keyframe, kind="stable")
     bounds = np.searchsorted(survey_map.obs_keyframe[order], np.arange(len(survey_map.map_from_body) + 1))
     map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
     probes = []
-    for k in spread(np.flatnonzero(np.diff(bounds)), count):
+    for k in spread(np.flatnonzero(np.diff(bounds) >= _ENOUGH_LANDMARKS), count):
         rows = order[bounds[k] : bounds[k + 1]]
         pixels, descriptors = survey_map.obs_pixels[rows], survey_map.descriptors[survey_map.obs_landmark[rows]]
         angles = np.zeros(len(rows), np.float32)

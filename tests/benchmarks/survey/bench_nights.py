@@ -96,8 +96,8 @@ def fetched(folder: Path, cache: Path) -> dict[str, int]:
         manifest = link.fetch(wanted)
         link.activate(manifest, wanted)
         received = link.received_bytes
-        # The manifest comes first, by a patch or whole; what follows are tiles.
-        first = next(size for what, result, size in told if what in {"manifest", "patch"} and result == "ok")
+        # The manifest comes first, by a patch or whole; what follows are tiles. Nothing comes where nothing was published.
+        first = next((size for what, result, size in told if what in {"manifest", "patch"} and result == "ok"), 0)
         refused = sum(what == "patch" and result != "ok" for what, result, _ in told)
         service.close()
     return {"bytes": received, "manifest": first, "tiles": received - first, "without_patch": refused}

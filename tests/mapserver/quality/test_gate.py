@@ -63,6 +63,9 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     return done, [HeldOut(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
 
 
+OBSERVED = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
+
+
 @lru_cache(maxsize=1)
 def sound() -> tuple[Survey, list[HeldOut]]:
     """The ride with the right calibration."""
@@ -160,12 +163,47 @@ def test_a_shift_that_the_surveys_own_trajectory_shares_is_seen_by_the_last_vers
     assert any("last_versions_places: wrong_share" in reason for reason in said.reasons)
 
 
+def nights_after(first: SurveyMap, nights: int) -> SurveyMap:
+    """The map after nights whose keyframes stand where the first ones do, and observe three landmarks each: what was new."""
+    count = len(first.map_from_body)
+    rows = np.concatenate([np.flatnonzero(first.obs_keyframe == k)[:3] for k in range(count)])
+    later = replace(first, **{name: getattr(first, name)[rows] for name in OBSERVED})
+    parts = [first, *(replace(later, obs_keyframe=later.obs_keyframe + count * (n + 1)) for n in range(nights))]
+    names = (*OBSERVED, "map_from_body", "keyframe_stamps_ns")
+    return replace(first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
+    """Of a draft with the current version's own tiles; archive: what that knows."""
+    done, own = sound()
+    before = Before(manifest(tiles, 1), archive, tiles, [])
+    session = JudgedSession(done.map.trajectory, own, done)
+    return examine_draft(DraftMap(tiles, done.vocabulary, done.map.camera), before, [session], [])
+
+
+def test_nights_that_changed_little_do_not_hold_the_next_one() -> None:
+    """Seen: after eight nights most keyframes of a version had observed a handful of new landmarks, and no night passed any more."""
+    evidence = beside_itself(nights_after(sound()[0].map, 8), tiles_from_survey(sound()[0].map))
+    assert evidence.last_version is not None
+    assert evidence.last_version.draft.frames >= 12
+    assert evidence.last_version.draft.localised_share == 1.0
+
+
+def test_what_the_current_version_does_not_find_either_is_no_loss() -> None:
+    survey_map = sound()[0].map
+    kept = ~looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
+    half = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+    evidence = beside_itself(survey_map, tiles_from_survey(half))
+    assert evidence.last_version is not None
+    assert evidence.last_version.draft.frames < len(survey_map.map_from_body)
+    assert evidence.last_version.draft.localised_share == 1.0
+
+
 def test_a_draft_that_lost_a_third_of_its_landmarks_is_refused() -> None:
     survey_map = sound()[0].map
     lost = np.random.default_rng(1).random(len(survey_map.landmark_ids)) < 1 / 3
     kept = ~lost[survey_map.obs_landmark]
-    names = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
-    fewer = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in names})
+    fewer = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
     said, evidence = verdict(fewer)
     assert evidence.last_version is not None
     assert evidence.last_version.inliers_share is not None
