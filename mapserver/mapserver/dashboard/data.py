@@ -13,6 +13,7 @@ from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
+from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request, survey_requests
 from mapserver.floor_plan.alignment import PLAN
@@ -122,6 +123,11 @@ class MapData:
             while len(self._plans) > _CACHED_PLANS:
                 self._plans.popitem(last=False)
         return plan
+
+    def space(self, site: str, version: int) -> bytes:
+        """A version's landmarks and places for the view in space; made at each call, since browsers keep it."""
+        manifest = self._store.manifest(site, version)
+        return space_bytes([decode_tile(self._store.blob(entry.sha256)) for entry in manifest.tiles])
 
     def underlays(self, site: str, version: int, root: str) -> list[Layer]:
         """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""

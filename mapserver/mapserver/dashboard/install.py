@@ -25,6 +25,7 @@ from mapserver.dashboard.pages import (
     map_page,
     robot_page,
     sign_in_page,
+    space_page,
     survey_page,
 )
 from mapserver.fleet.fleet import Fleet
@@ -47,7 +48,7 @@ def install_dashboard(
         surveys,
         RobotPlacing(store, fleet, bus),
     )
-    for page in (fleet_page, robot_page, map_page, failures_page, failure_page, survey_page, live_page):
+    for page in (fleet_page, robot_page, map_page, space_page, failures_page, failure_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
     _install_pictures(services, store)
@@ -79,6 +80,15 @@ def _install_pictures(services: Services, store: MapStore) -> None:
             return _picture(services.maps.plan(site, version).png, "image/png", "private, max-age=31536000, immutable")
         except FleetmapError as error:
             return Response(str(error), 404, media_type="text/plain")
+
+    @pages.get("/spaces/{site}/{version}.bin", include_in_schema=False)
+    def space(site: str, version: int) -> Response:
+        """Landmarks and places of a version; versions do not change."""
+        try:
+            data = services.maps.space(site, version)
+        except FleetmapError as error:
+            return Response(str(error), 404, media_type="text/plain")
+        return _picture(data, "application/octet-stream", "private, max-age=31536000, immutable")
 
     @pages.get("/underlays/{site}/{version}/{kind}.png", include_in_schema=False)
     def underlay(site: str, version: int, kind: Literal["floor", "grid"]) -> Response:

@@ -306,12 +306,17 @@ class Seen:
         return [address for address in self.requests if not address.startswith(inside)]
 
 
+def is_fault(kind: str, text: str) -> bool:
+    """Whether a page said something that nobody should find on its console; graphics in software tell how slow they are."""
+    return kind in {"error", "warning"} and "GL Driver Message (OpenGL, Performance" not in text
+
+
 def watch(page) -> Seen:  # type: ignore[no-untyped-def]
     """Notes what a page loads, errors on its console, and answers that are errors."""
     seen = Seen()
     page.on("request", lambda request: seen.requests.append(request.url))
     page.on("websocket", lambda socket: seen.requests.append(socket.url))
-    page.on("console", lambda said: seen.faults.append(said.text) if said.type in {"error", "warning"} else None)
+    page.on("console", lambda said: seen.faults.append(said.text) if is_fault(said.type, said.text) else None)
     page.on("pageerror", lambda error: seen.faults.append(str(error)))
     page.on("response", lambda got: seen.faults.append(f"{got.status} {got.url}") if got.status >= 400 else None)
     return seen

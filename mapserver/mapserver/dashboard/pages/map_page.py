@@ -183,8 +183,8 @@ async def _one_version(services: Services, context: PageContext, version: int) -
             html(
                 Markup(
                     '<p class="quiet">Grey: landmarks. Blue dots: places that robots recognise. Squares: tiles, darker with more '
-                    "landmarks.</p>"
-                )
+                    "landmarks. {}</p>"
+                ).format(link(context.to("space", version=version), "See it in space"))
             )
         right = Markup("<h2>Quality of version {}</h2>{}{}")
         html(right.format(version, _quality_facts(quality, plan), _verdicts(context, quality)))

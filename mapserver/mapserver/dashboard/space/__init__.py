@@ -1,0 +1,1 @@
+"""A version's map in three dimensions: its bytes for the browser, and the element that draws them."""
