@@ -172,12 +172,23 @@ class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
     metrics: Metrics = {}
 
 
-def _position_and_quat(
-    target_from_source: Array,
-) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    x, y, z = (float(value) for value in target_from_source[:3, 3])
-    qw, qx, qy, qz = (float(value) for value in quat_wxyz_from_rotation(target_from_source[:3, :3]))
-    return (x, y, z), (qw, qx, qy, qz)
+class Placement(msgspec.Struct, frozen=True, kw_only=True):
+    """A rigid transform: position in metres, unit quaternion."""
+
+    position_m: tuple[float, float, float]
+    quat_wxyz: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, target_from_source: Array) -> Self:
+        """The message part of a transform (4, 4)."""
+        x, y, z = target_from_source[:3, 3].tolist()
+        qw, qx, qy, qz = quat_wxyz_from_rotation(target_from_source[:3, :3]).tolist()
+        return cls(position_m=(x, y, z), quat_wxyz=(qw, qx, qy, qz))
+
+    @property
+    def target_from_source(self) -> Array:
+        """(4, 4) transform."""
+        return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_m))
 
 
 class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -197,11 +208,11 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
         """The message of map_from_base (4, 4) with cov_rot_trans (6, 6)."""
         assert map_from_base.shape == (4, 4)
         assert cov_rot_trans.shape == (6, 6)
-        position_m, quat_wxyz = _position_and_quat(map_from_base)
+        placed = Placement.of(map_from_base)
         return cls(
             stamp_ns=int(stamp_ns),
-            position_map_m=position_m,
-            quat_wxyz=quat_wxyz,
+            position_map_m=placed.position_m,
+            quat_wxyz=placed.quat_wxyz,
             cov_rot_trans=tuple(float(value) for value in cov_rot_trans.ravel()),
             status=status,
             map_version=map_version,
@@ -211,24 +222,6 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
     def map_from_base(self) -> Array:
         """(4, 4) transform of this message."""
         return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_map_m))
-
-
-class Placement(msgspec.Struct, frozen=True, kw_only=True):
-    """A rigid transform: position in metres, unit quaternion."""
-
-    position_m: tuple[float, float, float]
-    quat_wxyz: tuple[float, float, float, float]
-
-    @classmethod
-    def of(cls, target_from_source: Array) -> Self:
-        """The message part of a transform (4, 4)."""
-        position_m, quat_wxyz = _position_and_quat(target_from_source)
-        return cls(position_m=position_m, quat_wxyz=quat_wxyz)
-
-    @property
-    def target_from_source(self) -> Array:
-        """(4, 4) transform."""
-        return se3(rotation_from_quat_wxyz(np.array(self.quat_wxyz)), np.array(self.position_m))
 
 
 class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -273,6 +266,15 @@ class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
     jpeg: Annotated[bytes, msgspec.Meta(max_length=MAX_THUMBNAIL_BYTES)]
 
 
+class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
+    """A robot's left camera after rectification, without distortion, and its mounting; reports of older robots have none."""
+
+    size_px: tuple[int, int]
+    focal_px: float
+    centre_px: tuple[float, float]
+    base_from_cam: Placement
+
+
 class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     """A position failure with its context, as docs/reports.md defines failures.
 
@@ -307,6 +309,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     exposure: float | None = None
     sharpness: float | None = None
     calibration: Text = ""
+    camera: CameraNote | None = None
     fixes: Annotated[tuple[FixNote, ...], msgspec.Meta(max_length=20)] = ()
     thumbnails: Annotated[tuple[Thumbnail, ...], msgspec.Meta(max_length=4)] = ()
 

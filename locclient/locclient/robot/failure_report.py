@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
-from fleetmap.messages import MAX_THUMBNAIL_BYTES, Cause, FailureReport, Placement, Thumbnail
+from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
@@ -23,6 +23,7 @@ from locclient.robot.robot import FailureContext
 Canvas = NDArray[np.uint8]
 Matches = tuple[Array, Array, NDArray[np.int64]]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
+_LETTERS = 0.55  # size of the title, where it fits
 _WINDOW_PX = 25.0  # the place may be off: the view shows whether anything would match nearby
 
 
@@ -60,7 +61,10 @@ def match_view(left: Image, matches: Matches, title: str) -> Canvas:
             cv2.line(told, _at(pixel), _at(features[feature]), _FOUND, 1, cv2.LINE_AA)
     head = np.zeros((30, 2 * left.shape[1], 3), np.uint8)
     text = f"{title}: {int((hit >= 0).sum())} of {len(pixels)} expected landmarks match, {len(features)} features"
-    cv2.putText(head, text, (8, 21), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _INK, 1, cv2.LINE_AA)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    (width_px, _), _ = cv2.getTextSize(text, font, _LETTERS, 1)
+    letters = _LETTERS * min(1.0, (head.shape[1] - 16) / width_px)
+    cv2.putText(head, text, (8, 21), font, letters, _INK, 1, cv2.LINE_AA)
     return np.vstack([head, np.hstack([seen, told])])
 
 
@@ -135,7 +139,18 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         sharpness=None if image is None else image.sharpness,
         fixes=failure.fixes,
         calibration=failure.estimate.calibration.text[:2000],
+        camera=_camera(profile),
         thumbnails=_thumbnails(context, matches, cause),
+    )
+
+
+def _camera(profile: RobotProfile) -> CameraNote:
+    camera = profile.camera
+    return CameraNote(
+        size_px=(camera.width_px, camera.height_px),
+        focal_px=float(camera.focal_px),
+        centre_px=(float(camera.cx_px), float(camera.cy_px)),
+        base_from_cam=Placement.of(profile.base_from_body @ profile.body_from_cam),
     )
 
 

@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Annotated
 
@@ -18,10 +19,11 @@ from fleetmap.occupancy_grid import map_server_files
 from fleetmap.version_grid import grid_of, occupancy
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.guard import address_of
-from mapserver.api.parameters import RobotHeight, Site, Version, ViewPose
+from mapserver.api.parameters import Number, RobotHeight, Site, Version, ViewPose
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.serving.expected_views import ExpectedViews, looking
+from mapserver.serving.expected_views import ExpectedViews, failure_camera, looking
 from mapserver.store import MapStore
+from mapserver.surfels.expected_view import ExpectedView
 
 _DIGESTS_KEPT = 256
 _VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a fifth of a second of CPU
@@ -81,17 +83,27 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
 
     views, drawn = ExpectedViews(store), RateLimit(_VIEWS_AT_ONCE, _VIEWS_PER_S, store.now_ns)
 
+    def answer(request: Request, draw: Callable[[], ExpectedView]) -> Response:
+        if not drawn.admits(address_of(request.scope)):
+            raise HTTPException(429, "too many views are asked for; wait a second", {"Retry-After": "1"})
+        view = draw()
+        alpha = np.where(view.unknown, np.uint8(0), np.uint8(255))
+        png = cv2.imencode(".png", np.dstack([view.picture] * 3 + [alpha]))[1].tobytes()
+        return bytes_response(request, png, sha256_hex(png), "image/png", immutable=False)
+
     @app.get("/v1/sites/{site}/versions/{version}/view.png", response_class=Response)
     def view_png(request: Request, site: Site, version: Version, camera: Annotated[ViewPose, Query()]) -> Response:
         """What the survey's camera should see at a pose, drawn from the version's surfels; transparent where nothing is known."""
         store.version(site, version)
-        if not drawn.admits(address_of(request.scope)):
-            raise HTTPException(429, "too many views are asked for; wait a second", {"Retry-After": "1"})
         place = looking((camera.x_m, camera.y_m, camera.z_m), camera.yaw_deg, camera.pitch_deg)
-        view = views.view(site, version, place, width_px=camera.width_px)
-        alpha = np.where(view.unknown, np.uint8(0), np.uint8(255))
-        png = cv2.imencode(".png", np.dstack([view.picture] * 3 + [alpha]))[1].tobytes()
-        return bytes_response(request, png, sha256_hex(png), "image/png", immutable=False)
+        return answer(request, lambda: views.view(site, version, place, width_px=camera.width_px))
+
+    @app.get("/v1/failures/{number}/expected.png", response_class=Response)
+    def expected(request: Request, number: Number) -> Response:
+        """What a robot's camera should have seen when its failure began, where it believed to be; transparent where nothing is known."""
+        report = store.fleet.failure(number).report
+        version, map_from_cam, camera = failure_camera(report)
+        return answer(request, lambda: views.view(report.site, version, map_from_cam, camera))
 
     @app.get("/v1/sites/{site}/versions/{version}/vda5050")
     def vda5050(request: Request, site: Site, version: Version) -> dict[str, str]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from fleetmap.errors import FleetmapError, StateError, UsageError
 from fleetmap.mapformat import Manifest, decode_tile
 from fleetmap.mapformat.building import ALIGNMENT
+from fleetmap.messages import FailureReport
 from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
@@ -20,7 +21,9 @@ from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
+from mapserver.serving.expected_views import failure_camera
 from mapserver.store import Actor, CanaryRow, Event, JobInfo, MapStore, SiteInfo, VerdictRow, VersionInfo
+from mapserver.surfels.surfel_map import index_address
 
 _log = logging.getLogger(__name__)
 _CACHED_PLANS = 8
@@ -173,6 +176,15 @@ class MapData:
     def areas(self, site: str) -> Areas:
         """The named areas of a site."""
         return self._store.areas(site)
+
+    def lacks_view(self, report: FailureReport) -> str | None:
+        """Why it cannot be drawn what a robot should have seen when its failure began; None where it can."""
+        try:
+            version, _, _ = failure_camera(report)
+            index_address(self._store.manifest(report.site, version))
+        except FleetmapError as error:
+            return str(error)
+        return None
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

@@ -4,8 +4,10 @@ import threading
 
 import numpy as np
 
+from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.mapformat import CameraEntry
+from fleetmap.messages import FailureReport
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.store import MapStore
@@ -13,6 +15,7 @@ from mapserver.surfels.expected_view import FAR_M, ExpectedView, expected_view, 
 from mapserver.surfels.surfel_map import TILE_SIZE_M, Surfels, surfels_of
 
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_FARTHEST_M = 1e5  # from the origin of a map: no site is larger
 _REACH_M = min(FAR_M, 25.0)  # around the middle of a tile: what a request may read
 
 
@@ -40,6 +43,29 @@ class ExpectedViews:
                 self._kept = None
                 self._kept = key, surfels_of(manifest, self._store.blob, (float(middle[0]), float(middle[1]), _REACH_M))
             return expected_view(self._kept[1], lens, map_from_cam)
+
+
+def failure_camera(report: FailureReport) -> tuple[int, Array, CameraCalibration]:
+    """The version that a robot used when a failure began, map_from_cam (4, 4) as it believed to stand then, and its camera.
+
+    Raises UsageError where the report does not say them, or says what no camera is.
+    """
+    camera, believed = report.camera, report.map_from_base
+    if report.version is None:
+        raise UsageError("the robot had no map")
+    if believed is None:
+        raise UsageError("the robot had claimed no position when it began")
+    if camera is None:
+        raise UsageError("the report does not tell the robot's camera; update fleetmap on the robot")
+    map_from_cam = believed.target_from_source @ camera.base_from_cam.target_from_source
+    (width_px, height_px), centre_px = camera.size_px, camera.centre_px
+    is_size = 16 <= width_px <= 1 << 14 and 1 <= height_px <= 4 * width_px
+    if not (is_size and np.isfinite(centre_px).all() and 0.1 < camera.focal_px / width_px < 50):
+        raise UsageError("the report's camera is none; check the robot's calibration")
+    if not np.isfinite(map_from_cam).all() or np.abs(map_from_cam[:3, 3]).max() > _FARTHEST_M:
+        raise UsageError("the reported position is none; check the robot's calibration")
+    stereo = StereoCamera(camera.focal_px, *centre_px, 0.0, width_px, height_px)
+    return report.version, map_from_cam, pinhole(stereo)
 
 
 def survey_camera(entry: CameraEntry) -> CameraCalibration:

@@ -118,6 +118,17 @@ def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> 
     return SurfelReport(sha256=sha256, bytes=sum(map(len, blobs)), surfels=surfels, without=without)
 
 
+def index_address(manifest: Manifest) -> str:
+    """SHA-256 of the index of a version's surfels; StateError for a version without any, saying why."""
+    where, report = f"version {manifest.version} of site {manifest.site}", report_of(manifest)
+    if report is None:
+        raise StateError(f"{where} has no surfels: set `surfel_map = true` in [survey] and build the next version")
+    if report.sha256 is None:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
+        raise StateError(f"{where} has no surfels: {reasons or 'no recording showed anything near'}")
+    return report.sha256
+
+
 def surfels_of(
     manifest: Manifest, blob: Callable[[str], bytes], near: tuple[float, float, float] | None = None
 ) -> Surfels:
@@ -126,13 +137,7 @@ def surfels_of(
     Raises StateError for a version without any, saying why, and MapFormatError or NewerFormatError for bytes that are none.
     """
     where = f"version {manifest.version} of site {manifest.site}"
-    report = report_of(manifest)
-    if report is None:
-        raise StateError(f"{where} has no surfels: set `surfel_map = true` in [survey] and build the next version")
-    if report.sha256 is None:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
-        raise StateError(f"{where} has no surfels: {reasons or 'no recording showed anything near'}")
-    parts, index = [], _read_index(blob(report.sha256))
+    parts, index = [], _read_index(blob(index_address(manifest)))
     for entry in index.tiles:
         if near is not None:
             off = np.array([entry.x, entry.y]) * TILE_SIZE_M - near[:2]

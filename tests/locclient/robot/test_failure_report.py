@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3
+from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
@@ -67,7 +67,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     assert len(told) == 1
     assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
     rig = robot_world.rectifier()
-    profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    base_from_body = se3(so3_exp(np.array([0.0, 0.1, 0.4])), np.array([0.2, -0.1, 0.5]))
+    profile = RobotProfile("room", "r1", base_from_body, rig.body_from_cam, rig.camera, robot_world.SETTINGS)
     report = failure_report(told[0], profile, report_id="ab" * 16, wall_ns=7)
     assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
     assert report.status in {"DEGRADED", "LOST"}
@@ -75,6 +76,15 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     assert report.exposure == 0.0
     assert report.inliers is not None
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
+    map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
+    np.testing.assert_allclose(map_from_cam, told[0].onset.map_from_body @ rig.body_from_cam, atol=1e-9)
+    assert report.camera.size_px == (rig.camera.width_px, rig.camera.height_px)
+    assert (*report.camera.centre_px, report.camera.focal_px) == (
+        rig.camera.cx_px,
+        rig.camera.cy_px,
+        rig.camera.focal_px,
+    )
+    assert len(encode_message(report.camera)) < 256
     assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())
     assert written["cause"] == "dark"

@@ -3,6 +3,8 @@
 import time
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import schemathesis
 from hypothesis import HealthCheck, given, settings
 from schemathesis.checks import not_a_server_error
@@ -13,7 +15,7 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.messages import FailureReport, Placement, Thumbnail
+from fleetmap.messages import CameraNote, FailureReport, Placement, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
@@ -32,6 +34,10 @@ FAILURE = FailureReport(
     version=1, tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
     map_from_base=Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
     thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8\xff\xd9"),),
+)  # fmt: skip
+LOOKED = msgspec.structs.replace(
+    FAILURE, id="f2", version=3, map_from_base=Placement.of(np.eye(4)),
+    camera=CameraNote(size_px=(320, 240), focal_px=300.0, centre_px=(159.5, 119.5), base_from_cam=Placement.of(np.eye(4))),
 )  # fmt: skip
 
 
@@ -73,7 +79,8 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         save_grid_draft(store, site="hall", surfels=wall())
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
         fleet = Fleet(store, clock_ns=lambda: now_ns)  # a robot that was heard stays so
-        assert not fleet.take_failure("hall", "r1", FAILURE).refused
+        for failure in (LOOKED, FAILURE):
+            assert not fleet.take_failure("hall", "r1", failure).refused
         store.fleet.add_replay(1, FailureReplay(b"summary", b"recording", []), keep_bytes=100)
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")

@@ -7,6 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from fleetmap.geometry import se3
+from fleetmap.messages import CameraNote, FailureReport, Placement
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import FailureFilter
 from support.fleet.served_api import Server, served_api
 from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
 
@@ -58,3 +62,63 @@ def test_many_views_are_slowed_down(server: Server, address: str) -> None:
     codes = [server.client.get(address, params=POSE).status_code for _ in range(12)]
     assert codes[0] == 200
     assert 429 in codes
+
+
+def reported(server: Server, version: int | None, **changes: object) -> str:
+    """A failure of a robot whose camera looks along x from the origin, as far as the robot believed; the address of its view."""
+    optical = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    mounted = Placement.of(se3(optical, np.array([0.3, 1.0, 0.2])))
+    camera = CameraNote(size_px=(640, 480), focal_px=600.0, centre_px=(319.5, 239.5), base_from_cam=mounted)
+    given = {"camera": camera, "map_from_base": Placement.of(se3(np.eye(3), np.array([-0.3, -1.0, -0.2])))} | changes
+    number = len(server.store.fleet.failures(FailureFilter())) + 1
+    report = FailureReport(
+        site="lab", robot="r1", id=f"f{number}", stamp_ns=1, wall_ns=1, duration_s=3.0, kind="blind", status="LOST", cause="dark",
+        version=version, **given,
+    )  # fmt: skip
+    assert not Fleet(server.store).take_failure("lab", "r1", report).refused
+    return f"/v1/failures/{number}/expected.png"
+
+
+def test_a_failure_shows_what_its_camera_should_have_seen(server: Server) -> None:
+    version = save_surfel_draft(server.store, wall(2.0))
+    answer = server.client.get(reported(server, version))
+    assert answer.status_code == 200
+    image = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (240, 320, 4)
+    # A white square of 0.4 m, 2 m away, by the robot's own focal length, which is 300 px at this size.
+    white = np.argwhere(image[..., 0] > 200)
+    assert np.ptp(white, axis=0) == pytest.approx((60, 60), abs=4)
+    assert white.mean(axis=0) == pytest.approx((119.5, 159.5), abs=1)
+    aside = reported(server, version, map_from_base=Placement.of(se3(np.eye(3), np.array([-0.3, -1.2, -0.2]))))
+    image = cv2.imdecode(np.frombuffer(server.client.get(aside).content, np.uint8), cv2.IMREAD_UNCHANGED)
+    white = np.argwhere(image[..., 0] > 200)
+    assert white.mean(axis=0)[1] == pytest.approx(159.5 - 30, abs=1.5), "0.2 m to the right: it is seen to the left"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"camera": None}, "update fleetmap on the robot"),
+        ({"map_from_base": None}, "no position"),
+        ({"map_from_base": Placement(position_m=(float("nan"), 0, 0), quat_wxyz=(1, 0, 0, 0))}, "position is none"),
+        ({"map_from_base": Placement(position_m=(1e200, 0, 0), quat_wxyz=(1, 0, 0, 0))}, "position is none"),
+        *(
+            ({"camera": {name: value}}, "camera is none")
+            for name, value in (
+                ("size_px", (0, 480)),
+                ("size_px", (640, 1 << 40)),
+                ("focal_px", 0.0),
+                ("centre_px", (float("nan"), 1.0)),
+            )
+        ),
+    ],
+)
+def test_reports_that_allow_no_view_say_why(server: Server, changes: dict[str, object], said: str) -> None:
+    version = save_surfel_draft(server.store, wall())
+    if isinstance(changes.get("camera"), dict):
+        good = {"size_px": (640, 480), "focal_px": 600.0, "centre_px": (320.0, 240.0)}
+        changes = {"camera": CameraNote(**(good | changes["camera"]), base_from_cam=Placement.of(np.eye(4)))}
+    answer = server.client.get(reported(server, version, **changes))
+    assert answer.status_code in (404, 409, 422)
+    assert said in answer.json()["detail"]
+    assert "no surfels" in server.client.get(reported(server, save_sample_draft(server.store))).json()["detail"]

@@ -7,17 +7,20 @@ from pathlib import Path
 
 import httpx
 import msgspec
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from fleetmap.failure_summary import Moment
-from fleetmap.messages import FailureReport
+from fleetmap.geometry import se3
+from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.dashboard.failure import story
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving
 from support.fleet.failed_robot import send_replay, small_file
 from support.fleet.whole_page import assert_whole
+from support.storage.map_samples import save_surfel_draft, wall
 
 BEGAN_NS = 50_000_000_000
 AT_NS = 1_790_000_000_000_000_000  # by the server's clock: 2026-09-21 14:13:20 UTC
@@ -123,7 +126,7 @@ def report(name: str, **changes: object) -> FailureReport:
 
 @pytest.fixture(scope="module")
 def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm."""
+    """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm. 5: with a view."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with MapStore.open(folder) as store:
@@ -141,6 +144,13 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
             given = {"site": SITE, "robot": name, "id": f"of-{name}", "began_ns": BEGAN_NS, "stamps_ns": stamps_ns}
             file = small_file(folder / "failure.mcap", jpegs=jpegs, moments=moments, **given)
             send_replay(fleet, SITE, name, f"of-{name}", file)
+        version = save_surfel_draft(store, wall(), site=SITE)
+        optical = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+        camera = CameraNote(
+            size_px=(320, 240), focal_px=300.0, centre_px=(160.0, 120.0), base_from_cam=Placement.of(optical)
+        )
+        known = report("tug-5", camera=camera, version=version, map_from_base=Placement.of(np.eye(4)))
+        assert not fleet.take_failure(SITE, "tug-5", known).refused
         fleet.flush()
     with serving(folder) as server:
         yield server
@@ -194,6 +204,20 @@ def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, ser
     assert page.locator(".player").count() == 0
     assert any(mark["shape"] == "cross" for mark in marks(page))
     assert seen.faults == []
+
+
+def test_the_expected_view_stands_beside_the_picture(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures/5")
+    pair = page.locator(".pictures:not(.row)").first.locator("img")
+    expect(pair).to_have_count(2)
+    pair.nth(1).scroll_into_view_if_needed()
+    page.wait_for_function("document.querySelector('img[src*=expected]').naturalWidth === 320", timeout=90_000)
+    assert_whole(page)
+    assert seen.faults == []
+    opened(page, served, "failures/1")
+    expect(page.locator(".nicegui-content")).to_contain_text(
+        "No expected view: the report does not tell the robot's camera"
+    )
 
 
 def test_a_recording_made_to_harm_is_shown_as_words(page: Page, served: Served) -> None:

@@ -29,6 +29,7 @@ from mapserver.dashboard.pages.failures_page import tone_of
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.store import FailureDetail, PictureRow
 
+_DRAWN = "Drawn from the map: what the camera should have seen where the robot believed to be when it began"
 _LEFT, _MATCHES = "Left camera image", "The image, and the landmarks expected in it"
 _ADVICE = {
     Cause.CARRIED: "The robot was carried: what it sees ended between two images, and its fixes agree on another place.",
@@ -75,7 +76,7 @@ def install(services: Services) -> None:
             html(Markup("<h1>Failure {} of {}</h1>").format(shown.detail.failure.number, shown.detail.failure.robot))
             html(_answer(shown))
             html(_pictures(shown))
-            html(_match_view(shown))
+            html(_expected(shown, await load(services.maps.lacks_view, shown.detail.report)))
             await _seconds(services, shown)
             if shown.moments:
                 html(_summary(shown))
@@ -130,15 +131,27 @@ def _pictures(shown: _Shown) -> Markup:
     return Markup('<h2>Pictures</h2><div class="pictures row">{}</div>').format(figures)
 
 
+def _expected(shown: _Shown, lack: str | None) -> Markup:
+    """The picture at the beginning beside the one that the map's surfels make, and the match view. lack: why there is none."""
+    parts: list[Markup] = [Markup("<h2>What the map expected</h2>")]
+    seen = [picture for picture in shown.detail.pictures if picture.kind != "matches"]
+    if lack is None:
+        drawn = Markup(
+            '<figure><img src="../../v1/failures/{0}/expected.png" alt="{1}" loading="lazy"><figcaption>{1}</figcaption></figure>'
+        ).format(shown.detail.failure.number, _DRAWN)
+        at = min(seen, key=lambda picture: abs(picture.stamp_ns - shown.clock.began_ns), default=None)
+        pair = [drawn] if at is None else [_figure(shown, at, _LEFT), drawn]
+        parts.append(Markup('<div class="pictures">{}</div>').format(joined(pair)))
+    else:
+        parts.append(Markup('<p class="quiet">No expected view: {}.</p>').format(lack))
+    return joined([*parts, _match_view(shown)])
+
+
 def _match_view(shown: _Shown) -> Markup:
     views = [
         _figure(shown, picture, _MATCHES, "matches") for picture in shown.detail.pictures if picture.kind == "matches"
     ]
-    return (
-        Markup('<h2>What the map expected</h2><div class="pictures">{}</div>').format(joined(views))
-        if views
-        else Markup()
-    )
+    return Markup('<div class="pictures">{}</div>').format(joined(views)) if views else Markup()
 
 
 def _summary(shown: _Shown) -> Markup:
