@@ -1,11 +1,13 @@
 """Each study is a short script with a page, figures that are kept with seeds and versions, and a picture."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from studies import study
+from benchmarks.common.looks import Answer, curve, right_at
+from studies import dark_ladder, study
 from studies.robot_days.rates import Stratum, day_rate
 
 PAGES = sorted(page for page in study.PAGES.glob("*.md") if page.stem != "README")
@@ -86,3 +88,23 @@ def test_failures_of_one_drive_tell_less_than_those_of_many() -> None:
     assert together.rate == apart.rate
     assert together.high > apart.high
     assert together.robot_days < apart.robot_days
+
+
+def test_right_and_wrong_over_the_threshold() -> None:
+    """Of five looks one is not answered, and the least sure answer is wrong: by place, or by direction."""
+    right = [Answer("TRACKING", score, 0.1, 1.0) for score in (90.0, 60.0, 30.0)]
+    silent = Answer("AMBIGUOUS", 0.0, None, None)
+    for wrong in (Answer("INITIALISING", 20.0, 3.0, 0.0), Answer("INITIALISING", 20.0, 0.1, 90.0)):
+        found = [*right, silent, wrong]
+        assert curve(found) == [(90.0, 0.2, 0.0), (60.0, 0.4, 0.0), (30.0, 0.6, 0.0), (20.0, 0.6, 0.25)]
+        assert right_at(found, 0.01) == 0.6
+        assert right_at([*found, Answer("TRACKING", 99.0, 3.0, 0.0)], 0.01) == 0.0
+    assert right_at([silent], 0.01) == 0.0
+
+
+def test_the_ladder_goes_down() -> None:
+    tables = [dark_ladder.darkening(level) for level in dark_ladder.LEVELS]
+    assert tables[0].tolist() == list(range(256))
+    assert all((below <= above).all() and below.sum() < above.sum() for above, below in pairwise(tables))
+    a, gamma = dark_ladder.parameters(3)
+    assert tables[3][100] == round(255 * a * (100 / 255) ** (1 / gamma))

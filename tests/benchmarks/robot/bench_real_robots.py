@@ -107,12 +107,12 @@ CASES: dict[str, Case] = {
 }
 
 
-def mapped(work: Path, path: Path) -> Path:
-    """A store with the map of the even frames, in the frame of the truth."""
-    store = work / path.stem / "store"
+def mapped(work: Path, path: Path, frames: str = MAPPED) -> Path:
+    """A store with the map of some frames, the even ones unless others are named, in the frame of the truth."""
+    store = work / path.stem / ("store" if frames == MAPPED else f"store-{frames.replace(':', '-')}")
     if not (store / "built").exists():
         to_store = ["--site", SITE, "--store", str(store)]
-        options = ["--frames", MAPPED, "--frame-from-ground-truth", "--report", str(work / f"{path.stem}.json")]
+        options = ["--frames", frames, "--frame-from-ground-truth", "--report", str(work / f"{path.stem}.json")]
         store.parent.mkdir(parents=True, exist_ok=True)
         subprocess.run([*tool("mapserver"), "build", str(path), *to_store, *options], check=True)
         subprocess.run([*tool("mapserver"), "publish", *to_store, *known_rig(store.parent)], check=True)
