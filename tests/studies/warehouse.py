@@ -10,34 +10,36 @@ from matplotlib.figure import Figure
 
 from studies.robot_days import rendered
 from studies.robot_days.configurations import CONFIGURATIONS, FULL
-from studies.robot_days.drives import Batch, row_of
+from studies.robot_days.drives import DRIVES, Batch, row_of
 from studies.robot_days.rates import DayRate, Stratum, day_rate
 from studies.robot_days.situations import SITUATIONS
 from studies.study import Column, Row, publish, results, table
 
 _BESIDE = "with pictures and without: "
-SEEDS = (21,)  # sites, one for each batch
-ABLATED = 0  # batches under every configuration
+SEED = 21  # of the site
+ABLATED, RARE = 1, 0.1  # drives of each situation under every other configuration; none of what a robot-day has less of
 
 
 def cases() -> dict[str, partial[Row]]:
-    """Batch by batch, so that a study which was stopped has some of everything."""
+    """Batch by batch, so that a study which was stopped has some of everything. Ablations drive the first drives of the first batch."""
     out = {}
-    for number, seed in enumerate(SEEDS):
-        for situation in SITUATIONS:
+    for number in range(max(about.batches for about in SITUATIONS.values())):
+        for situation in [name for name, about in SITUATIONS.items() if number < about.batches]:
             for name, configuration in CONFIGURATIONS.items():
-                if name == FULL or number < ABLATED:
-                    out[f"{number}: {situation}: {name}"] = partial(
-                        row_of, Batch(situation, seed, number), configuration
-                    )
-    return out | {f"{_BESIDE}{name}": partial(rendered.row_of, name) for name in rendered.RENDERED}
+                drives = DRIVES if name == FULL else ABLATED
+                if name == FULL or (number == 0 and SITUATIONS[situation].per_day >= RARE):
+                    one = partial(row_of, Batch(situation, SEED, number), configuration, drives)
+                    out[f"{number}: {situation}: {name}"] = one
+        if number == 0:
+            out |= {f"{_BESIDE}{name}": partial(rendered.row_of, name) for name in rendered.RENDERED}
+    return out
 
 
 def strata(rows: list[Row], name: str, count: str) -> dict[str, Stratum]:
     """What was simulated of each situation under a configuration. count: failures or silent."""
     out = {}
     for situation, about in SITUATIONS.items():
-        own = [r for r in rows if r["situation"] == situation and r["case"].endswith(f": {name}")]
+        own = [r for r in rows if r.get("situation") == situation and r["case"].endswith(f": {name}")]
         failures = tuple(int(n) for row in own for n in row[count].split())
         if own:
             out[situation] = Stratum(about.per_day, sum(r["exposure"] for r in own), failures)
@@ -66,7 +68,7 @@ def situation_rows(rows: list[Row]) -> list[Row]:
     out = []
     for situation, stratum in strata(rows, FULL, "failures").items():
         about, rate = SITUATIONS[situation], day_rate([stratum])
-        own = [r for r in rows if r["situation"] == situation and r["case"].endswith(f": {FULL}")]
+        own = [r for r in rows if r.get("situation") == situation and r["case"].endswith(f": {FULL}")]
         p99 = [r["p99_mm"] for r in own if r["p99_mm"] is not None]
         out.append({
             "name": situation, "per_day": f"{about.per_day:g} {'' if about.events else 'h'}".strip(), "source": about.source,
@@ -105,14 +107,14 @@ def draw(found: list[Row]) -> Figure:
     axes.set_xscale("log")
     axes.set_xlim(1e-3, None)
     axes.set_xlabel("position failures in a robot-day of 16 hours, and 95 % interval")
-    axes.legend(loc="lower right", fontsize=8, frameon=False)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), fontsize=8, frameon=False)
     return figure
 
 
 def main() -> None:
     """Rows, tables and picture of docs/studies/warehouse.md."""
-    rows = results("warehouse", cases(), SEEDS)
-    found = [configuration_row(rows, name) for name in CONFIGURATIONS if name == FULL or ABLATED]
+    rows = results("warehouse", cases(), [SEED, rendered.SEED])
+    found = [configuration_row(rows, name) for name in CONFIGURATIONS]
     shown = [
         Column("name", "configuration"), Column("failures", "failures per robot-day"), Column("silent", "silent ones"),
         Column("robot_days", "effective robot-days", "{:.2g}"), Column("least_days", "of the situation simulated least", "{:.2g}"),

@@ -116,9 +116,9 @@ def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
     )  # fmt: skip
 
 
-def row_of(batch: Batch, configuration: Configuration) -> dict[str, object]:
-    """A batch's drives under a configuration, as they are kept. exposure: hours, or events where the situation has some."""
-    drives = [drive(batch, number, configuration) for number in range(DRIVES)]
+def row_of(batch: Batch, configuration: Configuration, count: int = DRIVES) -> dict[str, object]:
+    """A batch's first drives under a configuration, as they are kept. exposure: hours, or events where the situation has some."""
+    drives = [drive(batch, number, configuration) for number in range(count)]
     events, errors = SITUATIONS[batch.situation].events, np.concatenate([d.errors_m for d in drives])
     hours = round(sum(d.hours for d in drives), 4)
     kinds = {kind: sum(d.kinds[kind] for d in drives) for kind in drives[0].kinds}

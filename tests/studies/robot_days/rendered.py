@@ -16,22 +16,20 @@ from locclient.localization.estimate import Estimate
 from studies.robot_days.drives import Drive, judged
 from support.estimator.simulated_run import EstimatorSession, Smudge
 
-SCENARIO, SEED, FRAMES = "small-loop", 31, 180
-_BEGIN_S, _SOFT_PX = 5.0, 12.0
+SCENARIO, SEED, FRAMES = "small-loop", 31, 120
+_BEGIN_S, _SOFT_PX = 4.5, 12.0
 
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """A drive of twelve seconds, the day after the survey."""
+    """A drive of eight seconds, the day after the survey."""
 
-    light: str = "day"
     faults: tuple[Fault, ...] = ()
     smudge: Smudge | None = None
 
 
 RENDERED = {
     "driving": Situation(),
-    "driving at night": Situation("night"),
     "a person right in front for 2.5 s": Situation(faults=(Fault("person-in-front", _BEGIN_S, _BEGIN_S + 2.5),)),
     "glare for 1.5 s": Situation(faults=(Fault("over-exposure", _BEGIN_S, _BEGIN_S + 1.5),)),
     "a smudge on the lens": Situation(smudge=Smudge(400.0, 220.0, 120.0)),
@@ -59,9 +57,7 @@ def _smudged(frame: RectifiedFrame, smudge: Smudge | None) -> RectifiedFrame:
 def row_of(name: str) -> dict[str, object]:
     """Both runs' figures: rendered, and at the estimator's level."""
     about = RENDERED[name]
-    session = prepare(
-        Order(SCENARIO, seed=SEED, robot="runner-1", day=1, light=about.light, faults=about.faults, frames=FRAMES)
-    )
+    session = prepare(Order(SCENARIO, seed=SEED, robot="runner-1", day=1, faults=about.faults, frames=FRAMES))
     rectifier, (of_pictures, of_landmarks) = Rectifier(session.nominal), _maps()
     frames = [_smudged(rectifier.rectify(frame), about.smudge) for frame in session.frames()]
     session.renderer.close()

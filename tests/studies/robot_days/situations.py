@@ -21,7 +21,8 @@ _EVENT_TRIP_M, _TRIP_M = 60.0, 110.0
 class Situation:
     """per_day: hours, or events, of it in a robot-day, with the source of that. trip: one drive of it.
 
-    days: nights since the survey that made the map, one for each batch in turn. events: in one trip; 0 where the whole trip counts, by
+    days: nights since the survey that made the map, one for each batch in turn. batches: at most so many; what weighs most is driven
+    most. events: in one trip; 0 where the whole trip counts, by
     its hours. prior: what the robot is told where it begins.
     """
 
@@ -30,6 +31,7 @@ class Situation:
     source: str
     trip: Callable[[np.random.Generator], Trip]
     days: tuple[int, ...] = (1,)
+    batches: int = 1
     events: int = 0
     prior: Prior = "dock"
 
@@ -76,7 +78,7 @@ def _met(kind: str, count: int, speed_mps: float, beside_m: float) -> Callable[[
         middle_y = LAYOUT.aisle_y_m(LAYOUT.chunk_at(start_x, y_m)[1])
         movers = []
         for _ in range(count):
-            x_m, reach_m = float(rng.uniform(start_x, end_x)), float(rng.uniform(1.0, 4.0))
+            x_m, reach_m = float(rng.uniform(*sorted((start_x, end_x)))), float(rng.uniform(1.0, 4.0))
             side_y = middle_y + (beside_m if y_m < middle_y else -beside_m)
             stations = ((x_m - reach_m, side_y), (x_m + reach_m, side_y))
             movers.append(Mover(kind, stations, speed_mps, float(rng.uniform(0.0, 4 * reach_m))))
