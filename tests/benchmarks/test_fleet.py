@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fleet import bench_canary, bench_fleet, bench_flood
+from benchmarks.fleet import bench_canary, bench_failure_replay, bench_fleet, bench_flood
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
@@ -30,6 +30,14 @@ def test_a_robot_that_floods_is_in_nobodys_way(tmp_path: Path) -> None:
         assert found[kind]["longest_wait_s"] <= 1.0, kind
         assert found[kind]["memory_mb"] <= 50, kind
         assert found[kind]["disk_mb"] <= 50, kind
+
+
+def test_failures_are_repeated_from_their_recordings() -> None:
+    found = bench_failure_replay.measure(50, seed=0)
+    print(json.dumps(found))
+    assert found["same_statuses"] == found["failures"] == 50
+    assert len(found["causes"]) >= 3
+    assert found["ring_ms_mean"] <= 0.3
 
 
 def test_a_map_with_a_shifted_aisle_is_taken_back() -> None:

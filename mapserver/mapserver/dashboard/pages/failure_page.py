@@ -137,7 +137,7 @@ def _expected(shown: _Shown, lack: str | None) -> Markup:
     seen = [picture for picture in shown.detail.pictures if picture.kind != "matches"]
     if lack is None:
         drawn = Markup(
-            '<figure><img src="../../v1/failures/{0}/expected.png" alt="{1}" loading="lazy"><figcaption>{1}</figcaption></figure>'
+            '<figure><img src="../../v1/failures/{0}/expected.png" alt="{1}"><figcaption>{1}</figcaption></figure>'
         ).format(shown.detail.failure.number, _DRAWN)
         at = min(seen, key=lambda picture: abs(picture.stamp_ns - shown.clock.began_ns), default=None)
         pair = [drawn] if at is None else [_figure(shown, at, _LEFT), drawn]
