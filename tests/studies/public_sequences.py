@@ -72,9 +72,9 @@ def survey(path: Path) -> Row:
 def odometry(run: ReplayResult, truth: Trajectory) -> Row:
     """Each frame's pose as it was known then, in one frame that the first of them places; nothing is fitted."""
     chain = FrameChain()
-    poses = np.array([chain.append(estimate.odometry) for estimate in run.estimates])
+    odom_from_body = np.array([chain.append(estimate.odometry) for estimate in run.estimates])
     stamps_ns = np.array([estimate.stamp_ns for estimate in run.estimates])
-    mine, true = paired(at_first_stamp(Trajectory(stamps_ns, poses), truth), truth)
+    mine, true = paired(at_first_stamp(Trajectory(stamps_ns, odom_from_body), truth), truth)
     errors = np.linalg.norm(mine.positions_m - true.positions_m, axis=1)
     path_m = float(np.linalg.norm(np.diff(true.positions_m, axis=0), axis=1).sum())
     return {

@@ -39,7 +39,7 @@ def examine(draft: MapView, before: MapView | None, probes: Probes, motion: Traj
     return Evidence(
         held_out=compare(draft, before, probes.held_out),
         replayed=compare(draft, before, probes.replayed),
-        last_version=compare(draft, before, _known(before, probes.last_version)),
+        last_version=compare(draft, before, _placed_by_either(draft, before, probes.last_version)),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
         starts=None,
@@ -47,11 +47,13 @@ def examine(draft: MapView, before: MapView | None, probes: Probes, motion: Traj
     )
 
 
-def _known(before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:
-    """Those that the current version finds in its own tiles: a draft cannot lose what robots do not have."""
-    if before is None:
-        return probes
-    return [probe for probe in probes if relocalized(before, probe, probe.map_from_cam) is not None]
+def _placed_by_either(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:
+    """Those that the draft or the current version finds: a draft cannot lose what robots do not have.
+
+    Were those chosen that the current version finds, all that it finds by luck would count against the draft.
+    """
+    views = (draft,) if before is None else (before, draft)
+    return [p for p in probes if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
 
 
 def compare(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Compared | None:
