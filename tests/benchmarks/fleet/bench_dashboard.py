@@ -25,7 +25,7 @@ from playwright.sync_api import BrowserContext, sync_playwright
 from mapserver.api.app import fleetmap_version
 from support.fleet.dashboard_scene import chromium, fill_store, serving
 
-PAGES = ("", "map", "failures", "failures/1", "robots/tug-7", "surveys", "live")
+PAGES = ("", "map", "space", "failures", "failures/1", "robots/tug-7", "surveys", "live")
 _REPEATS = 5
 _FRAMES_S = 10
 _TALK = """
