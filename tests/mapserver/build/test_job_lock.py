@@ -97,3 +97,6 @@ def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.
     with MapStore.open(tmp_path, create=True) as maps, recorded_job(maps, "new", "build") as job:
         monkeypatch.setattr(maps, "tell_progress", busy)
         JobProgress(maps, job.number)("odometry", 1, 2)
+        job.report = {"version": 1}
+    with MapStore.open(tmp_path) as maps:
+        assert (maps.job(1).state, maps.job(1).report) == ("done", {"version": 1})
