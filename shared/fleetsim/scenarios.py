@@ -218,19 +218,31 @@ def _whole_drive(layout: Layout) -> Route:
     return Route(tuple(points))
 
 
-def _fulfilment_centre() -> Scenario:
-    layout = Layout(aisles=60, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
-    blocks = {"south": range(30), "north": range(30, 60)}
-    drives = [(name, block, is_back) for is_back in (False, True) for name, block in blocks.items()]
-    runs = {
+_CENTRE = Layout(aisles=60, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
+
+
+def _block_surveys(layout: Layout, south: range, north: range) -> dict[str, Run]:
+    """Two blocks of neighbouring aisles, each driven there and, for `-back`, the other way."""
+    drives = [(name, block, is_back) for is_back in (False, True) for name, block in (("south", south), ("north", north))]
+    return {
         f"survey-{name}" + ("-back" if is_back else ""): Run(
             "surveyor", (_block_drive(layout, block, is_reversed=is_back),), is_sharp=True, zone_period_s=20.0
         )
         for name, block, is_back in drives
     }
-    runs["survey-whole"] = Run("surveyor", (_whole_drive(layout),), is_sharp=True, zone_period_s=20.0)
-    runs["tote-1"] = Run("tote", (_loop(layout, 28, 31, shift_m=0.2),), zone_period_s=20.0)
-    return Scenario("a centre of 40,000 m2: 60 like aisles, cross aisles, packing; four surveys see all", layout, runs)
+
+
+def _fulfilment_centre() -> Scenario:
+    runs = _block_surveys(_CENTRE, range(30), range(30, 60))
+    runs["survey-whole"] = Run("surveyor", (_whole_drive(_CENTRE),), is_sharp=True, zone_period_s=20.0)
+    runs["tote-1"] = Run("tote", (_loop(_CENTRE, 28, 31, shift_m=0.2),), zone_period_s=20.0)
+    return Scenario("a centre of 40,000 m2: 60 like aisles, cross aisles, packing; four surveys see all", _CENTRE, runs)
+
+
+def _fulfilment_wing() -> Scenario:
+    runs = _block_surveys(_CENTRE, range(6), range(6, 12))
+    runs["tote-1"] = Run("tote", (_loop(_CENTRE, 4, 7, shift_m=0.2),), zone_period_s=20.0)
+    return Scenario("twelve aisles of that centre: four surveys of 3 km in all see them both ways", _CENTRE, runs)
 
 
 # Functions, so that listing them builds nothing.
@@ -243,6 +255,7 @@ SCENARIOS = {
     "identical-aisles": _identical,
     "marked-ends": _marked_ends,
     "site": _site,
+    "fulfilment-wing": _fulfilment_wing,
     "fulfilment-centre": _fulfilment_centre,
 }
 
