@@ -63,7 +63,7 @@ class NoiseSettings(Section, frozen=True):
     disparity_sigma_px: float = 0.2
     cut_sigmas: float = 4.0  # observations farther off are removed between adjustments
     # Error of the estimated stereo yaw with an exact calibration, measured in the simulator
-    turn_floor_px: float = 0.02
+    turn_floor_px: float = 0.04
     turn_sigmas: float = 3.0  # significance at which that yaw is corrected
     accel_noise_scale: float = 5.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
     gyro_noise_scale: float = 2.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
