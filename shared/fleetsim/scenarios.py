@@ -221,12 +221,14 @@ def _whole_drive(layout: Layout) -> Route:
 _CENTRE = Layout(aisles=60, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
 
 
-def _block_surveys(layout: Layout, south: range, north: range) -> dict[str, Run]:
+def _block_surveys(layout: Layout, south: range, north: range, rate_hz: float = 15.0) -> dict[str, Run]:
     """Two blocks of neighbouring aisles, each driven there and, for `-back`, the other way."""
-    drives = [(name, block, is_back) for is_back in (False, True) for name, block in (("south", south), ("north", north))]
+    drives = [
+        (name, block, is_back) for is_back in (False, True) for name, block in (("south", south), ("north", north))
+    ]
     return {
         f"survey-{name}" + ("-back" if is_back else ""): Run(
-            "surveyor", (_block_drive(layout, block, is_reversed=is_back),), is_sharp=True, zone_period_s=20.0
+            "surveyor", (_block_drive(layout, block, is_reversed=is_back),), rate_hz, is_sharp=True, zone_period_s=20.0
         )
         for name, block, is_back in drives
     }
@@ -240,7 +242,7 @@ def _fulfilment_centre() -> Scenario:
 
 
 def _fulfilment_wing() -> Scenario:
-    runs = _block_surveys(_CENTRE, range(6), range(6, 12))
+    runs = _block_surveys(_CENTRE, range(6), range(6, 12), rate_hz=10.0)
     runs["tote-1"] = Run("tote", (_loop(_CENTRE, 4, 7, shift_m=0.2),), zone_period_s=20.0)
     return Scenario("twelve aisles of that centre: four surveys of 3 km in all see them both ways", _CENTRE, runs)
 

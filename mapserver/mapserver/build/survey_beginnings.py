@@ -178,4 +178,5 @@ def survey_inputs_of(
     """The selected frames (F,) of a recording, read ahead, and its samples."""
     frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
     samples = recording.imu, recording.calibration, rectifier, recording.wheel
-    return SurveyInputs(frames, len(indices), *samples, given, RecordedParts(recording, indices))
+    parts = RecordedParts(recording, indices)
+    return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)

@@ -18,7 +18,7 @@ from mapserver.survey.keyframes.keyframes import Keyframe
 
 MOST_KEYFRAMES = 120  # of one stretch: more would cost time and say little more
 _ROW_SIGMA_PX = 0.15
-# Stereo windows are off by 0.02 px on slanted surfaces, measured in the simulator: as `turn_floor_px` of the survey
+# Stereo windows are off by 0.02 px on slanted surfaces, measured in the simulator
 _BIAS_PX = 0.02
 _ROW_SEARCH_PX = 3.0
 

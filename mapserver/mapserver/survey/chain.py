@@ -1,11 +1,13 @@
 """The chain of a survey's keyframes: from an initial trajectory to keyframes that are adjusted with their neighbours."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array
+from fleetmap.sensors.samples import PositionPrior
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, bundle_rounds, local_windows
 from mapserver.survey.bundle.odometry_factors import blackout_factors, odometry_factors
 from mapserver.survey.given_poses import poses_as_odometry
@@ -25,12 +27,17 @@ ADJUSTED_SIGMA_RAD = 0.02  # of the rotation between adjusted keyframes, and bet
 
 @dataclass(frozen=True)
 class AdjustedChain:
-    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already."""
+    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already.
+
+    priors: what devices said of the robot's place, of its base. base_from_body (4, 4).
+    """
 
     odometry: OdometryPass
     state: SurveyState
     matched: set[tuple[int, int]]
     depths: MonoDepths | None
+    priors: Sequence[PositionPrior]
+    base_from_body: Array
 
 
 def begun_chain(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
@@ -67,7 +74,7 @@ def adjusted_chain(
     else:
         state = local_windows(state, settings)
     odometry = with_depths(odometry, state, depths)
-    return AdjustedChain(odometry, state, matched, depths)
+    return AdjustedChain(odometry, state, matched, depths, inputs.priors, inputs.calibration.base_from_body)
 
 
 def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:

@@ -37,6 +37,7 @@ from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, 
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
+from mapserver.survey.pose_graph.position_priors import learn_priors
 from mapserver.survey.segments.segmented import begun_in_segments
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
@@ -98,7 +99,7 @@ def finish_survey(chain: AdjustedChain, options: SurveyConfig, tools: SurveyTool
     """The stages from the loops on."""
     settings = options.settings
     odometry, depths = chain.odometry, chain.depths
-    state, loops = _close_loops(odometry, chain.state, chain.matched, options, tools)
+    state, loops = _close_loops(chain, options, tools)
     # Neighbours need not be matched again. Of one camera they are, as depths by which they were matched have changed.
     known: _Known = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
     # The landmarks so far are those of neighbours; all are made anew, and nobody may hold the old ones meanwhile.
@@ -133,17 +134,18 @@ def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
     return SigmaBetween(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
 
 
-def _close_loops(
-    odometry: OdometryPass, state: SurveyState, matched: set[tuple[int, int]], options: SurveyConfig, tools: SurveyTools
-) -> tuple[SurveyState, Loops]:
-    """Finds loops; the keyframes are then where the pose graph with them says."""
+def _close_loops(begun: AdjustedChain, options: SurveyConfig, tools: SurveyTools) -> tuple[SurveyState, Loops]:
+    """Finds loops; the keyframes are then where the pose graph with them says. Position priors are known to the gate alone."""
+    odometry, state = begun.odometry, begun.state
     chain, scale_walk = chain_edges(odometry, state), options.settings.monocular.scale_walk
     kind, known = LoopCloser, chain
     if not odometry.scale_known:
         kind, known = Sim3LoopCloser, gate_covariances(chain, scale_walk)
     marginals = GraphMarginals(state.map_from_body, known)
+    if odometry.scale_known:
+        learn_priors(marginals, begun.priors, begun.base_from_body, odometry)
     parts = find_parts(covisibility_of(state), _sigmas_m(odometry), options.settings.join_sigma_m)
-    closer = kind(posed_keyframes(odometry, state), options, marginals, matched, tools.executor.nearby, parts)
+    closer = kind(posed_keyframes(odometry, state), options, marginals, begun.matched, tools.executor.nearby, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
         tools.at("loops", i + 1, len(odometry.keyframes))

@@ -7,7 +7,7 @@ from typing import Protocol
 from fleetmap.bow import Vocabulary
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, Trajectory, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
@@ -34,7 +34,7 @@ class FrameParts(Protocol):
 
 @dataclass(frozen=True)
 class SurveyInputs:
-    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration.
+    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration, position priors.
 
     initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry. parts: the same frames in
     parts, None where they come only once. keyframes_at: frames that become keyframes whatever they show.
@@ -49,6 +49,7 @@ class SurveyInputs:
     initial_trajectory: Trajectory | None = None
     parts: FrameParts | None = None
     keyframes_at: frozenset[int] = frozenset()
+    priors: Sequence[PositionPrior] = ()
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
@@ -32,6 +33,7 @@ _SHARED_SHARE = 0.4
 _MIN_BLOCKS = 8  # of a metre and a half: two walls of three by three metres
 _MOST_PLACES, _MOST_LOOKS = 4, 240  # alignments that are compared, keyframes that look
 _SAME_PLACE_M = 1.2
+_BESIDE_M, _BESIDE_COSINE = 2.0, 0.8  # from a place of the map, and between both ways of looking, to be found there
 _PRIOR_M = 3.0  # within which an alignment is where position priors put the session
 
 
@@ -119,7 +121,7 @@ class JoinTest:
     def locate(self) -> Located | NotJoined:
         """Where the session is, if fixes say so and nowhere else looks alike. The map's confirmation there is not judged yet."""
         visit, settings = self._visit, self._settings
-        ks = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // settings.fix_keyframes)))
+        ks = self._chosen_keyframes(settings.fix_keyframes)
         fixes = find_fixes(self._relocalizer, visit.keyframes, ks, visit.body_from_cam)
         if visit.map_from_survey is not None:
             expected = {k: visit.map_from_survey @ visit.survey_from_body[k] for k in ks}
@@ -135,12 +137,35 @@ class JoinTest:
                 "that are in the map, the same way round",
                 evidence=JoinEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
             )
-        return self._chosen([self._located(placed) for placed in enough[:_MOST_PLACES]])
+        # Where priors put it there may be few fixes: most of it is new, and a look-alike of what the map has has more.
+        ranked = sorted(enough, key=lambda placed: not self._is_where_priors_say(placed))
+        return self._chosen([self._located(placed) for placed in ranked[:_MOST_PLACES]])
+
+    def _chosen_keyframes(self, most: int) -> list[int]:
+        """Keyframes spread over the session, and as many again of those that position priors put beside a place of the map."""
+        visit, places = self._visit, self._relocalizer.view.map_from_cam
+        spread = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // most)))
+        if visit.map_from_survey is None:
+            return list(spread)
+        expected = visit.map_from_survey @ visit.survey_from_body @ visit.body_from_cam
+        beside = [k for k, at in enumerate(expected) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
+        return sorted({*spread, *beside[:: max(1, -(-len(beside) // most))]})
+
+    def _is_where_priors_say(self, placed: Placed) -> bool:
+        visit = self._visit
+        if visit.map_from_survey is None:
+            return False
+        ks = [fix.k for fix in placed.fixes]
+        by_fixes, by_priors = (
+            placed.map_from_survey @ visit.survey_from_body[ks],
+            visit.map_from_survey @ visit.survey_from_body[ks],
+        )
+        return bool(np.median(np.linalg.norm((by_fixes - by_priors)[:, :3, 3], axis=1)) < _PRIOR_M)
 
     def confirmation(self, map_from_body: Array) -> Confirmation:
         """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4)."""
         visit, view = self._visit, self._relocalizer.view
-        ks = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // _MOST_LOOKS)))
+        ks = self._chosen_keyframes(_MOST_LOOKS)
         looks = [look(view, visit.camera, visit.keyframes[k], map_from_body[k] @ visit.body_from_cam) for k in ks]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
@@ -162,7 +187,7 @@ class JoinTest:
 
     def judged(self, located: Located, seen: Confirmation) -> NotJoined | None:
         """Why a session that sees so much of the map is not joined; None where it is."""
-        if seen.blocks >= _MIN_BLOCKS and seen.low > _SHARED_SHARE and seen.share >= _REMAINING_SHARE:
+        if _speaks_for_itself(seen):
             return None
         said = f"of {seen.cells} parts of the map that it should see there it sees {seen.seen}"
         evidence = self.evidence(located, seen)
@@ -202,6 +227,10 @@ class JoinTest:
         ]
         alike = [best, *(one for one in others if one.seen.high >= max(_SHARED_SHARE, best.seen.low))]
         near = [one for one in alike if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
+        if not near:  # of a drive that adds new aisles its own place shows less than a look-alike elsewhere
+            near = [one for one in others if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
+            near = [one for one in near if _speaks_for_itself(one.seen)]
+            alike = [best, *near] if len(near) == 1 else alike
         rival_share = max((round(one.seen.share, 4) for one in others), default=None)
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
@@ -226,6 +255,11 @@ class JoinTest:
                 evidence=self.evidence(chosen, chosen.seen),
             )
         return chosen
+
+
+def _speaks_for_itself(seen: Confirmation) -> bool:
+    """Whether more is seen, for sure, than another building would show, and half of the map or more."""
+    return seen.blocks >= _MIN_BLOCKS and seen.low > _SHARED_SHARE and seen.share >= _REMAINING_SHARE
 
 
 def contradicts(seen: Confirmation) -> bool:

@@ -64,7 +64,7 @@ def joined_chain(segments: Sequence[SegmentSurvey], cuts: tuple[Cut, ...], input
     odometry = replace(_joined_odometry(placed), cuts=cuts)
     state = _joined_state(placed, odometry, inputs)
     matched = {(i + each.first_keyframe, j + each.first_keyframe) for each in placed for i, j in each.made.matched}
-    return AdjustedChain(odometry, state, matched, None)
+    return AdjustedChain(odometry, state, matched, None, inputs.priors, inputs.calibration.base_from_body)
 
 
 def _placed(segments: Sequence[SegmentSurvey], *, level: bool) -> list[_Placed]:

@@ -145,3 +145,28 @@ def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
     assert np.linalg.norm((located.map_from_body - drive(40, start_m=6.0))[:10, :3, 3], axis=1).max() < 0.03
     said, _ = verdict(join_test(KNOWN, HOME, drive(5, start_m=6.0), None))
     assert said is JoinVerdict.UNDECIDED
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_speaks_for_itself(is_there: bool) -> None:
+    """A drive that adds an aisle like one of the map: the map has six metres of it, of which a fifth was restocked since, or all."""
+    twin = aisle(1, y_m=30.0)
+    rng = np.random.default_rng(8)
+    shelf = np.unique(np.floor(twin.points_map * 2.0).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    changed = (rng.random(shelf.max() + 1) < (0.2 if is_there else 1.0))[shelf]
+    before = repainted(twin, aisle(77), changed)
+    both = Aisle(
+        *(
+            np.concatenate(parts)
+            for parts in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (HOME, before)), strict=True)
+        )
+    )
+    known = relocalizer(both, np.concatenate([drive(56), drive(16, start_m=2.0, y_m=30.0)]))
+    places = drive(40, start_m=2.0, y_m=30.0)
+    said, located = verdict(join_test(known, twin, places, places[0]))
+    assert (said is JoinVerdict.JOINED) == is_there
+    if is_there:
+        assert isinstance(located, Located)
+        assert located.rival_share is not None
+        assert located.rival_share > located.seen.share
+        assert np.linalg.norm((located.map_from_body - places)[:12, :3, 3], axis=1).max() < 0.05

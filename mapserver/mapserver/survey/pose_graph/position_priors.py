@@ -1,0 +1,109 @@
+"""Position priors as edges of the loops' gate: what docks, tags and zones say of where keyframes lie to each other. Pure.
+
+A survey among like aisles is told from time to time where it is, to a metre. Its pose graph drifts by more than that; an aisle is 4.5 m
+wide. The gate therefore learns each prior against the first one that knows its heading. The map does not: its shape is what the sensors
+measured.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.sensors.samples import PositionPrior
+from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+
+_MAX_GAP_NS = 500_000_000  # between a prior and the frame that stands for its moment
+_HEADING_KNOWN_RAD = 0.2
+_UNKNOWN_VARIANCE = np.array([1.0] * 3 + [1e4] * 3)  # rad^2, m^2
+# What a floor's unevenness and a robot's tilt add to a prior (roll, pitch, yaw in rad; x, y, z in m), and carrying it to a keyframe.
+_BETWEEN = np.diag(np.square([0.05, 0.05, 0.0, 0.05, 0.05, 0.25]))
+
+
+def learn_priors(
+    marginals: GraphMarginals, priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass
+) -> int:
+    """Adds what position priors say to a graph of the odometry's keyframes; returns how many contradict it and were left out.
+
+    Without a prior that knows its heading nothing is added: positions alone do not say which way the survey looked.
+    """
+    usable = _usable(priors, odometry)
+    first = next((n for n, (prior, _) in enumerate(usable) if _knows_heading(prior)), None)
+    if first is None:
+        return 0
+    contradicting = 0
+    reference, frame = usable[first]
+    keyframe = _keyframe_at(frame, odometry)
+    map_from_i = reference.map_from_base @ base_from_body @ se3_inverse(_led(keyframe, frame, odometry))
+    for n, (prior, at) in enumerate(usable):
+        other = _keyframe_at(at, odometry)
+        if n == first or other == keyframe:
+            continue
+        led = _led(other, at, odometry)
+        edge = _edge(marginals, (keyframe, map_from_i, reference), (other, prior), led, base_from_body)
+        if marginals.innovation_squared(edge) <= CHI2_6_0999:
+            marginals.add(edge)
+        else:
+            contradicting += 1
+    return contradicting
+
+
+def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[tuple[PositionPrior, int]]:
+    """Priors of devices that know where they are in the plane, each with the frame nearest to its moment."""
+    stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
+    found = []
+    for prior in priors:
+        frame = int(np.argmin(np.abs(stamps_ns - prior.stamp_ns)))
+        is_near = abs(int(stamps_ns[frame]) - prior.stamp_ns) <= _MAX_GAP_NS
+        if is_near and not prior.is_revisable and np.isfinite(np.diag(prior.cov_rot_trans)[3:5]).all():
+            found.append((prior, frame))
+    return found
+
+
+def _knows_heading(prior: PositionPrior) -> bool:
+    return bool(prior.cov_rot_trans[2, 2] <= _HEADING_KNOWN_RAD**2)
+
+
+def _keyframe_at(frame: int, odometry: OdometryPass) -> int:
+    """The keyframe that is nearest to a frame."""
+    return int(np.argmin([abs(k.frame_index - frame) for k in odometry.keyframes]))
+
+
+def _led(keyframe: int, frame: int, odometry: OdometryPass) -> Array:
+    """keyframe_from_frame (4, 4) of the body, by odometry."""
+    first = odometry.odom_from_body[odometry.keyframes[keyframe].frame_index]
+    return np.asarray(se3_inverse(first) @ odometry.odom_from_body[frame])
+
+
+def _edge(
+    marginals: GraphMarginals,
+    known: tuple[int, Array, PositionPrior],
+    told: tuple[int, PositionPrior],
+    led: Array,
+    base_from_body: Array,
+) -> PoseEdge:
+    """Where a told keyframe lies to the known one. Its heading is the graph's own, of which the edge says nothing."""
+    (i, map_from_i, reference), (j, prior) = known, told
+    placed = marginals.map_from_body
+    turn_ij = placed[i, :3, :3].T @ placed[j, :3, :3]
+    turn_map_j = map_from_i[:3, :3] @ turn_ij
+    turn_map_base = turn_map_j @ led[:3, :3] @ base_from_body[:3, :3].T
+    body_m = prior.map_from_base[:3, 3] + turn_map_base @ base_from_body[:3, 3] - turn_map_j @ led[:3, 3]
+    i_from_j = se3(turn_ij, map_from_i[:3, :3].T @ (body_m - map_from_i[:3, 3]))
+    turned = np.kron(np.eye(2), map_from_i[:3, :3].T)
+    free = adjoint(i_from_j)[:, :3]  # any turn of j about itself
+    where = np.diag([0.0] * 3 + [1.0] * 3)  # of the told one only its place counts
+    covariance = turned @ (_finite(reference) + where @ _finite(prior) @ where + _BETWEEN) @ turned.T + free @ free.T
+    return PoseEdge(i, j, i_from_j, covariance, is_loop=True)
+
+
+def _finite(prior: PositionPrior) -> Array:
+    """Its covariance (6, 6) with large variances in the place of infinite ones, which are of nothing else."""
+    variances = np.diag(prior.cov_rot_trans)
+    finite = np.where(np.isfinite(prior.cov_rot_trans), prior.cov_rot_trans, 0.0)
+    unknown = ~np.isfinite(variances)
+    finite[unknown] = finite[:, unknown] = 0.0
+    finite[unknown, unknown] = _UNKNOWN_VARIANCE[unknown]
+    return finite
