@@ -42,7 +42,7 @@ _CORES = (2, 4, 8, 16, 32)
 _AHEAD = ("matching", "matching again")  # stages whose work goes to the executor, several batches ahead
 
 
-class _Traffic:
+class Traffic:
     """Pickles of the executor: how many left this process, and bytes both ways."""
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ def measure(drive: Path, keyframes: int, workers: int) -> dict[str, Any]:
 
 
 def _measure(drive: Path, keyframes: int, executor: Executor, client: Any) -> dict[str, Any]:
-    traffic, options = _Traffic(), SurveyConfig(SETTINGS, default_vocabulary())
+    traffic, options = Traffic(), SurveyConfig(SETTINGS, default_vocabulary())
     counted = SimpleNamespace(dumps=traffic.dumps, loads=traffic.loads)
     with ImageSpill(drive.parent) as store:
         survey = SimulatedSurvey.read(drive, keyframes, store)
