@@ -1,33 +1,30 @@
 """Solving the reduced system: dense where small, else by conjugate gradients, else by sparse factorisation."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
-import scipy.sparse.linalg
 
 from fleetmap.geometry import AnyArray, Array
 from mapserver.survey.bundle.reduced_system_kernels import (
+    BlockPlaces,
     ChainFactors,
-    Numbers,
     SystemArrays,
-    add_numbers,
     conjugate_gradients,
     factor_chains,
+    fill_blocks,
     fill_lower,
-    lay_out,
 )
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure
+from mapserver.survey.sparse_solver.block_cholesky import BlockCholesky
 
 
 @dataclass(frozen=True)
 class Chains:
     """The inertial edges' order: edge_slots (E, 2), -1 for held keyframes; sequence and link (P,) as in the kernels.
 
-    layouts: that of the sparse matrix, once it was asked for.
+    layouts: that of the sparse factor, once it was asked for.
     """
 
     edge_slots: AnyArray
@@ -131,55 +128,49 @@ def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
 
 
 def solve_sparse(system: ReducedSystem) -> Array | None:
-    """The step by sparse LU without pivoting, fill reduced by minimum degree."""
+    """The step by sparse Cholesky; what fills in is found once for all systems of the same structure."""
     layouts = system.chains.layouts
-    order = layouts[0].order if layouts else np.arange(system.rhs.size)
-    layout = layouts[0] if layouts else SparseLayout.of(system, order)
-    try:
-        factor = _factor(layout.matrix(system), "NATURAL" if layouts else "MMD_AT_PLUS_A")
-    except RuntimeError:  # exactly singular
-        return None
-    if not layouts:  # minimum degree is not asked again for systems of the same structure
-        layouts.append(SparseLayout.of(system, np.argsort(factor.perm_c)))
-    step = np.empty(system.rhs.size)
-    step[order] = factor.solve(system.rhs.ravel()[order])
-    return step.reshape(system.rhs.shape) if np.isfinite(step).all() else None
-
-
-def _factor(matrix: scipy.sparse.csc_array, order: Literal["NATURAL", "MMD_AT_PLUS_A"]) -> Any:
-    return scipy.sparse.linalg.splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    if not layouts:
+        layouts.append(SparseLayout.of(system))
+    factor = layouts[0].pattern.factorised(layouts[0].values(system))
+    return None if factor is None else factor.solve(system.rhs.ravel()).reshape(system.rhs.shape)
 
 
 @dataclass(frozen=True)
 class SparseLayout:
-    """Where a problem's numbers lie in the sparse matrix of each of its systems, unknowns in an order that fills in little.
+    """Where a problem's blocks lie in the sparse factor of each of its systems.
 
-    order (U,): the unknowns by their place in the matrix. below: image blocks beside the diagonal. target: to which of the matrix's
-    values each number of a system is added; indices, indptr as in a CSC matrix.
+    Poses and motions are blocks of their own, as images join poses alone.
     """
 
-    order: AnyArray
-    below: AnyArray
-    target: AnyArray
-    indices: AnyArray
-    indptr: AnyArray
+    pattern: BlockCholesky
+    places: BlockPlaces
 
     @classmethod
-    def of(cls, system: ReducedSystem, order: AnyArray) -> "SparseLayout":
+    def of(cls, system: ReducedSystem) -> "SparseLayout":
         """The layout of all systems with the structure of this one."""
-        s = system.structure
-        place = np.empty(system.rhs.size, np.int32)
-        place[order] = np.arange(len(place))
-        block_rows = np.repeat(np.arange(len(s.row_ptr) - 1, dtype=np.int32), np.diff(s.row_ptr))
-        below = np.flatnonzero(block_rows != s.cols)
-        edges = np.ascontiguousarray(system.chains.edge_slots, np.int64).reshape(-1, 2)
-        numbers = Numbers(block_rows, s.cols, below, edges, s.free.ravel(), place, system.rhs.shape[1])
-        indptr, indices, target = lay_out(numbers)
-        return cls(order, below, target, indices, indptr)
+        s, (count, size), width = system.structure, system.rhs.shape, system.blocks.shape[1]
+        parts = [width, size - width] if size > width else [width]
+        rows = np.repeat(np.arange(count), np.diff(s.row_ptr))
+        images = len(parts) * np.stack([rows, s.cols], axis=1)
+        edges = _edge_pairs(system.chains.edge_slots) if len(parts) == 2 else np.zeros((0, 10, 2), np.int64)
+        joined = edges[(edges >= 0).all(axis=2)]
+        pattern = BlockCholesky.of(np.tile(parts, count), np.concatenate([images, joined]))
+        edge_places = np.full((*edges.shape[:2], 3), -1)
+        edge_places[(edges >= 0).all(axis=2)] = pattern.places(*joined.T)
+        own = np.arange(len(parts) * count)
+        diagonal = pattern.places(own, own).reshape(count, len(parts), 3)
+        return cls(pattern, BlockPlaces(pattern.places(*images.T), edge_places, diagonal))
 
-    def matrix(self, system: ReducedSystem) -> scipy.sparse.csc_array:
-        """S with rows and columns in `order`; unknowns that are held have a one on the diagonal."""
-        damp = np.where(system.structure.free, system.damp, 1.0)
-        values = np.zeros(len(self.indices))
-        add_numbers(system.blocks, self.below, system.edge_blocks, damp, self.target, values)
-        return scipy.sparse.csc_array((values, self.indices, self.indptr), shape=(len(self.order),) * 2)
+    def values(self, system: ReducedSystem) -> Array:
+        """S as its factorisation takes it."""
+        values = np.zeros(self.pattern.size)
+        fill_blocks(system.arrays, self.places, values)
+        return values
+
+
+def _edge_pairs(edge_slots: AnyArray) -> AnyArray:
+    """(E, 10, 2) pairs of nodes, pose and motion of both ends, that an inertial edge joins; negative for held keyframes."""
+    slots = np.asarray(edge_slots, np.int64).reshape(-1, 2)
+    nodes = np.where(slots[:, :, None] < 0, -1, 2 * slots[:, :, None] + np.arange(2)).reshape(-1, 4)
+    return np.stack([nodes[:, [x, y]] for x in range(4) for y in range(x + 1)], axis=1)

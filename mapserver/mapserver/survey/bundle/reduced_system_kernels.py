@@ -40,6 +40,18 @@ class ChainFactors(NamedTuple):
     couplings: Array
 
 
+class BlockPlaces(NamedTuple):
+    """Where the blocks of S belong among the values of its sparse factor, as in BlockCholesky.places; -1 first for those of held keyframes.
+
+    images (B, 3); edges (E, 10, 3) of pairs of pose i, motion i, pose j and motion j, row by row of a lower triangle; diagonal (P, parts,
+    3) of poses, and of motions where there are any.
+    """
+
+    images: AnyArray
+    edges: AnyArray
+    diagonal: AnyArray
+
+
 @kernel
 def fill_lower(system: SystemArrays, lower: Array) -> None:
     """Adds S to the zeroed dense `lower` (PD, PD); only its lower triangle is complete."""
@@ -209,118 +221,42 @@ def conjugate_gradients(
     return -1
 
 
-class Numbers(NamedTuple):
-    """Where the numbers of a system come from, one after the other: image blocks, those `below` the diagonal mirrored, edges, diagonal.
-
-    block_rows, cols (B,) of the blocks; below (b,) which lie beside the diagonal; edge_slots (E, 2), -1 for held keyframes; free (U,);
-    place (U,) of each unknown in the matrix; size: unknowns of a slot.
-    """
-
-    block_rows: Indices
-    cols: Indices
-    below: AnyArray
-    edge_slots: AnyArray
-    free: Mask
-    place: Indices
-    size: int
+@kernel
+def fill_blocks(system: SystemArrays, places: BlockPlaces, values: Array) -> None:
+    """Adds S to the zeroed values of its sparse factor; unknowns that are held have a one on the diagonal."""
+    blocks, row_ptr, cols, edge_slots, edge_blocks, damp, free = system
+    images, edges, diagonal = places
+    (count, size), width = free.shape, blocks.shape[1]
+    for p in range(count):
+        for s in range(row_ptr[p], row_ptr[p + 1]):
+            first, down, right = images[s]
+            for a in range(width):
+                for b in range(width):
+                    if free[p, a] and free[cols[s], b]:
+                        values[first + a * down + b * right] += blocks[s, a, b]
+        for a in range(size):
+            part = 0 if a < width else 1
+            first, down, right = diagonal[p, part]
+            values[first + (a - part * width) * (down + right)] += damp[p, a] if free[p, a] else 1.0
+    for e in range(len(edge_slots)):
+        pair = 0
+        for x in range(4):
+            for y in range(x + 1):
+                first, down, right = edges[e, pair]
+                pair += 1
+                if first >= 0:
+                    _add_part(edge_blocks[e], free, edge_slots[e], (x, y), (first, down, right), values)
 
 
 @inner_kernel
-def _row_and_column(numbers: Numbers, n: int) -> tuple[int, int]:
-    """Where number n stands in the matrix, (-1, -1) for one of held unknowns; their diagonal stands."""
-    block_rows, cols, below, edge_slots, free, place, size = numbers
-    images, mirrored, along = 36 * len(block_rows), 36 * len(below), 900 * len(edge_slots)
-    if n < images:
-        s, entry = n // 36, n % 36
-        row, col = size * block_rows[s] + entry // 6, size * cols[s] + entry % 6
-    elif n < images + mirrored:
-        s, entry = below[(n - images) // 36], (n - images) % 36
-        row, col = size * cols[s] + entry % 6, size * block_rows[s] + entry // 6
-    elif n < images + mirrored + along:
-        e, entry = (n - images - mirrored) // 900, (n - images - mirrored) % 900
-        p, q = edge_slots[e, entry // 450], edge_slots[e, entry % 30 // 15]
-        if p < 0 or q < 0:
-            return -1, -1
-        row, col = size * p + entry // 30 % 15, size * q + entry % 15
-    else:
-        unknown = n - images - mirrored - along
-        return place[unknown], place[unknown]
-    if not (free[row] and free[col]):
-        return -1, -1
-    return place[row], place[col]
-
-
-@kernel
-def lay_out(numbers: Numbers) -> tuple[Indices, Indices, Indices]:
-    """indptr (U + 1,) and indices of the CSC matrix, and to which of its values each number is added, -1 for none.
-
-    The first number of each value has -2 less that place: it is added last, to what the others sum up to.
-    """
-    count = len(numbers.place)
-    total = 36 * (len(numbers.block_rows) + len(numbers.below)) + 900 * len(numbers.edge_slots) + count
-    starts = np.zeros(count + 1, np.int64)
-    for n in range(total):
-        _, col = _row_and_column(numbers, n)
-        if col >= 0:
-            starts[col + 1] += 1
-    starts = np.cumsum(starts)
-    by_column, filled = np.empty(starts[count], np.int32), starts[:count].copy()
-    for n in range(total):
-        _, col = _row_and_column(numbers, n)
-        if col >= 0:
-            by_column[filled[col]] = n
-            filled[col] += 1
-    indptr, indices = np.zeros(count + 1, np.int32), np.empty(len(by_column), np.int32)
-    target, marked = np.full(total, -1, np.int32), np.full(count, -1, np.int32)
-    at, found = np.empty(count, np.int32), np.empty(count, np.int32)
-    for col in range(count):
-        size = 0
-        for number in by_column[starts[col] : starts[col + 1]]:
-            row, _ = _row_and_column(numbers, number)
-            if marked[row] != col:
-                marked[row] = col
-                found[size] = row
-                size += 1
-        first = indptr[col]
-        indptr[col + 1] = first + size
-        indices[first : first + size] = np.sort(found[:size])
-        for k in range(first, first + size):
-            at[indices[k]] = -2 - k
-        for number in by_column[starts[col] : starts[col + 1]]:
-            row, _ = _row_and_column(numbers, number)
-            target[number] = at[row]
-            if at[row] < 0:
-                at[row] = -2 - at[row]
-    return indptr, indices[: indptr[count]].copy(), target
-
-
-@inner_kernel
-def _add(number: float, target: int, is_first: bool, values: Array) -> None:
-    place = -2 - target if is_first else target
-    if place >= 0:
-        values[place] += number
-
-
-@kernel
-def add_numbers(
-    blocks: Array, below: AnyArray, edge_blocks: Array, damp: Array, target: Indices, values: Array
+def _add_part(
+    block: Array, free: Mask, slots: AnyArray, part: tuple[int, int], place: tuple[int, int, int], values: Array
 ) -> None:
-    """Adds the numbers of a system, in the order of `Numbers`, to the matrix's zeroed values."""
-    for is_first in (False, True):
-        n = 0
-        for s in range(len(blocks)):
-            for entry in range(36):
-                _add(blocks[s, entry // 6, entry % 6], target[n + entry], is_first, values)
-            n += 36
-        for s in below:
-            for entry in range(36):
-                _add(blocks[s, entry // 6, entry % 6], target[n + entry], is_first, values)
-            n += 36
-        for e in range(len(edge_blocks)):
-            for entry in range(900):
-                _add(edge_blocks[e, entry // 30, entry % 30], target[n + entry], is_first, values)
-            n += 900
-        for p in range(len(damp)):
-            for a in range(damp.shape[1]):
-                _add(damp[p, a], target[n + a], is_first, values)
-            n += damp.shape[1]
+    """Adds what a (30, 30) block says of two of its four parts, the pose and the motion of either end."""
+    (x, y), (first, down, right) = part, place
+    above, left = 6 * (x % 2), 6 * (y % 2)
+    for a in range(above, 15 if x % 2 else 6):
+        for b in range(left, 15 if y % 2 else 6):
+            if free[slots[x // 2], a] and free[slots[y // 2], b]:
+                to = first + (a - above) * down + (b - left) * right
+                values[to] += block[15 * (x // 2) + a, 15 * (y // 2) + b]

@@ -12,7 +12,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
     keyframe_covariances,
 )
 from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
-from mapserver.survey.bundle.reduced_system import SparseLayout, dense_lower, solve_dense, solve_pcg, solve_sparse
+from mapserver.survey.bundle.reduced_system import dense_lower, solve_dense, solve_pcg, solve_sparse
 from mapserver.survey.bundle.settings import BundleSettings
 from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
 
@@ -117,19 +117,6 @@ def test_solvers_agree(inertial: bool) -> None:
     np.testing.assert_allclose(sparse, dense, atol=1e-8 * np.abs(dense).max())
     np.testing.assert_allclose(iterated, dense, atol=1e-6 * np.abs(dense).max())
     assert (dense[~system.structure.free] == 0).all()
-
-
-@pytest.mark.parametrize("inertial", [False, True])
-def test_sparse_matrix_in_any_order(inertial: bool) -> None:
-    bundle = Bundle(_problem(inertial=inertial), NO_ROBUSTNESS)
-    bundle.linearise()
-    system = bundle.reduced(1e-3)
-    whole = dense_lower(system)
-    whole = np.triu(whole) + np.triu(whole, 1).T
-    order = np.random.default_rng(1).permutation(len(whole))
-    sparse = SparseLayout.of(system, order).matrix(system)
-    assert sparse.has_canonical_format
-    np.testing.assert_allclose(sparse.toarray(), whole[np.ix_(order, order)], rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("inertial", [False, True])

@@ -1,0 +1,1 @@
+"""Cholesky factorisation of large sparse matrices of poses."""
