@@ -70,7 +70,9 @@ def adjusted_chain(
     tools.at("local adjustment", 0, 1)
     if state.motion.inertial:
         # All at once: windows hold what came before them, and so lose the direction that odometry has from the gyro.
-        state = bundle_rounds(state, settings, rounds=2)
+        held = [state]
+        del state  # or its observations would be in memory twice
+        state = bundle_rounds(held.pop(), settings, rounds=2)
     else:
         state = local_windows(state, settings)
     odometry = with_depths(odometry, state, depths)

@@ -201,10 +201,10 @@ def _adjust_globally(
             del tracks
         else:  # a second search finds hardly a match more; its coordinates are finer
             landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
-        state = replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))
-        del landmarks
+        held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))]
+        del landmarks, state  # or observations would be in memory twice
         tools.release()
-        state = adjust_visits(state, settings, redundant, rounds=3 if search else 2)
+        state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
         if round_number == 0:
             yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
     return odometry, state, yaw

@@ -82,7 +82,8 @@ def bundle_rounds(
     """The adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
 
     final: near the optimum; the last round takes the redescending cost of `final_bundle` with the noise that the others left
-    over. Inertial factors: Forster et al. 2017.
+    over. Inertial factors: Forster et al. 2017. A site's observations are as large as all else: who wants none twice in memory holds no
+    `state` of its own meanwhile.
     """
     for round_number in range(rounds):
         last = round_number + 1 == rounds
@@ -97,6 +98,7 @@ def bundle_rounds(
             if free is not None:
                 keep |= ~np.isin(state.landmarks.obs_keyframe, np.flatnonzero(free))
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
+        del problem, result  # and with them the observations that were dropped
     return state
 
 

@@ -75,7 +75,9 @@ def adjust_visits(
 ) -> SurveyState:
     """Final adjustment of all keyframes but redundant ones (K,), which are then localized among its landmarks."""
     if not redundant.any():
-        return bundle_rounds(state, settings, rounds=rounds, final=True)
+        held = [state]
+        del state  # or its observations would be in memory twice
+        return bundle_rounds(held.pop(), settings, rounds=rounds, final=True)
     part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
     numbers = np.flatnonzero(~redundant)
     seen = _seen_by(redundant, state.landmarks, part.landmarks, numbers)

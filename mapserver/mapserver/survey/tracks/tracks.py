@@ -20,6 +20,7 @@ from mapserver.survey.tracks.tracks_kernels import join as join_kernel
 _SAME_WARP = (
     0.01  # change of a patch's shape that moves its rim by less than a twentieth of a pixel, to all sides alike
 )
+_ROWS = 2**18  # observations whose warps are compared at once
 _BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
 
 
@@ -139,14 +140,14 @@ def refine_observations(
     before: map_from_cam (K, 4, 4) at which they were observed.
     """
     table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
-    turned, scaled = (
-        now - then
-        for now, then in zip(
-            _warps(table, marks.points_map, posed.map_from_cam), _warps(table, marks.points_map, before), strict=True
-        )
-    )
     anew = np.zeros(len(marks.points_map), bool)
-    anew[table[np.abs(turned).max(axis=(1, 2)) + np.abs(scaled) > _SAME_WARP, 1]] = True
+    reference = table[np.maximum.accumulate(np.where(_is_first(table), np.arange(len(table)), 0)), 0]
+    for start in range(0, len(table), _ROWS):  # rotations of a site's observations would be gigabytes
+        part = slice(start, start + _ROWS)
+        points, seen = marks.points_map[table[part, 1]], (table[part, 0], reference[part])
+        now, then = _warps(seen, points, posed.map_from_cam), _warps(seen, points, before)
+        changed = np.abs(now[0] - then[0]).max(axis=(1, 2)) + np.abs(now[1] - then[1]) > _SAME_WARP
+        anew[table[part, 1][changed]] = True
     rows = np.flatnonzero(anew[table[:, 1]])
     pixels, sigmas = marks.obs_pixels.copy(), marks.obs_sigma_px.copy()
     if len(rows):
@@ -154,12 +155,16 @@ def refine_observations(
     return replace(marks, obs_pixels=pixels, obs_sigma_px=sigmas)
 
 
-def _warps(table: NDArray[np.int64], points_map: Array, map_from_cam: Array) -> tuple[Array, Array]:
-    """Rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of how much farther it is than from there."""
-    own, cam_from_map = table[:, 0], se3_inverse(map_from_cam)
-    reference = own[np.maximum.accumulate(np.where(_is_first(table), np.arange(len(table)), 0))]
-    points = points_map[table[:, 1]]
-    depths = [np.einsum("mi,mi->m", cam_from_map[k, 2, :3], points) + cam_from_map[k, 2, 3] for k in (own, reference)]
+def _warps(
+    seen: tuple[NDArray[np.int64], NDArray[np.int64]], points_map: Array, map_from_cam: Array
+) -> tuple[Array, Array]:
+    """Rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of how much farther it is than from there.
+
+    seen: the keyframe (M,) of each observation and that of its reference. points_map (M, 3) of their landmarks.
+    """
+    own, reference = seen
+    cam_from_map = se3_inverse(map_from_cam)
+    depths = [np.einsum("mi,mi->m", cam_from_map[k, 2, :3], points_map) + cam_from_map[k, 2, 3] for k in seen]
     scale = np.log(np.maximum(depths[0], 1e-6) / np.maximum(depths[1], 1e-6))
     return np.asarray(cam_from_map[own, :3, :3] @ map_from_cam[reference, :3, :3]), np.asarray(scale)
 
