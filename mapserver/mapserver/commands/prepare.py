@@ -22,6 +22,7 @@ def prepare() -> None:
 def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
     """Surveys of a painted room, each with what it adds to those before it."""
     import io
+    import math
     from contextlib import redirect_stderr
 
     import cv2
@@ -53,10 +54,10 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
 
     def build_as_large() -> None:
         settings = survey_settings(None, SensorSet.STEREO)
-        solvers = ("bundle", "rough_bundle", "final_bundle")
+        iterated_and_factorised = {"bundle": 0.0, "rough_bundle": 0.0, "final_bundle": math.inf}
         large = {
-            name: msgspec.structs.replace(getattr(settings, name), dense_unknowns=0, sparse_couplings=0.0)
-            for name in solvers
+            name: msgspec.structs.replace(getattr(settings, name), dense_unknowns=0, sparse_couplings=couplings)
+            for name, couplings in iterated_and_factorised.items()
         }
         build("large", SensorSet.STEREO, msgspec.structs.replace(settings, **large))
 

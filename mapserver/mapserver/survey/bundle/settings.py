@@ -15,6 +15,6 @@ class BundleSettings(Section, frozen=True):
     relative_cost_tolerance: float = 1e-4  # relative gain of the last step
     dense_unknowns: int = 700  # reduced systems up to this size are solved by dense Cholesky
     # For each keyframe; up to so many sparse factorisation is quicker than conjugate gradients.
-    sparse_couplings: float = 40.0
+    sparse_couplings: float = 100.0
     pcg_tolerance: float = 1e-4  # relative residual at the end
     pcg_max_iterations: int = 300  # then the step is solved again by sparse factorisation
