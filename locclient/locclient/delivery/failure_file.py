@@ -35,12 +35,12 @@ from locclient.localization.calibration.parameters import CalibrationState
 from locclient.localization.image_quality import ImageQuality
 from locclient.localization.localizer_state import LocalizerState
 from locclient.localization.settings import LocalizerSettings
-from locclient.robot.failure_report import RobotProfile
+from locclient.robot.failure_report import RobotProfile, without_detail
 from locclient.robot.failure_ring import FailureCut, KeptFrame, KeptQuery, Said, Segment, UsedMap
 
 PICTURES = ("full", "blurred")
 _FORMAT = 1
-_WIDTH_PX, _BLURRED_PX = 320, 32  # of pictures, and of what is left of blurred ones
+_WIDTH_PX = 320  # of pictures
 _QUALITIES, _PICTURE_BYTES = (70, 50, 30), 24 << 10
 _MAX_UNPACKED_BYTES = 64 << 20
 _ARRAYS = ("<f8", "<f4", "<i8", "<u8", "<u4", "|u1", "|i1", "|b1")
@@ -271,10 +271,7 @@ def _jpeg(image: Image, pictures: str) -> StoredImage:
     size = image.shape[1] // step, image.shape[0] // step
     small = cv2.resize(image[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
     if pictures == "blurred":
-        coarse = _BLURRED_PX, max(1, round(_BLURRED_PX * size[1] / size[0]))
-        small = cv2.resize(
-            cv2.resize(small, coarse, interpolation=cv2.INTER_AREA), size, interpolation=cv2.INTER_LINEAR
-        )
+        small = without_detail(np.asarray(small, np.uint8))
     data = b""
     for quality in _QUALITIES:
         data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

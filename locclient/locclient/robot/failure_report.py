@@ -24,6 +24,7 @@ Canvas = NDArray[np.uint8]
 Matches = tuple[Array, Array, NDArray[np.int64]]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
 _LETTERS = 0.55  # size of the title, where it fits
+_COARSE_PX = 32  # what is left of a blurred picture's width
 _WINDOW_PX = 25.0  # the place may be off: the view shows whether anything would match nearby
 
 
@@ -68,6 +69,14 @@ def match_view(left: Image, matches: Matches, title: str) -> Canvas:
     return np.vstack([head, np.hstack([seen, told])])
 
 
+def without_detail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image (H, W) as 32 pixels of its width show it, in the size that it had: places of light and dark, no faces and no words."""
+    height_px, width_px = image.shape
+    coarse = _COARSE_PX, max(1, round(_COARSE_PX * height_px / width_px))
+    few = cv2.resize(image, coarse, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(few, (width_px, height_px), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
 def small_jpeg(image: NDArray[np.uint8], width_px: int, max_bytes: int) -> bytes:
     """JPEG of an image (H, W) or (H, W, 3), not wider than width_px; quality gives way to max_bytes, then size does."""
     while True:
@@ -91,7 +100,7 @@ _MATCHES_WIDTH_PX = 800
 @dataclass(frozen=True)
 class RobotProfile:
     """What is the same in all reports of a robot: names of its site and itself, mounting, rectified camera, settings, noise and clock of
-    the IMU."""
+    the IMU, and whether its pictures are blurred before anybody else sees them."""
 
     site: str
     robot: str
@@ -101,6 +110,7 @@ class RobotProfile:
     settings: LocalizerSettings
     imu: ImuNoise | None = None
     imu_minus_cam_s: float = 0.0
+    is_blurred: bool = False
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
@@ -140,7 +150,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         fixes=failure.fixes,
         calibration=failure.estimate.calibration.text[:2000],
         camera=_camera(profile),
-        thumbnails=_thumbnails(context, matches, cause),
+        thumbnails=_thumbnails(context, profile, matches, cause),
     )
 
 
@@ -182,12 +192,16 @@ def _has_map_changed(context: FailureContext, profile: RobotProfile, expected: i
     return usual >= 2 * profile.settings.fix.min_inliers and seen < 0.5 * usual
 
 
-def _thumbnails(context: FailureContext, matches: Matches | None, cause: Cause) -> tuple[Thumbnail, ...]:
+def _thumbnails(
+    context: FailureContext, profile: RobotProfile, matches: Matches | None, cause: Cause
+) -> tuple[Thumbnail, ...]:
     unmatched, running = context.unmatched, context.running
-    made = [_thumbnail(stamp_ns, "frame", left, PICTURE_WIDTH_PX) for stamp_ns, left in context.onset.pictures]
+    may_show = without_detail if profile.is_blurred else np.asarray
+    pictures = context.onset.pictures
+    made = [_thumbnail(stamp_ns, "frame", may_show(left), PICTURE_WIDTH_PX) for stamp_ns, left in pictures]
     if matches is not None and running is not None:
         title = f"{context.failure.kind}, {cause}, version {running.version}"
-        drawn = match_view(unmatched.left, matches, title)
+        drawn = match_view(may_show(unmatched.left), matches, title)
         made.append(_thumbnail(unmatched.stamp_ns, "matches", drawn, _MATCHES_WIDTH_PX))
     return tuple(made)
 

@@ -1,6 +1,7 @@
 """The report of a failure: numbers, small pictures, and what the map expected beside what was seen."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_mes
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from locclient.delivery.report_delivery import write_failure
-from locclient.robot.failure_report import expected_matches, match_view, small_jpeg
+from locclient.robot.failure_report import expected_matches, match_view, small_jpeg, without_detail
 from locclient.robot.jit_warmup import warm_up_kernels
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
@@ -26,6 +27,20 @@ def frame(index: int) -> RectifiedFrame:
 
 def green(picture: np.ndarray) -> int:
     return int(((picture[..., 1] > 180) & (picture[..., 0] < 100) & (picture[..., 2] < 100)).sum())
+
+
+def grey(jpeg: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def is_like(jpeg: bytes, left: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the picture under what is drawn over a match view is rather `left` than `other`."""
+    view = grey(jpeg)
+    under = view[-(view.shape[1] // 2) * left.shape[0] // left.shape[1] :, : view.shape[1] // 2]
+    far = [
+        np.median(np.abs(under - cv2.resize(np.asarray(each, np.float64), under.shape[::-1]))) for each in (left, other)
+    ]
+    return bool(far[0] < far[1])
 
 
 def test_the_match_view_tells_the_right_place_from_a_wrong_one() -> None:
@@ -86,6 +101,17 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     )
     assert len(encode_message(report.camera)) < 256
     assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
+    left = frame(60).left
+    bright = replace(told[0], unmatched=replace(told[0].unmatched, left=left))
+    sharp, blurred = (
+        failure_report(bright, replace(profile, is_blurred=blur), report_id="ab" * 16, wall_ns=7).thumbnails
+        for blur in (False, True)
+    )
+    assert [each.stamp_ns for each in blurred] == [each.stamp_ns for each in sharp]
+    edges = [cv2.Laplacian(grey(each[0].jpeg), cv2.CV_64F).var() for each in (sharp, blurred)]
+    assert edges[1] < 0.1 * edges[0]
+    assert is_like(sharp[3].jpeg, left, without_detail(left))
+    assert is_like(blurred[3].jpeg, without_detail(left), left)
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())
     assert written["cause"] == "dark"
     assert all((tmp_path / "failures" / name).stat().st_size > 100 for name in written["thumbnails"])
