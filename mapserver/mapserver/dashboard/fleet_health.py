@@ -12,13 +12,14 @@ from fleetmap.failure_summary import FailureSummary, decode_summary
 from mapserver.dashboard.fleet_parts import Trial, trial_of
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, TileConcern
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore, TraceRow
 
 _log = logging.getLogger(__name__)
-DAY_H = 24
+DAY_H, WEEK_H = 24, 7 * 24
 DAYS_SHOWN = 14
 FAILURES_SHOWN = 50
 _CACHED_NS = 5_000_000_000
@@ -31,7 +32,8 @@ _PLACES = 5000
 class SiteHealth:
     """A site's figures. day: the last 24 h; week: the 7 days before; days: rates of 24 h each, oldest first, the last ends now.
 
-    robots: each one's figures of the last 24 h. trend: how day compares with week, in words.
+    robots: each one's figures of the last 24 h. trend: how day compares with week, in words. areas: the last 7 days beside the 7 before
+    them by named area, or by tile where has_areas says that none is named; week_since_ns: when those 7 days began.
     """
 
     day: Kpis
@@ -41,6 +43,9 @@ class SiteHealth:
     robots: Mapping[str, Kpis]
     trials: tuple[Trial, ...]
     resurvey: tuple[TileConcern, ...]
+    areas: tuple[AreaTrend, ...]
+    has_areas: bool
+    week_since_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +134,7 @@ class HealthData:
         days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
         week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
         robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
+        has_areas = bool(self._store.areas(site))
         return SiteHealth(
             kpis(days[-1]),
             kpis(week),
@@ -137,7 +143,20 @@ class HealthData:
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
             self._trials(site, now_ns),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
+            tuple(self._area_trends(site, "area" if has_areas else "tile", next_hour)),
+            has_areas,
+            (next_hour - WEEK_H) * HOUR_NS,
         )
+
+    def _area_trends(self, site: str, axis: str, next_hour: int) -> list[AreaTrend]:
+        now, before = (
+            {key: counts for (_, key), counts in self._store.fleet.counters(site, axis, **hours).items()}
+            for hours in (
+                {"since_hour": next_hour - WEEK_H, "until_hour": next_hour},
+                {"since_hour": next_hour - 2 * WEEK_H, "until_hour": next_hour - WEEK_H},
+            )
+        )
+        return area_trends(now, before)
 
     def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
         rows = self._store.canaries(site)

@@ -1,4 +1,4 @@
-"""Parts of the fleet page and of the shift leader's page: figures, trials, failure rates, tiles to survey again."""
+"""Parts of the fleet page and of the shift leader's page: figures, trials, failure rates, what got worse, tiles to survey again."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -8,10 +8,12 @@ from markupsafe import Markup
 from mapserver.dashboard import bar_chart
 from mapserver.dashboard.bar_chart import Bar
 from mapserver.dashboard.markup import badge, joined, link, share, table
+from mapserver.fleet_statistics.area_trend import AreaTrend, Verdict, trend_sentence
 from mapserver.fleet_statistics.canary_test import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.resurvey_test import TileConcern
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
+from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.store import CanaryRow
 
 _TRIAL_WORDS = {
@@ -20,6 +22,13 @@ _TRIAL_WORDS = {
     "rolled_back": ("bad", "was tried by {share} of the robots and rolled back at {when}"),
     "stopped": ("warn", "was tried by {share} of the robots until the trial was stopped at {when}"),
 }
+_TREND_TONES: dict[Verdict, str] = {
+    "worse": "bad",
+    "better": "good",
+    "no clear change": "quiet",
+    "too little driving to say": "quiet",
+}
+_TRENDS_SHOWN = 20
 
 
 class Figure(NamedTuple):
@@ -107,6 +116,50 @@ def rates(found: list[Bar], remark: str) -> Markup:
         '<h2>Failures per robot-day</h2>{}<p class="quiet">A robot-day is 16 hours of driving. The thin line is the 95 % interval of '
         "the true rate; periods with little driving have no bar. {}</p>"
     ).format(bar_chart.bars(found, "Failures per robot-day"), remark)
+
+
+def worse_sentence(trends: Sequence[AreaTrend]) -> Markup:
+    """Which areas got worse this week, with a link to the table that says by how much."""
+    if not trends:
+        return Markup("")
+    return Markup('<p class="week">This week: {}. <a href="#worse">Area by area</a></p>').format(
+        trend_sentence(list(trends))
+    )
+
+
+def got_worse(trends: Sequence[AreaTrend], area_address: Callable[[str], str], *, has_areas: bool) -> Markup:
+    """Areas of the last 7 days beside the 7 days before. has_areas: they have names, else they are tiles."""
+    head = (
+        "Area" if has_areas else "Tile", "Against the week before", "How often robots fail there now",
+        "Failures per robot-day, 7 days", "7 days before", "Localised while driving", "7 days before",
+    )  # fmt: skip
+    rows = [
+        (
+            trend.name if trend.name == OUTSIDE else link(area_address(trend.name), trend.name),
+            badge(_TREND_TONES[trend.verdict], trend.verdict),
+            trend.times_words,
+            _counted(trend.now),
+            _counted(trend.before),
+            share(trend.localised_now),
+            share(trend.localised_before),
+        )
+        for trend in trends[:_TRENDS_SHOWN]
+    ]
+    listed = table(head, rows, empty="Nothing was driven in these two weeks.", name="What got worse this week")
+    more = f" {len(trends) - _TRENDS_SHOWN} more are not shown." if len(trends) > _TRENDS_SHOWN else ""
+    named = "" if has_areas else " No area is named here; `mapserver areas` names them."
+    remark = (
+        "The last 7 days beside the 7 before. Worse and better are beyond chance: the intervals of how often hold all true values "
+        f"together with 95 %.{named}{more}"
+    )
+    answer = f"{trend_sentence(list(trends))}." if trends else ""
+    return Markup('<h2 id="worse">What got worse this week</h2><p>{}</p>{}<p class="quiet">{}</p>').format(
+        answer, listed, remark
+    )
+
+
+def _counted(found: Rate) -> str:
+    return f"{format_rate(found)}: {found.events} in {driven_words(found.robot_days)}"
 
 
 def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str] | None = None) -> Markup:

@@ -81,9 +81,10 @@ class PageContext:
 
     def range_fields(self) -> Markup:
         """Fields to choose that range by."""
-        return time_fields(*("" if ns is None else self._written(ns) for ns in self.time_range()))
+        return time_fields(*("" if ns is None else self.written(ns) for ns in self.time_range()))
 
-    def _written(self, stamp_ns: int) -> str:
+    def written(self, stamp_ns: int) -> str:
+        """A stamp as `since` and `until` of an address take it, to the minute."""
         return f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC).astimezone(self.zone):%Y-%m-%dT%H:%M}"
 
     def to(self, path: str, **query: object) -> str:

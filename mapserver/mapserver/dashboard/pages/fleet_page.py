@@ -52,9 +52,11 @@ def install(services: Services) -> None:
             areas = await load(services.maps.areas, context.site)
             html(Markup("<h1>Robots of {}</h1>").format(context.site))
             attention = html(_attention(context, live, areas))
+            week = html(fleet_parts.worse_sentence(health.areas))
             trials = html(fleet_parts.trial_notices(health.trials, context.moment))
             drawn = await _map(services, context, live)
             figures = html(_figures(live, health))
+            worse = html(_worse(context, health))
             chart = html(_rates(health))
             robots = _table(context, live, health)
             calibrations = html(fleet_parts.calibrations(_calibrations(live)))
@@ -75,6 +77,8 @@ def install(services: Services) -> None:
                 rows = _rows(context, live, health)
                 if rows != robots.rows:
                     robots.rows = rows
+                week.set_content(str(fleet_parts.worse_sentence(health.areas)))
+                worse.set_content(str(_worse(context, health)))
                 chart.set_content(str(_rates(health)))
                 calibrations.set_content(str(fleet_parts.calibrations(_calibrations(live))))
 
@@ -185,6 +189,14 @@ def _legend() -> Markup:
     entry = Markup('<span class="{0}"><i class="{1}"></i>{2}</span>')
     return Markup('<div class="legend">{}</div>').format(
         joined(entry.format(tone, _SHAPES[tone], words) for tone, words in _TONE_WORDS.items())
+    )
+
+
+def _worse(context: PageContext, health: SiteHealth) -> Markup:
+    """Area by area the last week beside the one before, each with its failures of this week."""
+    axis, since = ("area" if health.has_areas else "tile"), context.written(health.week_since_ns)
+    return fleet_parts.got_worse(
+        health.areas, lambda name: context.to("failures", **{axis: name, "since": since}), has_areas=health.has_areas
     )
 
 

@@ -1,0 +1,86 @@
+"""Which areas got worse: failures of a week beside those of the week before, area by area. Pure."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy.special import betaincinv
+
+from mapserver.fleet_statistics.kpis import Counters, Rate, figure, is_telling, kpis, rate
+
+Verdict = Literal["worse", "better", "no clear change", "too little driving to say"]
+_CONFIDENCE_TAIL = 0.05
+_ORDER: dict[Verdict, int] = {"worse": 0, "no clear change": 1, "better": 2, "too little driving to say": 3}
+
+
+@dataclass(frozen=True, slots=True)
+class AreaTrend:
+    """An area now and before. low, high: how many times as often robots fail there now; high None where it has no bound.
+
+    localised_*: share of the driving time in which robots were localised, None where nothing is known of it.
+    """
+
+    name: str
+    verdict: Verdict
+    now: Rate
+    before: Rate
+    low: float | None
+    high: float | None
+    localised_now: float | None
+    localised_before: float | None
+
+    @property
+    def times_words(self) -> str:
+        """How many times as often, in words; a dash where too little was driven."""
+        if self.low is None:
+            return "–"
+        if self.high is None:
+            return f"at least {figure(self.low)} times" if self.low > 0 else "any"
+        return f"{figure(self.low)} to {figure(self.high)} times"
+
+
+def area_trends(now: Mapping[str, Counters], before: Mapping[str, Counters]) -> list[AreaTrend]:
+    """All areas of either week, the worse first. The intervals of all of them together hold the true ratios with 95 %.
+
+    Given all failures of both weeks, those of the last one are binomial (Przyborowski and Wilenski 1940); the exact interval of that share
+    (Clopper and Pearson 1934) is one of the ratio, and Bonferroni's correction makes up for looking at many areas.
+    """
+    nothing = Counters()
+    pairs = {name: (now.get(name, nothing), before.get(name, nothing)) for name in {*now, *before}}
+    told = [name for name, both in pairs.items() if all(is_telling(rate(0, counts.robot_days)) for counts in both)]
+    tail = _CONFIDENCE_TAIL / max(1, len(told)) / 2
+    found = [_trend(name, *both, tail if name in told else None) for name, both in pairs.items()]
+    return sorted(found, key=lambda trend: (_ORDER[trend.verdict], -(trend.low or 0.0), -trend.now.events, trend.name))
+
+
+def _trend(name: str, now: Counters, before: Counters, tail: float | None) -> AreaTrend:
+    rates = (rate(now.position_failures, now.robot_days), rate(before.position_failures, before.robot_days))
+    shares = (kpis(now).localised_share_of_all, kpis(before).localised_share_of_all)
+    if tail is None:
+        return AreaTrend(name, "too little driving to say", *rates, None, None, *shares)
+    low, high = _ratio(rates[0], rates[1], tail)
+    verdict: Verdict = "worse" if low > 1 else "better" if high is not None and high < 1 else "no clear change"
+    return AreaTrend(name, verdict, *rates, low, high, *shares)
+
+
+def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
+    """The interval of the ratio of two rates with `tail` outside on either side."""
+    a, b = now.events, before.events
+    low = 0.0 if a == 0 else float(betaincinv(a, b + 1, tail))
+    high = 1.0 if b == 0 else float(betaincinv(a + 1, b, 1 - tail))
+    odds = before.robot_days / now.robot_days
+    return odds * low / (1 - low), None if high >= 1.0 else odds * high / (1 - high)
+
+
+def trend_sentence(trends: list[AreaTrend]) -> str:
+    """Which got worse, as an answer."""
+    worse = [trend.name for trend in trends if trend.verdict == "worse"]
+    silent = sum(trend.verdict == "too little driving to say" for trend in trends)
+    if worse:
+        names = " and ".join([", ".join(worse[:-1]), worse[-1]] if len(worse) > 1 else worse)
+        told = f"{names[:1].upper()}{names[1:]} got worse"
+    elif silent < len(trends):
+        told = "Nothing got clearly worse"
+    else:
+        return "Too little was driven in both weeks to say"
+    return told + (f"; in {silent} of {len(trends)} too little was driven to say" if silent else "")

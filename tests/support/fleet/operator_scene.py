@@ -1,0 +1,174 @@
+"""A hall as an operator finds it: two weeks of driving in four named aisles, one of which got worse, and what failed yesterday at 14:03."""
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from fleetmap.failure_summary import Moment
+from fleetmap.geometry import se3
+from fleetmap.messages import CameraNote, FailureReport, Placement
+from mapserver import releases
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.store import Actor, DraftContent, MapStore
+from mapserver.store.fleet_queries import FleetBatch
+from mapserver.store.rows import TraceRow
+from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
+from support.fleet.dashboard_scene import (
+    AISLE_M,
+    LENGTH_M,
+    SITE,
+    WIDTH_M,
+    build_report,
+    failure,
+    hall_tiles,
+    picture,
+)
+from support.fleet.failed_robot import send_replay, small_file
+from support.storage.map_samples import draft_details
+
+BEGAN_NS = 50_000_000_000
+WORSE = "aisle 2"
+_HOUR_MS = 3_600_000
+
+
+def yesterday(hour: int, minute: int) -> int:
+    """A moment of yesterday, UTC, in nanoseconds since 1970."""
+    day = datetime.now(UTC).replace(hour=hour, minute=minute, second=7, microsecond=0) - timedelta(days=1)
+    return round(day.timestamp()) * 1_000_000_000
+
+
+def aisles() -> bytes:
+    """Three aisles and the dock as GeoJSON; the rest of the hall has no name."""
+    boxes = {
+        f"aisle {n + 1}": (8.0, 2.0 + AISLE_M * n, LENGTH_M - 3, 2.0 + AISLE_M * (n + 1) - 0.1)
+        for n in range(int(WIDTH_M / AISLE_M) - 1)
+    }
+    boxes["dock"] = (0.0, 0.0, 7.9, WIDTH_M)
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"name": name},
+            "geometry": {"type": "Polygon", "coordinates": [[[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]]},
+        }
+        for name, (x0, y0, x1, y1) in boxes.items()
+    ]
+    return json.dumps({"type": "FeatureCollection", "frame": "map", "features": features}).encode()
+
+
+def rack_surfels(level: int = 3) -> Surfels:
+    """Both sides of the racks of `hall_tiles`, with uprights and boards darker than the goods."""
+    edge_m = 0.01 * 2**level
+    x, z = (axis.ravel() for axis in np.meshgrid(np.arange(3, LENGTH_M - 3, edge_m), np.arange(0.1, 3.0, edge_m)))
+    parts = []
+    for rack in np.arange(2.0, WIDTH_M, AISLE_M):
+        for side in (-1.0, 1.0):
+            points = np.column_stack([x, np.full(len(x), rack + 0.6 * side), z]).astype(np.float32)
+            frame = (x % 2.7 < 0.25) | (z % 1.0 < 0.2)
+            goods = 120 + 60 * ((np.floor(x / 0.9) * 7 + np.floor(z) * 3 + rack) % 5 / 5)
+            normals = np.tile(np.array([0.0, side, 0.0], np.float32), (len(x), 1))
+            greys = np.where(frame, 40, goods).astype(np.uint8)
+            parts.append(Surfels(points, normals, np.full(len(x), level, np.uint8), greys))
+    return Surfels.joined(parts)
+
+
+def fill_shift(folder: Path) -> None:
+    """Version 1 (used before), 2 (current, with surfels) and draft 3; areas, two weeks of counts, a day of traces, failures, jobs."""
+    ada = Actor("ada", "the nightly map")
+    surfels = rack_surfels()
+    with MapStore.open(folder, create=True) as store:
+        for number in (1, 2, 3):
+            report: dict[str, object] = {
+                "path_m": 410.0 + number, "duration_s": 600.0, "keyframes": 400 + number, "landmarks": 3600,
+                "loops": {"candidates": 40, "accepted": 12},
+                "findings": {"monday": []},
+            }  # fmt: skip
+            blobs = encode_surfels(surfels) if number == 2 else []
+            if blobs:
+                report["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
+            content = DraftContent(
+                tiles=hall_tiles(1, shifted_m=0.2 * (number - 1)), vocabulary=b"words" * 50,
+                details=draft_details(**report), surfels=blobs,
+            )  # fmt: skip
+            store.save_draft(SITE, content, actor=ada)
+            if number < 3:
+                releases.publish(store, SITE, number, actor=ada)
+        store.keep_site_files(SITE, {"areas": aisles()}, "areas", actor=ada)
+        job = store.begin_job(SITE, "nightly")
+        store.update_job(job, "done", "version 2 of 402 keyframes", {"builds": [build_report() | {"version": 2}]})
+        store.fleet.add(_weeks(store.now_ns()))
+        _failures(store, folder)
+
+
+def _weeks(now_ns: int) -> FleetBatch:
+    """Every hour of two weeks four robots drive for 20 minutes in each aisle. One aisle fails eight times as often since a week, and the
+    dock is hardly driven in."""
+    batch, hour = FleetBatch(), hour_of(now_ns)
+    for back in range(14 * 24):
+        for name in ("aisle 1", "aisle 2", "aisle 3", "dock"):
+            driven_ms = _HOUR_MS // 3 if name != "dock" else (_HOUR_MS // 3 if back in (3, 200) else 0)
+            every = {"aisle 2": 8 if back < 7 * 24 else 64}.get(name, 48)
+            failures = int(driven_ms > 0 and back % every == 5)
+            counts = Counters(
+                reports=1200, observed_ms=driven_ms, driving_ms=driven_ms, judged_ms=driven_ms, usable_ms=driven_ms,
+                found_ms=driven_ms - failures * 20_000, failures=failures, blind_failures=failures, blind_seen=failures,
+            )  # fmt: skip
+            for axis, key in (("area", name), ("site", ""), ("robot", f"tug-{back % 8}"), ("version", "2")):
+                batch.add(SITE, axis, key, hour - back, counts)
+    for robot in range(8):
+        for step in range(0, 20 * 3600, 10):
+            heard_ns = now_ns - (20 * 3600 - step) * 1_000_000_000
+            status = "LOST" if step % 7200 in range(3600 + 60 * robot, 3640 + 60 * robot) else "TRACKING"
+            x_m = 5.0 + abs((step * 0.8 + 17 * robot) % 108 - 54)
+            row = TraceRow(
+                SITE, f"tug-{robot}", hour_of(heard_ns), heard_ns, status, 2, x_m, 6.0 + AISLE_M * (robot % 3), 0.05,
+                heard_ns, "" if status == "TRACKING" else "no_match", 5.1, 0.4, 0.9,
+            )  # fmt: skip
+            batch.traces.append(row)
+    return batch
+
+
+def _report(robot: str, name: str, at_ns: int, place_m: tuple[float, float], **changes: object) -> FailureReport:
+    made = failure(robot, name, wall_ns=at_ns)
+    at = Placement.of(se3(np.eye(3), np.array([*place_m, 0.0])))
+    tile = (int(place_m[0] // 16), int(place_m[1] // 16))
+    return msgspec.structs.replace(made, map_from_base=at, tile=tile, **changes)
+
+
+def _failures(store: MapStore, folder: Path) -> None:
+    fleet = Fleet(store)
+    optical = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.2, 0.0, 0.8]))
+    camera = CameraNote(
+        size_px=(320, 240), focal_px=160.0, centre_px=(160.0, 120.0), base_from_cam=Placement.of(optical)
+    )
+    rng = np.random.default_rng(4)
+    for n in range(14):
+        at_ns = store.now_ns() - int(rng.uniform(1, 160) * 3600) * 1_000_000_000
+        place = (float(rng.uniform(20, 40)), 14.0) if n % 3 else (float(rng.uniform(10, 55)), 6.0 + 16.0 * (n % 2))
+        report = _report(f"tug-{n % 8}", f"some-{n}", at_ns, place, cause="no_match")
+        assert not fleet.take_failure(SITE, report.robot, report).refused
+    carried = _report(
+        "tug-7", "carried", yesterday(14, 3), (20.0, 14.0), cause="carried", wrong_by_m=5.0, camera=camera
+    )
+    assert not fleet.take_failure(SITE, "tug-7", carried).refused
+    moments = [
+        Moment(
+            BEGAN_NS + tenth * 10**8,
+            "LOST" if 0 <= tenth < 19 else "TRACKING",
+            "odometry lost" if 0 <= tenth < 19 else "",
+            None if 0 <= tenth < 19 else (20.0 + 0.05 * tenth + (5.0 if tenth >= 19 else 0.0), 14.0, 0.0),
+            0.0,
+            None if 0 <= tenth < 19 else 0.05,
+        )
+        for tenth in range(-50, 50)
+    ]
+    jpegs = [picture(f"{n}", 320) for n in range(20)]
+    stamps_ns = tuple(BEGAN_NS + k * 5 * 10**8 for k in range(-10, 10))
+    given = {"site": SITE, "robot": "tug-7", "id": "carried", "began_ns": BEGAN_NS, "stamps_ns": stamps_ns}
+    send_replay(
+        fleet, SITE, "tug-7", "carried", small_file(folder / "failure.mcap", jpegs=jpegs, moments=moments, **given)
+    )
+    fleet.flush()
