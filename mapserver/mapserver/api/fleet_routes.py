@@ -41,9 +41,10 @@ from mapserver.api.views import (
     SurveyAct,
 )
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
-from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request
+from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings, route_geojson
+from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import MapStore
 

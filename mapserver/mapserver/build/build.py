@@ -22,7 +22,7 @@ from fleetmap.sensors.samples import SensorSet
 from mapserver.build.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_lock import Job, JobProgress, recorded_job
-from mapserver.build.layers import grid_layer, layer_sessions, surfel_layer
+from mapserver.build.layers import covered_requests, grid_layer, layer_sessions, surfel_layer
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import (
     Accuracy,
@@ -312,7 +312,8 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         peak_rss_mb=sum(held_bytes) / 1e6,
     )
     report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
-    report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said)
+    asked = covered_requests(maps, site, built.joined)
+    report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked)
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,

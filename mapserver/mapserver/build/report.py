@@ -47,7 +47,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     is in the map.
     directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
     is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell. grid: that of planners,
-    surfels: the map that renders; None without one.
+    surfels: the map that renders; None without one. surveyed_requests: by id of a person's request the share of its places that these
+    recordings drove past.
     """
 
     recordings: list[str]
@@ -76,6 +77,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     lookalike_recall: float | None = None
     grid: GridReport | None = None
     surfels: SurfelReport | None = None
+    surveyed_requests: dict[str, float] = {}
 
 
 class Accuracy(msgspec.Struct, frozen=True):

@@ -16,9 +16,10 @@ from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
-from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request, survey_requests
+from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
+from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.expected_views import failure_camera

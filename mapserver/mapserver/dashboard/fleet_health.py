@@ -149,14 +149,11 @@ class HealthData:
         )
 
     def _area_trends(self, site: str, axis: str, next_hour: int) -> list[AreaTrend]:
-        now, before = (
-            {key: counts for (_, key), counts in self._store.fleet.counters(site, axis, **hours).items()}
-            for hours in (
-                {"since_hour": next_hour - WEEK_H, "until_hour": next_hour},
-                {"since_hour": next_hour - 2 * WEEK_H, "until_hour": next_hour - WEEK_H},
-            )
-        )
-        return area_trends(now, before)
+        def week(end: int) -> dict[str, Counters]:
+            found = self._store.fleet.counters(site, axis, since_hour=end - WEEK_H, until_hour=end)
+            return {key: counts for (_, key), counts in found.items()}
+
+        return area_trends(week(next_hour), week(next_hour - WEEK_H))
 
     def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
         rows = self._store.canaries(site)

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import TileEntry, decode_tile
-from mapserver.fleet.survey_requests import SurveyRequest, survey_requests
+from mapserver.fleet.survey_requests import survey_requests
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.fleet_statistics.resurvey_test import (
     ResurveySettings,
@@ -17,6 +17,7 @@ from mapserver.fleet_statistics.resurvey_test import (
     concerns,
     route,
 )
+from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import MapStore
 
 

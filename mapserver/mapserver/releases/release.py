@@ -6,6 +6,7 @@ from dataclasses import replace
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import decode_tile
 from mapserver.fleet_statistics.canary_test import threshold_for
+from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND, open_requests
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases import rules
 from mapserver.releases.version_diff import Difference, manifest_difference
@@ -14,6 +15,9 @@ from mapserver.store.rows import ReleaseChanges, SiteReleases
 from mapserver.trust.signing import try_update_lists
 
 _USUAL_GATE = GateSettings()
+SURVEYED = "surveyed_requests"
+"""The key of a build's report that says how much of each request its recordings covered."""
+
 _RECENT_NS = 2 * 86_400_000_000_000  # robots that are silent for longer are not chosen to try a version
 
 
@@ -122,10 +126,30 @@ def difference(store: MapStore, site: str, before: int, after: int) -> Differenc
 
 
 def _change(store: MapStore, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
-    """As `MapStore.change_releases`, and signs what robots may run now, if the keys are here."""
+    """As `MapStore.change_releases`, signs what robots may run now, if the keys are here, and ends requests that were surveyed."""
     changes = store.change_releases(site, decide)
     try_update_lists(store)
+    if any(state == "current" for _, state in changes.states):
+        _end_surveyed(store, site)
     return changes
+
+
+def _end_surveyed(store: MapStore, site: str) -> None:
+    """Takes requests off the list that the current version, or one that it was built on, covers with its own recordings."""
+    waiting = {request.id for request in open_requests(store, site)}
+    known = {info.version: info for info in store.versions(site)} if waiting else {}
+    current = store.current(site)
+    version = None if current is None else current.version
+    while waiting and version in known:
+        manifest = store.manifest(site, version)
+        said = manifest.report.get(SURVEYED)
+        shares = said if isinstance(said, dict) else {}
+        for name in sorted(waiting & shares.keys()):
+            if isinstance(shares[name], int | float) and shares[name] >= COVERED_SHARE:
+                words = f"done: version {version} surveyed {shares[name]:.0%} of its places"
+                store.keep_site_files(site, {KIND + name: None}, words)
+                waiting.discard(name)
+        version = manifest.parent
 
 
 def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSettings, *, force: bool) -> int | None:

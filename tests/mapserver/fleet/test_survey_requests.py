@@ -1,22 +1,28 @@
 """Surveys that people ask for: kept with the site, first on the list, and gone when they are done."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import StateError, UsageError
+from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
+from mapserver.build.layers import covered_requests
 from mapserver.cli import app
 from mapserver.fleet import survey_requests as requests
 from mapserver.fleet.resurvey_list import resurvey_list
-from mapserver.fleet.survey_requests import SurveyRequest, ask_for_survey, end_request, survey_requests
+from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
-from mapserver.store import Actor, MapStore
-from support.fleet.dashboard_scene import SITE, fill_store
+from mapserver.floor_plan.survey_requests import SurveyRequest
+from mapserver.store import Actor, DraftContent, MapStore
+from mapserver.survey.merge.multi_session import Joined
+from support.fleet.dashboard_scene import SITE, fill_store, hall_tiles
 from support.fleet.served_api import check_problem, served_api
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import draft_details, random_survey, save_sample_draft
 
 ADA = Actor("ada", "racks were moved")
 AISLE = [(14.0, 2.0), (20.0, 2.0), (20.0, 10.0), (14.0, 10.0)]
@@ -66,6 +72,47 @@ def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_
     ] * 2
     with pytest.raises(UsageError, match="may be done already"):
         end_request(store, SITE, made.id, ADA)
+
+
+def test_a_published_survey_of_it_ends_it(store: MapStore) -> None:
+    """Expected: a version whose recordings covered nine tenths ends the request when it is published, not when it is built."""
+    half, whole = (ask_for_survey(store, SITE, [(x, 2.0), (x + 6, 2.0), (x, 9.0)], ADA).id for x in (10.0, 30.0))
+    said = {half: 0.6, whole: 0.95, "ffffffff": 1.0, "x": "1"}
+    details = draft_details(path_m=213.0, surveyed_requests=said)
+    content = DraftContent(tiles=hall_tiles(1), vocabulary=b"words" * 50, details=details)
+    version = store.save_draft(SITE, content)
+    assert {request.id for request in survey_requests(store, SITE)} == {half, whole}
+    releases.publish(store, SITE, version)
+    assert [request.id for request in survey_requests(store, SITE)] == [half]
+    (event,) = (event for event in store.events(SITE)[-3:] if event.kind == f"survey request {whole}")
+    assert event.detail == f"done: version {version} surveyed 95% of its places"
+    releases.roll_back(store, SITE)
+    assert [request.id for request in survey_requests(store, SITE)] == [half]
+
+
+def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) -> None:
+    survey = random_survey(np.random.default_rng(2), keyframes=46)  # along x from -20 m to 25 m
+    asked = [
+        ask_for_survey(store, SITE, [(x, -9.0), (x + 10, -9.0), (x + 10, 9.0), (x, 9.0)], ADA) for x in (-15.0, 10.0)
+    ]
+    way = survey.trajectory
+
+    def covered(*spans: tuple[int, int, int]) -> dict[str, float]:
+        parts = [Trajectory(way.stamps_ns[a:b] + since_ns, way.frame_from_body[a:b]) for a, b, since_ns in spans]
+        whole = Trajectory(
+            np.concatenate([part.stamps_ns for part in parts]), np.concatenate([part.frame_from_body for part in parts])
+        )
+        joined = Joined(replace(survey, trajectory=whole), (), tuple(parts), ())
+        return covered_requests(store, SITE, joined)
+
+    first, second = (request.id for request in asked)
+    assert covered((0, 46, 0)) == {first: 1.0, second: 1.0}
+    assert covered((0, 20, 0)) == {first: 1.0}
+    assert covered((30, 36, 0))[second] == pytest.approx(0.6, abs=0.21)
+    before_ns, after_ns = asked[0].asked_ns - 3600 * 10**9, asked[0].asked_ns + 3600 * 10**9
+    assert covered((0, 20, before_ns), (30, 46, after_ns)) == {second: 1.0}, (
+        "what was recorded before it counts for nothing"
+    )
 
 
 @pytest.mark.parametrize(

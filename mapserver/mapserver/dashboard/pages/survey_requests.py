@@ -7,7 +7,7 @@ from mapserver.dashboard.layout import PageContext, Services, html
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark, Outline
 from mapserver.dashboard.pages.confirm import change_button, may_change
 from mapserver.dashboard.site_map import SiteMap
-from mapserver.fleet.survey_requests import SurveyRequest
+from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import Actor
 
 DRAWN = "Survey that you draw"
@@ -26,7 +26,8 @@ def request_form(services: Services, context: PageContext, requests: list[Survey
     if not requests:
         html(
             Markup(
-                '<p class="quiet">None. Draw one on the map above to put its tiles on the list of the next survey.</p>'
+                '<p class="quiet">None. Draw one on the map above to put its tiles on the list of the next survey; it ends by itself '
+                "when a version with a survey of it is published.</p>"
             )
         )
     for request in requests:

@@ -1,0 +1,76 @@
+"""Polygons that people want surveyed again, as a site keeps them, and how much of one a survey has covered. Pure but for who reads them."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+from scipy.spatial import cKDTree
+
+from fleetmap.geometry import Array, inside_rings
+
+KIND = "survey request "
+"""Begins the kind of a request among the files of a site; its id follows."""
+
+COVERED_SHARE = 0.9
+"""Of a request's places: so many near what was driven are a survey of it."""
+
+_SAMPLES = 8  # of a tile's side
+_EDGE = 256  # of an edge: two metres of the longest
+_NEAR_M = 2.0  # the other lane of an aisle, not the next aisle
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyRequest:
+    """Who asked when (nanoseconds since 1970) and why; corners in `map`, the first not repeated at the end."""
+
+    id: str
+    asked_ns: int
+    actor: str
+    reason: str
+    corners_map_m: list[list[float]]
+
+    def tiles(self, size_m: float) -> list[tuple[int, int]]:
+        """Tiles that the polygon lies in, in order."""
+        ring = np.array(self.corners_map_m)
+        low, high = ring.min(axis=0), ring.max(axis=0)
+        step = size_m / _SAMPLES
+        grid = np.meshgrid(*(np.arange(a, b, step) for a, b in zip(low + step / 2, high, strict=True)))
+        points = np.stack(grid, axis=-1).reshape(-1, 2)
+        along = (np.arange(_EDGE) / _EDGE)[:, None, None]
+        edges = (ring + along * (np.roll(ring, -1, axis=0) - ring)).reshape(-1, 2)
+        points = np.concatenate([edges, points[inside_rings(points, [ring])]])
+        return sorted({(int(x), int(y)) for x, y in np.floor(points / size_m)})
+
+    def covered_share(self, places_map_m: Array, driven_map_m: Array) -> float:
+        """The share of places (K, 2) in the polygon that lie within 2 m of somewhere that was driven (F, 2); 0 without places in it."""
+        inside = places_map_m[inside_rings(places_map_m, [np.array(self.corners_map_m)])]
+        if not len(inside) or not len(driven_map_m):
+            return 0.0
+        return float(np.mean(cKDTree(driven_map_m).query(inside)[0] <= _NEAR_M))
+
+
+class SiteFiles(Protocol):
+    """What a site keeps beside its versions; a MapStore is one."""
+
+    def site_file_kinds(self, site: str) -> list[str]:
+        """Kinds of the files, in order."""
+
+    def site_file(self, site: str, kind: str) -> bytes | None:
+        """The file of a kind, None without."""
+
+
+def open_requests(files: SiteFiles, site: str) -> list[SurveyRequest]:
+    """Those that are not done, oldest first."""
+    found = []
+    for kind in files.site_file_kinds(site):
+        data = files.site_file(site, kind) if kind.startswith(KIND) else None
+        if data is not None:
+            found.append(_read(kind.removeprefix(KIND), data))
+    return sorted(found, key=lambda request: (request.asked_ns, request.id))
+
+
+def _read(request: str, data: bytes) -> SurveyRequest:
+    feature: dict[str, Any] = msgspec.json.decode(data)["features"][0]
+    ring, who = feature["geometry"]["coordinates"][0], feature["properties"]
+    return SurveyRequest(request, who["asked_ns"], who["actor"], who["reason"], ring[:-1])
