@@ -14,6 +14,7 @@ from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
+from mapserver.dashboard.space.loops import Loop, loops_of_version
 from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
@@ -132,6 +133,18 @@ class MapData:
         """A version's landmarks and places for the view in space; made at each call, since browsers keep it."""
         manifest = self._store.manifest(site, version)
         return space_bytes([decode_tile(self._store.blob(entry.sha256)) for entry in manifest.tiles])
+
+    def has_surfels(self, site: str, version: int) -> bool:
+        """Whether views of a version can be drawn."""
+        try:
+            index_address(self._store.manifest(site, version))
+        except StateError:
+            return False
+        return True
+
+    def loops(self, site: str, version: int) -> list[Loop]:
+        """Loops of the build that made a version, as far as a job that is kept tells them."""
+        return loops_of_version((job.report for job in self._store.jobs(site, limit=_JOBS_SHOWN)), version)
 
     def underlays(self, site: str, version: int, root: str) -> list[Layer]:
         """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""

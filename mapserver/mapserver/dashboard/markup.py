@@ -1,10 +1,12 @@
 """Pieces of HTML. All text from outside is escaped, because robots choose their words themselves. Pure."""
 
+import re
 from collections.abc import Iterable, Sequence
 from urllib.parse import urlencode
 
 from markupsafe import Markup, escape
 
+_MOMENT = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d \S{1,10}", re.ASCII)
 NOTHING = Markup('<span class="quiet">–</span>')
 
 
@@ -14,7 +16,9 @@ def joined(parts: Iterable[object], between: str = "") -> Markup:
 
 
 def cell(value: object) -> Markup:
-    """A value as it stands in a table: a dash for None."""
+    """A value as it stands in a table: a dash for None; moments are not broken."""
+    if isinstance(value, str) and not isinstance(value, Markup) and _MOMENT.fullmatch(value):
+        return Markup('<span class="when">{}</span>').format(value)
     return NOTHING if value is None or value == "" else escape(value)
 
 

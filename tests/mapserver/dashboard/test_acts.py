@@ -30,7 +30,7 @@ def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
         page.wait_for_function(
             "document.querySelector('.site-map').marks().some(mark => mark.words === 'chosen place')"
         )
-        page.get_by_label("Heading (degrees)").fill("90")
+        page.get_by_label("Heading (°)").fill("90")
         x, y = (float(page.get_by_label(f"{axis} (m)").input_value()) for axis in "xy")
         change(page, "tug-5 is here")
         deadline_s = time.monotonic() + 20

@@ -37,7 +37,9 @@ def test_bytes_hold_all_landmarks_and_places() -> None:
     xyz = np.frombuffer(data, "<f4", 3 * count, 8).reshape(-1, 3)
     np.testing.assert_allclose(xyz, np.concatenate([tile.points_map for tile in made]), atol=1e-4)
     cameras = np.frombuffer(data, "<f4", 12 * places, 8 + 12 * count).reshape(-1, 3, 4)
-    np.testing.assert_allclose(cameras, np.concatenate([tile.map_from_cam for tile in made])[:, :3], atol=1e-4)
+    order = np.argsort(np.concatenate([tile.place_ids for tile in made]), kind="stable")
+    in_order = np.concatenate([tile.map_from_cam for tile in made])[order, :3]
+    np.testing.assert_allclose(cameras, in_order, atol=1e-4, err_msg="as they were surveyed, one after the other")
     exactness = np.frombuffer(data, np.uint8, count, 8 + 12 * count + 48 * places)
     sigma_m = np.concatenate([tile.sigma_m for tile in made])
     by_sigma = exactness[np.argsort(sigma_m)]

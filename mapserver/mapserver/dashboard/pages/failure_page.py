@@ -254,7 +254,11 @@ async def _position(services: Services, shown: _Shown) -> SiteMap | None:
         words += " Line: where it believed to be in these seconds, in the colour of its state."
     else:
         words += " There is no recording of the seconds around it: the robot sends none, has not sent it yet, or it went to save space."
-    html(Markup('<p class="quiet">{} Map version {}.</p>').format(words, version))
+    there = Markup("")
+    if row.x_map_m is not None and row.y_map_m is not None:
+        place = {"x": round(row.x_map_m, 2), "y": round(row.y_map_m, 2)}
+        there = link(context.to("space", version=version, **place), "Stand there in space")
+    html(Markup('<p class="quiet">{} Map version {}. {}</p>').format(words, version, there))
     return drawn
 
 

@@ -184,7 +184,7 @@ async def _one_version(services: Services, context: PageContext, version: int) -
                 Markup(
                     '<p class="quiet">Grey: landmarks. Blue dots: places that robots recognise. Squares: tiles, darker with more '
                     "landmarks. {}</p>"
-                ).format(link(context.to("space", version=version), "See it in space"))
+                ).format(link(context.to("space", version=version), "Walk through it in space"))
             )
         right = Markup("<h2>Quality of version {}</h2>{}{}")
         html(right.format(version, _quality_facts(quality, plan), _verdicts(context, quality)))

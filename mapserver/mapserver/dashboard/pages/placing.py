@@ -30,7 +30,7 @@ def place_form(services: Services, context: PageContext, robot: str, drawn: Site
     with ui.row().classes("actions"):
         x, y, heading = (
             ui.number(words).props(f'outlined dense step={step} input-style="width:9em"')
-            for words, step in (("x (m)", 0.1), ("y (m)", 0.1), ("Heading (degrees)", 15))
+            for words, step in (("x (m)", 0.1), ("y (m)", 0.1), ("Heading (°)", 15))
         )
 
         def told() -> InitialPoseMessage:

@@ -27,11 +27,12 @@ from mapserver.dashboard.pages.placing import CHOSEN, place_form
 from mapserver.dashboard.robot_history import SILENT, Stretch, stretches
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import Areas
-from mapserver.store import FailureFilter, TraceRow
+from mapserver.store import FailureDetail, FailureFilter, FailureRow, TraceRow
 
 _REFRESH_S = 1.0
 _USUAL_NS = 24 * 3_600_000_000_000
 _ROWS = 60
+_LAST_FAILURES, _PICTURES, _FRAMES = 5, 3, {"frame", "replay"}
 _BROKEN_NS = 30_000_000_000  # rows further apart are no way
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
 Range = tuple[int, int]
@@ -78,10 +79,16 @@ async def _page(services: Services, context: PageContext, robot: LiveRobot) -> N
                 drawn = await version_map(services, context, version, layers)
                 place_form(services, context, robot.name, drawn)
         told = html(_facts(context, robot))
+    parts = stretches(rows, *shown)
     html(_range_form(context, robot.name))
-    html(_timeline(context, stretches(rows, *shown), shown))
-    html(Markup("<h2>Failures</h2>"))
-    html(failure_table(context, failures[:FAILURES_SHOWN], "No failures in this time."))
+    html(_timeline(context, parts, shown))
+    last = FailureFilter(site=context.site, robot=robot.name, until_ns=shown[0])
+    before = [] if failures else (await load(services.health.failures, last, None))[:_LAST_FAILURES]
+    html(_failures(context, failures, before))
+    newest = next(iter(failures or before), None)
+    if newest is not None:
+        html(_last_pictures(context, await load(services.health.failure, newest.number)))
+    html(_states(context, parts))
 
     async def refresh() -> None:
         found = (await load(services.robots.look, context.site)).robot(robot.name)
@@ -178,8 +185,48 @@ def _range_form(context: PageContext, robot: str) -> Markup:
     ).format(f"{context.root}/robots/{robot}", context.site, context.range_fields(), context.to(f"robots/{robot}"))
 
 
+def _failures(context: PageContext, found: list[FailureRow], before: list[FailureRow]) -> Markup:
+    """Those of the range; where it has none, the last ones before it."""
+    none = (
+        "No failures in this time; the last ones before it:"
+        if before
+        else "No failures in this time, and none before it."
+    )
+    told = Markup('<p class="quiet">{}</p>').format(none) if not found else ""
+    listed = failure_table(context, (found or before)[:FAILURES_SHOWN], "")
+    return Markup("<h2>Failures</h2>{}{}").format(told, listed if found or before else "")
+
+
+def _last_pictures(context: PageContext, found: FailureDetail) -> Markup:
+    """What its camera last showed: robots send pictures with failures alone."""
+    frames = sorted(
+        (each for each in found.pictures if each.kind in _FRAMES),
+        key=lambda each: abs(each.stamp_ns - found.report.stamp_ns),
+    )[:_PICTURES]
+    if not frames:
+        return Markup("")
+    row = found.failure
+    figure = Markup('<figure><img src="{0}" alt="{1}" loading="lazy"><figcaption>{1}</figcaption></figure>')
+    drawn = joined(
+        figure.format(
+            f"{context.root}/pictures/{row.number}/{each.place}.jpg", _beside(each.stamp_ns - found.report.stamp_ns)
+        )
+        for each in sorted(frames, key=lambda each: each.stamp_ns)
+    )
+    told = Markup("Robots send pictures with failures alone; these are of {} at {}.").format(
+        link(context.to(f"failures/{row.number}"), f"failure {row.number}"), context.moment(row.happened_ns)
+    )
+    return Markup('<h2>Its last pictures</h2><p class="quiet">{}</p><div class="pictures row">{}</div>').format(
+        told, drawn
+    )
+
+
+def _beside(after_ns: int) -> str:
+    return f"{abs(after_ns) / 1e9:.1f} s {'before' if after_ns < 0 else 'after'} the beginning"
+
+
 def _timeline(context: PageContext, found: list[Stretch], shown: Range) -> Markup:
-    """A bar of the states, and the same as a table, the last one first."""
+    """A bar of the states."""
     if not found:
         return Markup(
             '<p class="quiet">Nothing is kept of this time; traces stay two days unless [ingest] says otherwise.</p>'
@@ -195,6 +242,17 @@ def _timeline(context: PageContext, found: list[Stretch], shown: Range) -> Marku
         )
         for stretch in found
     )
+    begin, end = (context.moment(ns) for ns in shown)
+    return Markup(
+        '<div class="timeline" role="img" aria-label="States from {0} to {1}">{2}</div>'
+        '<p class="ends quiet"><span>{0}</span><span>{1}</span></p>'
+    ).format(begin, end, bar)
+
+
+def _states(context: PageContext, found: list[Stretch]) -> Markup:
+    """The same as a table, the last one first."""
+    if not found:
+        return Markup("")
     rows = [
         (
             context.moment(stretch.since_ns),
@@ -210,13 +268,8 @@ def _timeline(context: PageContext, found: list[Stretch], shown: Range) -> Marku
     ]
     head = ("Since", "For", "State", "Cause", "Map version", "CPU of a frame", "Brightness", "Sharpness")
     more = f"and {len(found) - _ROWS} before that" if len(found) > _ROWS else ""
-    begin, end = (context.moment(ns) for ns in shown)
-    drawn = Markup(
-        '<div class="timeline" role="img" aria-label="States from {0} to {1}">{2}</div>'
-        '<p class="ends quiet"><span>{0}</span><span>{1}</span></p>'
-    ).format(begin, end, bar)
     listed = table(head, rows, empty="", name="States, the last one first")
-    return joined([drawn, listed, Markup('<p class="quiet">{}</p>').format(more)])
+    return Markup('<h2>Its states, the last one first</h2>{}<p class="quiet">{}</p>').format(listed, more)
 
 
 def _words(stretch: Stretch) -> tuple[str, str]:

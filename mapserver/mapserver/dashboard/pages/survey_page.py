@@ -1,7 +1,6 @@
 """The survey page: jobs, the doctor's findings in their recordings, accepted and refused loops on the map."""
 
 from collections import Counter
-from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,6 +11,7 @@ from nicegui import ui
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
 from mapserver.dashboard.markup import age, badge, facts, joined, link, table
+from mapserver.dashboard.space.loops import builds_of, dicts, ends_of
 from mapserver.store import JobInfo
 
 _REFRESH_S = 3.0
@@ -90,15 +90,9 @@ def _state(job: JobInfo) -> str:
 
 async def _one_job(services: Services, context: PageContext, job: JobInfo) -> None:
     html(Markup("<h2>Job {}: {}</h2><p>{}</p>").format(job.id, job.kind, job.message or _state(job)))
-    report = _build_of(job.report)
+    report = builds_of(job.report)[-1]
     html(Markup("{}{}").format(_doctor(report), _recordings(report)))
     await _loops(services, context, report)
-
-
-def _build_of(report: dict[str, Any]) -> dict[str, Any]:
-    """The build in a job's report: a night's last one, else the report itself."""
-    builds = list(_dicts(report.get("builds")))
-    return builds[-1] if builds else report
 
 
 def _doctor(report: dict[str, Any]) -> Markup:
@@ -139,7 +133,7 @@ def _recordings(report: dict[str, Any]) -> Markup:
             session.get("reason"),
             *_join_figures(session.get("evidence")),
         )
-        for session in _dicts(report.get("sessions"))
+        for session in dicts(report.get("sessions"))
     ]
     listed = table(
         ("Recording", "Result", "Why", "Fixes that agree", "Seen of the map"),
@@ -165,7 +159,7 @@ def _join_figures(evidence: Any) -> tuple[str, str]:
 
 
 async def _loops(services: Services, context: PageContext, report: dict[str, Any]) -> None:
-    found = [place for place in _dicts(report.get("loop_places")) if _ends(place) is not None]
+    found = [place for place in dicts(report.get("loop_places")) if ends_of(place) is not None]
     if not found:
         html(Markup('<h2>Loops on the map</h2><p class="quiet">The report contains no loops.</p>'))
         return
@@ -178,7 +172,7 @@ async def _loops(services: Services, context: PageContext, report: dict[str, Any
         return
     lines: list[Item] = []
     for place in sorted(found, key=lambda p: p.get("verdict") == "accepted"):
-        ends, tone = _ends(place), _VERDICTS.get(str(place.get("verdict")), "quiet")
+        ends, tone = ends_of(place), _VERDICTS.get(str(place.get("verdict")), "quiet")
         assert ends is not None
         words = f"{str(place.get('verdict')).replace('_', ' ')}: {place.get('reason') or 'consistent'}"
         lines.append(Line(list(ends), tone, words))
@@ -201,7 +195,7 @@ def _refusals(found: list[dict[str, Any]]) -> Markup:
     reasons = Counter(str(place.get("reason") or place.get("verdict")).replace("_", " ") for place in refused)
     rows = []
     for place in refused[:_REASONS_SHOWN]:
-        ends = _ends(place)
+        ends = ends_of(place)
         assert ends is not None
         (x, y), (to_x, to_y) = ends
         verdict, score = str(place.get("verdict")), place.get("score")
@@ -215,18 +209,3 @@ def _refusals(found: list[dict[str, Any]]) -> Markup:
     return Markup("<details><summary>Why {} candidates were refused: {}</summary>{}</details>").format(
         len(refused), why, listed
     )
-
-
-def _ends(place: dict[str, Any]) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Both ends of a loop, None unless the report has two numbers for each."""
-    ends = [place.get("from_map_m"), place.get("to_map_m")]
-    if not all(
-        isinstance(end, list) and len(end) == 2 and all(isinstance(v, int | float) for v in end) for end in ends
-    ):
-        return None
-    (x, y), (to_x, to_y) = ends  # type: ignore[misc]
-    return (float(x), float(y)), (float(to_x), float(to_y))
-
-
-def _dicts(value: object) -> Iterable[dict[str, Any]]:
-    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
