@@ -1,0 +1,120 @@
+"""The operator's questions, asked as somebody would who has not seen the pages before: the right answer in at most two clicks each."""
+
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from mapserver.store import MapStore
+from support.fleet.dashboard_scene import SITE, Served, opened, serving, talking
+from support.fleet.operator_scene import WORSE, fill_shift
+
+MOST_CLICKS = 2
+
+
+@pytest.fixture(scope="module")
+def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("store")
+    fill_shift(folder)
+    with serving(folder) as server:
+        yield server
+
+
+@dataclass
+class Operator:
+    """Looks at pages and counts clicks. Begins on the fleet page."""
+
+    page: Page
+    served: Served
+    clicks: int = 0
+    faults: list[str] = field(default_factory=list)
+
+    def begin(self) -> None:
+        self.clicks, self.faults = 0, opened(self.page, self.served, "").faults
+
+    def click(self, thing: Locator) -> None:
+        self.clicks += 1
+        thing.click()
+
+
+@pytest.fixture
+def operator(page: Page, served: Served) -> Iterator[Operator]:
+    made = Operator(page, served)
+    with talking(served.zenoh, 20) as moved:
+        moved["tug-4"] = (33.0, 14.0)  # lost in aisle 2
+        time.sleep(3)
+        made.begin()
+        yield made
+    assert made.faults == []
+
+
+def test_which_robots_need_a_person_now(operator: Operator) -> None:
+    attention = operator.page.locator(".attention")
+    expect(attention).to_contain_text("robots need a look", timeout=60_000)
+    row = attention.get_by_role("row", name=re.compile("^tug-4"))
+    expect(row).to_contain_text("lost")
+    expect(row).to_contain_text(WORSE)
+    expect(row).to_contain_text(re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d"))
+    assert attention.bounding_box()["y"] < 400, "the answer is the first thing on the page"
+    assert operator.clicks == 0
+
+
+def test_why_did_tug_7_fail_at_14_03(operator: Operator) -> None:
+    page = operator.page
+    operator.click(page.get_by_role("link", name="tug-7", exact=True).last)
+    failed = page.get_by_role("table", name="Failures").get_by_role("row", name=re.compile(r" \d\d:03:07 "))
+    operator.click(failed.get_by_role("link", name=re.compile("^Failure")))
+    answer = page.locator(".notice").first
+    expect(answer).to_contain_text(
+        re.compile(r"^tug-7 failed at .* in aisle 2: carried 5.0 m, by its own fixes, .*found again after 1.9 s")
+    )
+    assert operator.clicks <= MOST_CLICKS
+
+
+def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
+    page = operator.page
+    expect(page.locator(".week")).to_have_text(
+        re.compile("^This week: Aisle 2 got worse; in 1 of 4 too little was driven")
+    )
+    assert page.locator(".week").bounding_box()["y"] < 800, "without scrolling"
+    operator.click(page.get_by_role("link", name="Area by area"))
+    heading = page.get_by_role("heading", name="What got worse this week")
+    expect(heading).to_be_in_viewport()
+    table = page.get_by_role("table", name="What got worse this week")
+    expect(table.get_by_role("row").nth(1)).to_contain_text(re.compile(r"^aisle 2worse\S+ to \S+ times"))
+    expect(table.get_by_role("row", name=re.compile("^dock"))).to_contain_text("too little driving to say")
+    operator.click(table.get_by_role("link", name="aisle 2"))
+    expect(page.locator("h1")).to_have_text("Failures of hall")
+    where = page.get_by_role("table", name="Failures").locator("tbody tr td:nth-child(7)")
+    expect(where.first).to_have_text("aisle 2")
+    assert set(where.all_inner_texts()) == {"aisle 2"}
+    assert operator.clicks <= MOST_CLICKS
+
+
+def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
+    """Undoing is two clicks and a form: the button, a name and a reason, and yes."""
+    page = operator.page
+    operator.click(page.get_by_role("link", name="Map", exact=True))
+    operator.click(page.get_by_role("button", name="Publish draft 3", exact=True))
+    dialog = page.locator(".q-dialog")
+    expect(dialog).to_contain_text(
+        re.compile("Draft 3 goes through the gate. If the gate accepts it, all 20 robots of hall get it.")
+    )
+    assert operator.clicks <= MOST_CLICKS
+    dialog.get_by_label("Your name").fill("ada")
+    dialog.get_by_role("button", name=re.compile("^Yes")).click()
+    expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 3.")
+
+    operator.begin()
+    operator.click(page.get_by_role("link", name="Map", exact=True))
+    operator.click(page.get_by_role("button", name="Roll back to version 2", exact=True))
+    expect(dialog).to_contain_text("All 20 robots of hall go from version 3 back to version 2.")
+    assert operator.clicks <= MOST_CLICKS
+    dialog.get_by_label("Your name").fill("ada")
+    dialog.get_by_role("button", name=re.compile("^Yes")).click()
+    expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.")
+    with MapStore.open(operator.served.folder) as store:
+        assert store.current(SITE).version == 2
