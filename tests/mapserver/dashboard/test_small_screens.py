@@ -1,0 +1,93 @@
+"""Acts on a phone, a tablet and a desk, in both looks: everything is in reach, readable and large enough to hit, and does what it says."""
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from mapserver.store import MapStore
+from support.fleet.dashboard_scene import SITE, Served, change, fill_store, opened, serving, talking
+from support.fleet.whole_page import SIZES, WEAKEST_CONTRAST
+
+ACTS = {
+    "map": ("Publish draft 3", "Roll back to version 1", "Try version 3 on 5% of the robots", "Ask for a survey of it"),
+    "robots/tug-5": ("tug-5 is here",),
+}
+_LEAST_PX = 32  # of a thing to tap; WCAG 2.2 asks for 24
+
+
+@pytest.fixture(scope="module")
+def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with serving(folder) as server, talking(server.zenoh, 8):
+        yield server
+
+
+@pytest.fixture
+def phone(browser: Browser) -> Iterator[Page]:
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, color_scheme="dark")
+    context.set_default_timeout(90_000)
+    yield context.new_page()
+    context.close()
+
+
+def assert_in_reach(page: Page, thing: Locator) -> None:
+    """Wholly within the width of the screen, and large enough."""
+    thing.scroll_into_view_if_needed()
+    box, size = thing.bounding_box(), page.viewport_size
+    assert box["x"] >= 0, thing
+    assert box["x"] + box["width"] <= size["width"], thing
+    assert min(box["width"], box["height"]) >= _LEAST_PX, (thing, box)
+
+
+def test_every_act_is_in_reach_in_every_size_and_look(page: Page, served: Served) -> None:
+    for path, names in ACTS.items():
+        seen = opened(page, served, path)
+        for look in ("light", "dark"):
+            page.emulate_media(color_scheme=look)
+            for width, height in SIZES:
+                page.set_viewport_size({"width": width, "height": height})
+                for name in names:
+                    act = page.get_by_role("button", name=name, exact=True)
+                    assert_in_reach(page, act)
+                    act.click()
+                    dialog = page.locator(".q-dialog")
+                    for part in (
+                        dialog.get_by_label("Your name"),
+                        dialog.get_by_label("Reason"),
+                        dialog.get_by_role("button", name=re.compile("^Yes")),
+                        dialog.get_by_role("button", name=re.compile("^No")),
+                    ):
+                        assert_in_reach(page, part)
+                    contrast, words = page.evaluate(WEAKEST_CONTRAST)
+                    assert contrast >= 4.5, f"{name}, {look}, {width}: {words}"
+                    dialog.get_by_role("button", name=re.compile("^No")).click()
+                    expect(dialog).to_have_count(0)
+        assert seen.faults == []
+
+
+def test_all_acts_on_a_phone(phone: Page, served: Served) -> None:
+    seen = opened(phone, served, "robots/tug-5")
+    phone.locator(".site-map").tap()
+    expect(phone.get_by_label("x (m)")).not_to_have_value("")
+    change(phone, "tug-5 is here")
+    expect(phone.locator(".q-dialog")).to_have_count(0)
+
+    opened(phone, served, "map")
+    phone.get_by_text("Draw on the map").tap()
+    drawing = phone.locator(".site-map").first
+    for x, y in ((150, 150), (200, 150), (200, 200)):
+        drawing.tap(position={"x": x, "y": y})
+    phone.wait_for_function("document.querySelector('.site-map').marks().length === 3")
+    change(phone, "Ask for a survey of it")
+    expect(phone.get_by_text(re.compile("asked by ada at "))).to_have_count(1)
+
+    for act, current in (("Publish draft 3", 3), ("Roll back to version 2", 2), ("Promote version 3", 3)):
+        change(phone, act)
+        expect(phone.locator(".nicegui-content")).to_contain_text(f"Robots should use version {current}.")
+        with MapStore.open(served.folder) as store:
+            assert store.current(SITE).version == current
+    assert phone.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert seen.faults == []
