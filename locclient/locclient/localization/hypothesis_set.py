@@ -89,9 +89,9 @@ def competitors(
 def disambiguated(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
     """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
 
-    It need not rank first: a sign is little beside all that aliases share. Only where the whole site is mapped: of the aliases of a
-    place that the map does not hold, one is always the least unlike it. The test is repeated with every query, as in a sequential
-    test (Wald 1945); it never rejects.
+    It need not rank first: a sign is little beside all that aliases share. What a person said counts as a sign, too. Only where the
+    whole site is mapped: of the aliases of a place that the map does not hold, one is always the least unlike it. The test is repeated
+    with every query, as in a sequential test (Wald 1945); it never rejects.
     """
     if not settings.is_whole_site_mapped or not competitors(hypotheses, settings):
         return None
@@ -105,7 +105,8 @@ def disambiguated(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings)
 
     def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
         (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
-        return log_odds(history, other_history, flags, other_flags)
+        told = one.told_log_odds - other.told_log_odds
+        return log_odds(history, other_history, flags, other_flags) + told
 
     yield
     best = max(order[1:], key=lambda other: lead(other, order[0]))

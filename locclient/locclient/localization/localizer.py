@@ -298,7 +298,7 @@ class Localizer:
         prior = self._prior
         within = [fix for fix, hypothesis in self._observations(fixes) if prior.is_compatible(hypothesis)]
         if within or not prior.is_revisable:
-            return within
+            return fixes if prior.is_revisable else within  # a person may have named an alias of the place
         yield
         fixes = yield from relocalizer.anywhere(features, None, None)
         fixes = [fix for fix in fixes if self._is_reliable(fix)]
@@ -319,7 +319,10 @@ class Localizer:
     def _observations(self, fixes: Sequence[Fix]) -> Observations:
         """The fixes of the query that goes on, with their poses at the present."""
         assert self._query_frame is not None
-        return [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
+        found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
+        for _, hypothesis in found if self._prior else ():
+            hypothesis.told_log_odds = self._prior.log_odds(hypothesis, self._track)
+        return found
 
     def _odom_from_body(self) -> Array:
         assert self._last_odom_from_body is not None
@@ -382,7 +385,7 @@ class Localizer:
         if competitors:
             return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
         moved_m = None
-        has_prior = self._prior is not None and self._prior.is_tight(self._track.tight_prior_sigma_m)
+        has_prior = self._prior is not None and self._prior.confirms(best, self._track)
         if not has_prior and candidates.may_be_lookalike(best):
             return QueryResult(None, "a place that is not in the map may look as much like this one")
         if has_prior or candidates.is_confirmed(best, fixes):

@@ -34,8 +34,8 @@ class PoseHypothesis:
     query_cov: at the frame of the present map query, which may be some frames old. stamp_ns: of the last fix. support: number of
     fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
-    for those without a fix, and their number. misses: queries since the last fix. kidnap_hypotheses: places that rejected fixes
-    name instead.
+    for those without a fix, and their number. misses: queries since the last fix. told_log_odds: that a person who named its
+    place is right, 0 where nobody did. kidnap_hypotheses: places that rejected fixes name instead.
     """
 
     frame_index: int
@@ -56,6 +56,7 @@ class PoseHypothesis:
     looks: int = 0
     misses: int = 0
     travelled_m: float = 0.0
+    told_log_odds: float = 0.0
     kidnap_hypotheses: list["PoseHypothesis"] = field(default_factory=list)
     history: ObservationHistory = field(default_factory=ObservationHistory)
 

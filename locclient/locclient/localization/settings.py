@@ -21,6 +21,8 @@ class TrackSettings(Section, frozen=True):
     # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
     strong_twin_share: float = 0.5
     tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
+    # Of places that people name: one of these is weighed against its aliases, not believed. An assumption
+    wrong_prior_share: float = 0.05
     near_prior_sigma_m: float = 2.1  # 3.7 sigmas of it exclude the look-alikes that the map server looks for, 8 m away
     # Squared Mahalanobis distance from the prediction: 0.999 of chi-square, 6 degrees of freedom
     innovation_limit: float = 22.458

@@ -9,6 +9,7 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.sensors.samples import PositionPrior
 from support.fleet.scripted_robot import MAP_FROM_ODOM, Robot, off
 
 TWIN = off(0.0, 5.0)
@@ -72,3 +73,49 @@ def test_signs_tell_nothing_where_the_own_aisle_may_not_be_in_the_map(
     robot = Robot(monkeypatch).load()
     monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
     assert {e.status for e in robot.ride(20, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
+
+
+def told(robot: Robot, place: Array, *, is_revisable: bool) -> None:
+    """A place to half a metre, the robot's own displaced."""
+    map_from_base = robot.map_from_body.copy()
+    map_from_base[:3, 3] += place
+    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, 0.4**2, 0.4**2, 0.25**2])
+    robot.localizer.handle_prior(PositionPrior(0, map_from_base, covariance, is_revisable))
+
+
+@pytest.mark.parametrize("is_whole", [False, True])
+def test_a_person_who_names_the_twin_is_not_believed_at_once(monkeypatch: pytest.MonkeyPatch, is_whole: bool) -> None:
+    robot = Robot(monkeypatch, is_whole_site_mapped=is_whole).load()
+    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
+    told(robot, TWIN, is_revisable=True)
+    said = robot.ride(30, 0.4, [TWIN, off(0.0)])
+    assert said[0].status is Status.AMBIGUOUS
+    known = [e for e in said if e.status is Status.TRACKING and e.map_from_body is not None]
+    assert all(np.linalg.norm(e.map_from_body[:2, 3] - robot.map_from_body[:2, 3]) < 20.0 for e in known)
+    assert bool(known) is is_whole, "by the signs, where they may tell"
+    if known:
+        assert said[-1].map_from_body is not None
+        assert np.linalg.norm(said[-1].map_from_body[:3, 3] - robot.map_from_body[:3, 3]) < 0.05
+
+
+def test_a_persons_right_word_needs_fewer_signs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Than none, for the same robot in the same aisle."""
+    frames = []
+    for is_told in (False, True):
+        robot = Robot(monkeypatch, is_whole_site_mapped=True).load()
+        monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
+        if is_told:
+            told(robot, off(0.0), is_revisable=True)
+        said = robot.ride(30, 0.4, [off(0.0), TWIN])
+        frames.append(next(n for n, e in enumerate(said) if e.status is Status.TRACKING))
+    assert frames[1] < frames[0]
+
+
+def test_a_person_is_believed_where_no_other_place_looks_like_it(sure_robot: Robot) -> None:
+    told(sure_robot, off(0.0), is_revisable=True)
+    assert sure_robot.ride(3, 0.4, [off(0.0)])[0].status is Status.TRACKING
+
+
+def test_a_dock_is_believed_beside_its_twin(sure_robot: Robot) -> None:
+    told(sure_robot, off(0.0), is_revisable=False)
+    assert sure_robot.ride(3, 0.4, [off(0.0), TWIN])[0].status is Status.TRACKING
