@@ -2,13 +2,18 @@
 
 import json
 from itertools import pairwise
+from time import process_time
 
 import numpy as np
 import pytest
 
 from benchmarks.common.looks import Answer, curve, right_at
+from fleetmap.messages import Status
+from locclient.replay.run_metrics import FrameRecord
 from studies import dark_ladder, study
-from studies.robot_days.rates import Stratum, day_rate
+from studies.robot_days.closeness import closeness
+from studies.robot_days.rates import Stratum, combined, day_rate
+from studies.robot_days.tails import TailStratum, resampled_rates, tail_rate
 
 PAGES = sorted(page for page in study.PAGES.glob("*.md") if page.stem != "README")
 SCRIPTS = study.PAGES.parents[1] / "tests" / "studies"
@@ -108,3 +113,88 @@ def test_the_ladder_goes_down() -> None:
     assert all((below <= above).all() and below.sum() < above.sum() for above, below in pairwise(tables))
     a, gamma = dark_ladder.parameters(3)
     assert tables[3][100] == round(255 * a * (100 / 255) ** (1 / gamma))
+
+
+def _situation(
+    rng: np.random.Generator, drives: int, scale: float
+) -> list[np.ndarray[tuple[int], np.dtype[np.float64]]]:
+    return [rng.exponential(scale, 9) for _ in range(drives)]
+
+
+def test_a_rate_beyond_what_was_seen_is_found_by_the_model() -> None:
+    """Two situations with exponential figures; their true rate is far below one failure in all that was drawn."""
+    rng, scale = np.random.default_rng(3), 0.08
+    true, estimated, above = 9 * 40 * np.exp(-1 / scale) * (10.0 + 2.0), [], 0
+    for _ in range(40):
+        strata = [TailStratum(weight, _situation(rng, 40, scale)) for weight in (10.0, 2.0)]
+        estimated.append(tail_rate(strata))
+        above += float(np.percentile(resampled_rates(strata, 100, rng), 97.5)) >= true
+    assert true < 0.02
+    assert above >= 32, "the upper end lies above the truth in most samples; the bootstrap is a little short"
+    assert np.median(estimated) < 20 * true
+
+
+def test_heavier_tails_reach_a_failure_sooner() -> None:
+    rng = np.random.default_rng(4)
+    light = [TailStratum(1.0, [rng.exponential(0.05, 9) for _ in range(50)])]
+    heavy = [TailStratum(1.0, [0.05 * rng.pareto(3.0, 9) for _ in range(50)])]
+    assert tail_rate(light) < 1e-3 * tail_rate(heavy)
+
+
+def test_what_was_counted_and_what_was_extrapolated_add_up() -> None:
+    rng = np.random.default_rng(5)
+    counted = [Stratum(0.2, 32.0, (1, *[0] * 31))]
+    alone = combined(counted, [], 1)
+    assert alone.rate == pytest.approx(0.2 / 32)
+    assert alone.low < alone.rate < alone.high < 0.2 * 6 / 32
+    tails = [[TailStratum(1.0, [0.05 * rng.pareto(3.0, 9) for _ in range(50)])]]
+    both = combined(counted, tails, 1)
+    assert both.rate == pytest.approx(alone.rate + tail_rate(tails[0]))
+    assert both.high > alone.high
+
+
+def _frames(count: int, status: Status, error_m: float, sigma_m: float = 0.02) -> list[FrameRecord]:
+    cov = np.diag([1e-4] * 3 + [sigma_m**2] * 3)
+    return [
+        FrameRecord(k * 66_666_667, status, True, cov, np.array([error_m, 0.0, 0.0]), 0.0, 0.0, 0.0, {}, 1.0)
+        for k in range(count)
+    ]
+
+
+def test_closeness_is_one_where_a_failure_begins() -> None:
+    far = closeness(_frames(300, Status.TRACKING, 0.31, 0.5))
+    assert far.wrong[0] == pytest.approx(0.31 / 0.30)
+    near = closeness(_frames(300, Status.TRACKING, 0.02))
+    assert near.wrong[0] == pytest.approx(0.02 / 0.30)
+    assert near.outside[0] == pytest.approx(1.0 / np.sqrt(16.266), rel=1e-3)
+    assert near.blind[0] == pytest.approx(2.796 * 0.02 / 0.30, rel=1e-3)
+    blind = [
+        *_frames(150, Status.TRACKING, 0.02),
+        *_frames(15, Status.LOST, 0.02),
+        *_frames(150, Status.TRACKING, 0.02),
+    ]
+    assert closeness(blind).blind.max() == pytest.approx(0.5, abs=0.04), "one second of the two that are a failure"
+    short = [
+        *_frames(150, Status.TRACKING, 0.02),
+        *_frames(14, Status.TRACKING, 0.5),
+        *_frames(150, Status.TRACKING, 0.02),
+    ]
+    assert closeness(short).wrong.max() == pytest.approx(0.02 / 0.30), "less than a second"
+
+
+def test_a_study_that_may_take_so_long_shows_what_there_is(
+    tmp_path: study.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "PAGES", tmp_path)
+    monkeypatch.setenv("CPU_S", "0.05")
+
+    def case() -> study.Row:
+        begin_s = process_time()
+        while process_time() < begin_s + 0.2:
+            pass
+        return {"value": 1}
+
+    cases = dict.fromkeys("abc", case)
+    assert [row["case"] for row in study.results("counted", cases)] == ["a"]
+    monkeypatch.delenv("CPU_S")
+    assert [row["case"] for row in study.results("counted", cases)] == ["a", "b", "c"]

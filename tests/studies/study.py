@@ -1,7 +1,8 @@
 """What all studies share: results that are kept as they come, and the page that shows them.
 
 A study is a module of this folder with a `main`; `make study NAME=square` runs it. Its rows are kept in docs/studies/NAME.json after each
-case, so that one that was stopped goes on where it was; `make study NAME=square FRESH=1` begins anew. Its page is docs/studies/NAME.md:
+case, so that one that was stopped goes on where it was; `make study NAME=square FRESH=1` begins anew, and CPU_S=600 begins no
+case after so many seconds of CPU: the page then shows what there is. Its page is docs/studies/NAME.md:
 prose by hand, and between two marks the tables of the last run.
 """
 
@@ -11,6 +12,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,12 +41,15 @@ def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[i
     path = PAGES / f"{name}.json"
     kept = json.loads(path.read_text()) if path.exists() and not os.environ.get("FRESH") else {}
     rows = {row["case"]: row for row in kept.get("rows", []) if row["case"] in cases}
+    until_s = _cpu_s() + float(os.environ.get("CPU_S") or inf)
     for case in track([c for c in cases if c not in rows], name, console=Console(stderr=True), disable=len(cases) < 2):
         begin_s = _cpu_s()
+        if begin_s >= until_s:
+            break
         row = cases[case]()
         rows[case] = {"case": case, **row, "cpu_s": round(_cpu_s() - begin_s, 2)}
         _keep(path, [rows[c] for c in cases if c in rows], seeds)
-    return [rows[case] for case in cases]
+    return [rows[case] for case in cases if case in rows]
 
 
 def _cpu_s() -> float:

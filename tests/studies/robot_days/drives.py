@@ -1,7 +1,6 @@
 """Drives of one situation under one configuration: the localizer in the loop, judged by the definition of a failure."""
 
 import copy
-import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -14,48 +13,34 @@ from fleetmap.sensors.samples import ImuSamples, PositionPrior
 from locclient.localization.estimate import Estimate
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
+from studies.robot_days import own_map
+from studies.robot_days.closeness import KINDS, Blocks, closeness
 from studies.robot_days.configurations import Configuration
-from studies.robot_days.site import LAYOUT, driven, surveyed_site
+from studies.robot_days.site import LAYOUT, Trip, driven, surveyed_site
 from studies.robot_days.situations import SITUATIONS, Prior
+from studies.robot_days.ungated_map import ungated_view
 
 _DOCK_SIGMA_M, _TOLD_SIGMA_M = 0.05, 0.5
 _SILENT_S = 1.0
-DRIVES = 2  # of a batch
+_COUNTED_S = 3.0  # an event that begins later than so long before the end is not counted, nor a failure that it might have led to
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """One drive's outcome. kinds: how many failures of each kind; one failure may be of two."""
+    """One drive's outcome. kinds: how many failures of each kind; one failure may be of two. blocks: how near it came to more."""
 
     hours: float
     failures: int
     silent: int
     kinds: dict[str, int]
     errors_m: Array
+    blocks: Blocks
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Drives of one situation at one site. number: of the batch, from 0."""
-
-    situation: str
-    seed: int
-    number: int
-
-    def day(self, configuration: Configuration) -> int:
-        """Nights since the survey."""
-        days = SITUATIONS[self.situation].days
-        return configuration.day or days[self.number % len(days)]
-
-    def generator(self, number: int) -> np.random.Generator:
-        """What is random in the batch's drive of that number."""
-        return np.random.default_rng([self.seed, zlib.crc32(self.situation.encode()), self.number, number])
-
-
-@lru_cache(maxsize=DRIVES)
-def _session(batch: Batch, number: int, day: int) -> RememberingSession:
-    trip = SITUATIONS[batch.situation].trip(batch.generator(number))
-    return driven(batch.seed, day, trip, f"{batch.situation}-{batch.number}-{number}")
+@lru_cache(maxsize=1)
+def _session(situation: str, seed: int, number: int, day: int) -> tuple[Trip, RememberingSession]:
+    trip = SITUATIONS[situation].trip_of(seed, number)
+    return trip, driven(seed, day, trip)
 
 
 def _prior(session: RememberingSession, kind: Prior, rng: np.random.Generator) -> PositionPrior | None:
@@ -78,14 +63,20 @@ def _without_imu(session: RememberingSession) -> RememberingSession:
     return blind
 
 
-def drive(batch: Batch, number: int, configuration: Configuration) -> Drive:
-    """The batch's drive of that number; equal arguments give equal outcomes."""
-    session = _session(batch, number, batch.day(configuration))
-    prior = _prior(session, SITUATIONS[batch.situation].prior, batch.generator(1000 + number))
+def is_restart(situation: str) -> bool:
+    """Whether it begins, or goes on, where the robot does not know."""
+    return SITUATIONS[situation].prior != "dock" or situation.startswith("carried")
+
+
+def _estimates(
+    session: RememberingSession, situation: str, seed: int, prior: PositionPrior | None, configuration: Configuration
+) -> list[Estimate]:
     seen = session if configuration.has_imu else _without_imu(session)
-    view, has_wheels = surveyed_site(batch.seed).view, configuration.has_imu
-    estimates = estimator_loop.run_localizer(seen, view, prior, has_wheels=has_wheels, settings=configuration.settings)
-    return judged(estimates, session.map_from_body, session.stamps_ns)
+    if is_restart(situation) and not configuration.has_shared_map:
+        return own_map.estimates(seen, prior)
+    view = ungated_view(seed) if configuration.survey == "ungated" else surveyed_site(seed).view
+    has_wheels = configuration.has_imu
+    return estimator_loop.run_localizer(seen, view, prior, has_wheels=has_wheels, settings=configuration.settings)
 
 
 def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]) -> Drive:
@@ -102,7 +93,8 @@ def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]
     failures = run_metrics.position_failures(frames)
     kinds["blind"] = int(failures > 0 and not any(kinds.values())) * failures
     errors = np.array([f.error_m for f in frames if f.error_m is not None and f.status == "TRACKING"])
-    return Drive((stamps_ns[-1] - stamps_ns[0]) / 3.6e12, failures, kinds["silent"], kinds, errors)
+    hours = (stamps_ns[-1] - stamps_ns[0]) / 3.6e12
+    return Drive(hours, failures, kinds["silent"], kinds, errors, closeness(frames))
 
 
 def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
@@ -116,20 +108,23 @@ def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
     )  # fmt: skip
 
 
-def row_of(batch: Batch, configuration: Configuration, count: int = DRIVES) -> dict[str, object]:
-    """A batch's first drives under a configuration, as they are kept. exposure: hours, or events where the situation has some."""
-    drives = [drive(batch, number, configuration) for number in range(count)]
-    events, errors = SITUATIONS[batch.situation].events, np.concatenate([d.errors_m for d in drives])
-    hours = round(sum(d.hours for d in drives), 4)
-    kinds = {kind: sum(d.kinds[kind] for d in drives) for kind in drives[0].kinds}
+def row_of(situation: str, seed: int, number: int, configuration: Configuration) -> dict[str, object]:
+    """A situation's drive of that number under a configuration, as it is kept; equal arguments give equal rows.
+
+    exposure: hours, or events where the situation has some. The figures of `closeness` are kept to three digits.
+    """
+    about = SITUATIONS[situation]
+    day = configuration.day or about.day(number)
+    trip, session = _session(situation, seed, number, day)
+    prior = _prior(session, about.prior, np.random.default_rng([seed, 7004, number]))
+    estimates = _estimates(session, situation, seed, prior, configuration)
+    found = judged(estimates, session.map_from_body, session.stamps_ns)
+    events = len(trip.movers) or sum(fault.start_s < 3600 * found.hours - _COUNTED_S for fault in trip.faults) or 1
+    hours = round(found.hours, 5)
     return {
-        "situation": batch.situation,
-        "seed": batch.seed,
-        "day": batch.day(configuration),
-        "hours": hours,
-        "exposure": len(drives) * events if events else hours,
-        "failures": " ".join(str(d.failures) for d in drives),
-        "silent": " ".join(str(d.silent) for d in drives),
-        "kinds": ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count),
-        "p99_mm": round(1e3 * float(np.percentile(errors, 99)), 1) if len(errors) else None,
-    }
+        "situation": situation, "seed": seed, "day": day, "hours": hours,
+        "exposure": hours if about.kind == "hours" else events,
+        "failures": found.failures, "silent": found.silent,
+        "kinds": ", ".join(f"{kind} {count}" for kind, count in found.kinds.items() if count),
+        "p99_mm": round(1e3 * float(np.percentile(found.errors_m, 99)), 1) if len(found.errors_m) else None,
+    } | {kind: " ".join(f"{value:.3g}" for value in values) for kind, values in zip(KINDS, found.blocks, strict=True)}  # fmt: skip

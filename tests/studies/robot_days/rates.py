@@ -3,7 +3,10 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 from scipy.stats import chi2
+
+from studies.robot_days.tails import TailStratum, resampled_rates, tail_rate
 
 _LEVEL = 0.95
 
@@ -56,3 +59,31 @@ def day_rate(strata: Sequence[Stratum]) -> DayRate:
     wider, above = variance + largest**2, rate + largest
     high = wider / (2 * above) * float(chi2.ppf(1 - tail, 2 * above**2 / wider))
     return DayRate(rate, low, high, rate / variance, 1 / largest)
+
+
+def combined(
+    counted: Sequence[Stratum], modelled: Sequence[Sequence[TailStratum]], seed: int, draws: int = 1000
+) -> DayRate:
+    """Counted strata and modelled ones together: each one's confidence distributions are added up.
+
+    modelled: for each way to fail the strata whose figures of it are extrapolated; their rates are added, as if no failure were of two
+    ways, and rise and fall together in the bootstrap. A counted stratum's distributions are gammas, for its lower end of the failures
+    that were seen, for its upper end of one more; failures of one drive are one event of their number. Those of the model are its
+    bootstrap. Source: Fay, Proschan and Brittain 2015, melding.
+    """
+    low, rate = np.zeros(draws), 0.0
+    for strata in modelled:
+        low = low + resampled_rates(strata, draws, np.random.default_rng(seed))
+        rate += tail_rate(strata)
+    high, rng = low.copy(), np.random.default_rng([seed, 1])
+    for stratum in counted:
+        seen = sum(stratum.failures)
+        size = sum(n * n for n in stratum.failures) / seen if seen else 1.0
+        rate += stratum.weight * seen
+        low = low + stratum.weight * size * (rng.gamma(seen / size, size=draws) if seen else 0.0)
+        high += stratum.weight * size * rng.gamma(seen / size + 1.0, size=draws)
+    tail = 100 * (1 - _LEVEL) / 2
+    variance = float(high.var())
+    largest = max((s.weight for s in counted), default=0.0)
+    ends = float(np.percentile(low, tail)), float(np.percentile(high, 100 - tail))
+    return DayRate(rate, *ends, rate / variance if variance else 0.0, 1 / largest if largest else 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.common import estimator_loop
 from benchmarks.robot.aliased_starts import RememberingSession, within_budget
+from fleetmap.mapformat import Tile
 from fleetmap.relocalization.map_view import MapView
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
@@ -24,13 +25,18 @@ LAYOUT = Layout(aisles=6, bays=33, aisle_width_m=2.3, cross_bays=(11, 22), are_a
 NAME, DAY_S = "warehouse-block", 57_600.0
 _SURVEY_RATE_HZ, _PLACE_EVERY_M = 5.0, 0.8
 _END_M, _ASIDE_M = 2.7, 0.3
+_REMEMBERED = 500  # stretches of half a metre: more than the longest drive has
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Trip:
-    """A robot's drive: its routes, one more for each time that it is carried, and what goes wrong on the way."""
+    """A robot's drive: its routes, one more for each time that it is carried, and what goes wrong on the way.
 
+    name: of the way. Trips of one name share ripple, wear and noise, so that they differ in what goes wrong alone.
+    """
+
+    name: str
     routes: tuple[Route, ...]
     faults: tuple[Fault, ...] = ()
     movers: tuple[Mover, ...] = ()
@@ -93,9 +99,12 @@ def random_route(rng: np.random.Generator, length_m: float, stop_s: float = 0.0)
 
 @dataclass(frozen=True, slots=True)
 class SurveyedSite:
-    """The map that robots get of a survey on day 0, when every aisle looks like every other."""
+    """The map that robots get of a survey on day 0, when every aisle looks like every other: `tile`, made by a camera of
+    focal_px, and as a robot holds it in memory."""
 
     seed: int
+    tile: Tile
+    focal_px: float
     view: MapView
 
 
@@ -116,15 +125,16 @@ def surveyed_site(seed: int) -> SurveyedSite:
     rng = np.random.default_rng(seed)
     (tile,), vocabulary = estimator_loop.survey_map(survey, rng, every_m=_PLACE_EVERY_M)
     tile = within_budget(tile, survey.camera, survey.body_from_cam)
-    return SurveyedSite(seed, MapView([tile], vocabulary, survey.camera.focal_px))
+    focal_px = survey.camera.focal_px
+    return SurveyedSite(seed, tile, focal_px, MapView([tile], vocabulary, focal_px))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _field(seed: int, day: int) -> LandmarkField:
-    return LandmarkField(World(LAYOUT, seed=seed, day=day))
+    return LandmarkField(World(LAYOUT, seed=seed, day=day), remembered=_REMEMBERED)
 
 
-def driven(seed: int, day: int, trip: Trip, name: str) -> RememberingSession:
+def driven(seed: int, day: int, trip: Trip) -> RememberingSession:
     """The trip on a day, `day` nights after the survey."""
     run = Run("runner", trip.routes, faults=trip.faults)
-    return RememberingSession(prepared(seed, day, name, run, trip.movers), _field(seed, day), trip.smudge)
+    return RememberingSession(prepared(seed, day, trip.name, run, trip.movers), _field(seed, day), trip.smudge)

@@ -47,8 +47,11 @@ class Landmarks:
 class LandmarkField:
     """Landmarks of a world's near chunks, made when first asked for. Far, plain chunks hold none."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, remembered: int = 0) -> None:
+        """remembered: answers of `seen_from` that are kept, for several runs along one way."""
         self._world = world
+        self._remembered = remembered
+        self._seen: OrderedDict[bytes, Landmarks] = OrderedDict()
         self._weights = _texture_weights(world)
         self._chunks: OrderedDict[tuple[int, int], Landmarks] = OrderedDict()
         self._bounds: dict[tuple[int, int], Array] = {}
@@ -72,6 +75,16 @@ class LandmarkField:
 
     def seen_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
         """Landmarks that a camera there may see: in a cone |x/z|, |y/z| < widest (2,), near enough, with nothing between."""
+        key = np.concatenate([map_from_cam.ravel(), [focal_px], widest]).tobytes()
+        if key not in self._seen:
+            self._seen[key] = self._look_from(map_from_cam, focal_px, widest)
+        self._seen.move_to_end(key)
+        seen = self._seen[key]
+        if len(self._seen) > self._remembered:
+            self._seen.popitem(last=False)
+        return seen
+
+    def _look_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
         centre, reach_per_m = np.ascontiguousarray(map_from_cam[:3, 3]), focal_px / PITCH_PX
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
         view = landmark_kernels.Viewpoint(cam_from_map, centre, reach_per_m, widest, _OCTAVE_SPAN)
