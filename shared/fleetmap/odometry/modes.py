@@ -138,6 +138,7 @@ class VisualMode(WindowMode):
         """cam_from_previous (4, 4): the last motion where one is known."""
         super().__init__(window)
         self._cam_from_previous = np.eye(4) if cam_from_previous is None else cam_from_previous
+        self._was_lost = False
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; where the state will be is known only when the frame was tracked."""
@@ -148,15 +149,19 @@ class VisualMode(WindowMode):
         return self._cam_from_previous if self.window.filter.clone_ids[-1:] == [frame_index] else None
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode."""
+        """See Mode. `odom` begins anew where the images no longer show the motion: what that may be is said about this place."""
+        change = None
         if self.window.filter.clone_ids:
+            if tracked.lost and not self._was_lost:
+                change = self.window.filter.begin_frame_anew()
+            self._was_lost = tracked.lost
             self._predict_random_walk(tracked)
             if (
                 tracked.lost
             ):  # no motion has verified these observations, and without an IMU nothing else contradicts wrong ones
                 tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0])
         used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
-        return Step(self, used)
+        return Step(self, used, change)
 
     def _predict_random_walk(self, tracked: Tracked) -> None:
         rig, settings, window = self._rig, self._rig.settings.filter, self.window
@@ -236,7 +241,8 @@ class StartingMode(VisualMode):
         mode.predict(stamp_ns)
         mode.window.seed(frame_index, tracked)
         change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
-        return Step(mode, step.used, change)
+        begun = step.new_odom_from_old_odom
+        return Step(mode, step.used, change if begun is None else change @ begun)
 
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
         """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""

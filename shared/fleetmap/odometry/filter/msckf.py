@@ -139,6 +139,32 @@ class InvariantFilter:
         self.covariance = _copied(self.covariance, _CLONES + 6 * index, 0)
         self.true_error_cov = _copied(self.true_error_cov, CONSIDERED + _CLONES + 6 * index, CONSIDERED)
 
+    def begin_frame_anew(self) -> Array:
+        """new_odom_from_old_odom (4, 4): the frame now begins at the newest clone, and errors count from there.
+
+        Motions between clones, and what is known of them, stay as they are. Of the frame before only that is forgotten which none of
+        them shows: how far it may be off altogether. With the distance from its origin that grows without bound, until the motion
+        between two clones is a difference of numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
+        """
+        begin_m = self._positions[-1].copy()
+        self.state.position_m = self.state.position_m - begin_m
+        self._positions = self._positions - begin_m
+        for name, first in (("covariance", 0), ("true_error_cov", CONSIDERED)):
+            covariance = getattr(self, name)
+            carried = np.eye(len(covariance))
+            bodies = [(first, first + 6)]
+            bodies += [(first + at, first + at + 3) for at in range(_CLONES, len(covariance) - first, 6)]
+            for turn, place in bodies:  # p - begin changes by Exp(turn) begin - begin besides
+                carried[place : place + 3, turn : turn + 3] = -skew(begin_m)
+            since = np.eye(len(covariance))
+            newest = bodies[-1]
+            for body in bodies:
+                for one, other in zip(body, newest, strict=True):
+                    since[range(one, one + 3), range(other, other + 3)] -= 1.0
+            change = since @ carried
+            setattr(self, name, _symmetric(change @ covariance @ change.T))
+        return se3(np.eye(3), -begin_m)
+
     def odom_from_clone(self, clone_id: int) -> Array:
         """(4, 4) odom_from_body of a clone."""
         index = self.clone_ids.index(clone_id)

@@ -299,3 +299,47 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     assert estimate.correct_with(still, gate=22.0) < 22.0
     assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
     np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)
+
+
+def test_a_frame_that_begins_anew_changes_nothing_between_clones() -> None:
+    """Neither what is known of the motions, nor what images then say of them; only where the frame lies is certain again."""
+    points, found = room(np.random.default_rng(3)), []
+    for is_anew in (False, True):
+        estimate, seen = clones_at([0.0, 0.15, 0.3], points, np.random.default_rng(4))
+        known, placed = [estimate.motion_since(k) for k in (0, 1)], estimate.odom_from_clone(1)
+        if is_anew:
+            apart = np.abs(estimate.body_covariance()).max()
+            change = estimate.begin_frame_anew()
+            np.testing.assert_allclose(estimate.odom_from_clone(1), change @ placed, atol=1e-12)
+            np.testing.assert_allclose(estimate.state.position_m, np.zeros(3), atol=1e-12)
+            assert np.abs(estimate.body_covariance()).max() < 1e-3 * apart, (
+                "what is left is the offset of a clone's time"
+            )
+            for (motion, cov), k in zip(known, (0, 1), strict=True):
+                np.testing.assert_allclose(estimate.motion_since(k)[0], motion, atol=1e-12)
+                np.testing.assert_allclose(estimate.motion_since(k)[1], cov, atol=1e-9)
+        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+        found.append([estimate.motion_since(k) for k in (0, 1)])
+    for (motion, cov), (anew, anew_cov) in zip(*found, strict=True):
+        np.testing.assert_allclose(anew, motion, atol=1e-6)
+        np.testing.assert_allclose(anew_cov, cov, rtol=1e-3, atol=1e-3 * np.abs(cov).max())
+
+
+def test_far_from_where_the_frame_began_rounding_leaves_no_covariance() -> None:
+    """Five kilometres away, unless the frame begins anew: what a robot without IMU drives in a shift, and then two seconds in the dark."""
+    points, least = room(np.random.default_rng(3)), []
+    for is_anew in (False, True):
+        state = true_state(0.0)
+        state.velocity_mps, state.position_m = np.zeros(3), state.position_m + np.array([4000.0, 3000.0, 0.0])
+        estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+        estimate.add_clone(0, np.zeros(3))
+        if is_anew:
+            estimate.begin_frame_anew()
+        for _ in range(30):
+            estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
+        estimate.add_clone(1, np.zeros(3))
+        seen = {k: observe(points, 0.0, np.random.default_rng(k)) for k in (0, 1)}
+        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+        cov = estimate.motion_since(0)[1]
+        least.append(float(np.linalg.eigvalsh(cov)[0]))
+    assert least[0] < -1e-4 < 0.0 < least[1]
