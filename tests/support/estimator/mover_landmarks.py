@@ -46,11 +46,23 @@ class MoverLandmarks:
         columns = ("points_map", "normals_map", "sizes_m", "keys")
         points, normals, sizes, keys = (np.concatenate([getattr(p, column) for p in parts]) for column in columns)
         seen = np.ones(len(points), bool)
+        away = points - centre_map
+        far = np.linalg.norm(away, axis=1)
         for _, _, centre, half, rotation in boxes:
-            seen &= ~_is_behind(points, centre_map, centre, half - _SKIN_M, rotation)
+            rows = np.flatnonzero(_may_be_behind(away, far, centre - centre_map, half))
+            seen[rows] &= ~_is_behind(points[rows], centre_map, centre, half - _SKIN_M, rotation)
         rows = np.flatnonzero(seen)
         rows = rows[np.argsort(keys[rows, 2], kind="stable")]
         return Landmarks(points[rows], normals[rows], sizes[rows], keys[rows], np.zeros(1, np.int64))
+
+
+def _may_be_behind(away: Array, far_m: Array, toward: Array, half: Array) -> NDArray[np.bool_]:
+    """(N,) which points, `away` (N, 3) from the eye, lie within the cone of the ball around a box, `toward` (3,) from the eye."""
+    distance_m, radius_m = float(np.linalg.norm(toward)), float(np.linalg.norm(half))
+    if distance_m <= radius_m:
+        return np.ones(len(away), bool)
+    cosine = np.sqrt(1.0 - (radius_m / distance_m) ** 2)
+    return np.asarray(away @ (toward / distance_m) >= (cosine - 1e-9) * far_m)
 
 
 def _is_behind(points: Array, eye: Array, centre: Array, half: Array, rotation: Array) -> NDArray[np.bool_]:
