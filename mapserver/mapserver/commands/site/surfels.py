@@ -12,21 +12,21 @@ from mapserver.commands.options import SiteName, StoreFolder, check_output
 
 def splats(
     version: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE.ply", help="File to write; replaced if it exists.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
 ) -> None:
     """Write the surfels of a version as 3D Gaussians, in the frame of the map, for viewers of Gaussian splats."""
-    check_output("FILE.ply", file)
-    if file.suffix != ".ply":
-        raise UsageError(f"{file} must end in .ply")
+    check_output("FILE", file)
+    if file.suffix not in (".ply", ".spz"):
+        raise UsageError(f"{file} must end in .ply or .spz")
     from mapserver.store import MapStore
-    from mapserver.surfels.splat_file import splat_ply
+    from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
     from mapserver.surfels.surfel_map import surfels_of
 
     with MapStore.open(store, read_only=True) as maps:
         surfels = surfels_of(maps.manifest(site, version), maps.blob)
-    data = splat_ply(surfels)
+    data = (splat_spz if file.suffix == ".spz" else splat_ply)(Splats.of(surfels))
     with disk_errors(f"{file} cannot be written", "choose another place"):
         file.write_bytes(data)
     typer.echo(f"site {site}: {len(surfels)} surfels of version {version} are in {file}, {len(data) / 1e6:.1f} MB")
