@@ -12,7 +12,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.surfels.exposure import lens_factor
-from mapserver.surfels.render_kernels import discs_before, draw_discs
+from mapserver.surfels.render_kernels import BINS, BLOCK_PX, RIM, Image32, discs_before, draw_discs, near_to_far
 from mapserver.surfels.surfel_map import Surfels
 
 FAR_M = 40.0
@@ -58,28 +58,7 @@ def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Arr
     rotation = map_from_cam[:3, :3]
     if not np.isfinite(map_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
         raise UsageError(f"the pose {np.round(map_from_cam[:3], 3).tolist()} is none; give a rotation and metres")
-    rays, pixels_per_rad, cosine = _lens(
-        camera.model, camera.width_px, camera.height_px, tuple(camera.intrinsics_px), tuple(camera.distortion)
-    )
-    cam_from_map = se3_inverse(map_from_cam)
-    numbers, points = np.empty(len(surfels), np.int64), np.empty((len(surfels), 3))
-    count = discs_before(surfels.points_map, surfels.normals, cam_from_map, (cosine, FAR_M), numbers, points)
-    numbers, points = numbers[:count], points[:count]
-    pixels = camera.pixel_from_ray(points)
-    rim_px = 0.1 * camera.width_px
-    low, high = -rim_px, np.array([camera.width_px, camera.height_px]) + rim_px
-    inside = ((pixels > low) & (pixels < high)).all(axis=1)
-    numbers, points, pixels = numbers[inside], points[inside], pixels[inside]
-    drawn = surfels[numbers]
-    edges_m = drawn.edges_m.astype(np.float64)
-    normals = drawn.normals.astype(np.float64) @ cam_from_map[:3, :3].T
-    shape = rays.shape[:2]
-    nearest = np.full(shape, np.inf, np.float32)
-    weight, colour, depth_m = (np.zeros(shape, np.float32) for _ in range(3))
-    draw_discs(
-        pixels, points, normals, RADIUS_EDGES * edges_m, edges_m, drawn.greys.astype(np.float64), rays, pixels_per_rad,
-        nearest, weight, colour, depth_m,
-    )  # fmt: skip
+    rays, weight, colour, depth_m = _drawn(surfels, camera, map_from_cam, FAR_M)
     unknown = weight <= 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
         colour, depth_m = colour / weight, depth_m / weight
@@ -90,6 +69,44 @@ def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Arr
     )
     picture = np.clip(np.round(filled(colour, unknown)), 0, 255).astype(np.uint8)
     return ExpectedView(picture, depth_m, unknown)
+
+
+def expected_depth(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array, far_m: float) -> Image32:
+    """(H, W) distances along the rays as of `expected_view`, of surfels up to so far away; NaN where nothing is known."""
+    _, weight, _, depth_m = _drawn(surfels, camera, map_from_cam, far_m)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(depth_m / weight, np.float32)
+
+
+def _drawn(
+    surfels: Surfels, camera: CameraCalibration, map_from_cam: Array, far_m: float
+) -> tuple[Array, Image32, Image32, Image32]:
+    """The rays (H, W, 3) of a view, and weights, colours and depths (H, W) as of `draw_discs`."""
+    rays, pixels_per_rad, cosine = _lens(
+        camera.model, camera.width_px, camera.height_px, tuple(camera.intrinsics_px), tuple(camera.distortion)
+    )
+    cam_from_map, shape = se3_inverse(map_from_cam), rays.shape[:2]
+    bends = camera.model != "radial-tangential" or camera.distortion.any()
+    numbers, points, pixels = np.empty(len(surfels), np.int32), np.empty((len(surfels), 3)), np.empty((len(surfels), 2))
+    count = discs_before(
+        surfels.points_map, surfels.normals, cam_from_map, (cosine, far_m), camera.intrinsics_px * (not bends),
+        (camera.width_px, camera.height_px), numbers, points, pixels,
+    )  # fmt: skip
+    numbers, points, pixels = numbers[:count], points[:count], pixels[:count]
+    if bends:
+        pixels = camera.pixel_from_ray(points)
+        low, high = -RIM * camera.width_px, np.array([camera.width_px, camera.height_px]) + RIM * camera.width_px
+        inside = ((pixels > low) & (pixels < high)).all(axis=1)
+        numbers, points, pixels = numbers[inside], points[inside], pixels[inside]
+    order = np.empty(len(points), np.int32)
+    near_to_far(points, far_m, np.zeros(BINS + 1, np.int64), order)
+    nearest, hidden = np.full(shape, np.inf, np.float32), np.empty([-(-side // BLOCK_PX) for side in shape], np.float32)
+    weight, colour, depth_m = (np.zeros(shape, np.float32) for _ in range(3))
+    draw_discs(
+        order, numbers, pixels, points, cam_from_map, surfels.normals, surfels.levels, surfels.greys, RADIUS_EDGES, rays, pixels_per_rad,
+        hidden, nearest, weight, colour, depth_m,
+    )  # fmt: skip
+    return rays, weight, colour, depth_m
 
 
 def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:

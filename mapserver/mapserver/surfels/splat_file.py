@@ -33,7 +33,7 @@ _TURN = 1.0 / np.sqrt(2.0)  # about x: z of the map becomes y of SPZ
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """N flat Gaussians in `map`: points_map (N, 3), unit normals (N, 3), sigmas_m (N,) along the disc, greys (N,) of 0 to 255, opacities (N,)."""
+    """N flat Gaussians in `map`: points_map (N, 3), unit normals (N, 3), greys (N,) of 0 to 255, opacities (N,), sigmas_m (N,) along the disc."""
 
     points_map: NDArray[np.float32]
     normals: NDArray[np.float32]
