@@ -4,7 +4,7 @@ import base64
 import hashlib
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -21,12 +21,14 @@ from mapserver.api.bytes_response import bytes_response
 from mapserver.api.guard import address_of
 from mapserver.api.parameters import Number, RobotHeight, Site, Version, ViewPose
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.serving.expected_views import ExpectedViews, failure_camera, looking
+from mapserver.serving.expected_views import ExpectedViews, SurfelChanges, failure_camera, looking
 from mapserver.store import MapStore
+from mapserver.surfels.changes import Changes, changes_geojson, changes_png
 from mapserver.surfels.expected_view import ExpectedView
 
 _DIGESTS_KEPT = 256
-_VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a fifth of a second of CPU
+_VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a tenth of a second of CPU
+_PAIRS_PER_S, _MOST_VIEWS = 0.2, 600  # versions compared: a twentieth of a second of CPU for each view of either
 
 
 def install_file_routes(app: FastAPI, store: MapStore) -> None:
@@ -97,6 +99,24 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
         store.version(site, version)
         place = looking((camera.x_m, camera.y_m, camera.z_m), camera.yaw_deg, camera.pitch_deg)
         return answer(request, lambda: views.view(site, version, place, width_px=camera.width_px))
+
+    changes, compared = SurfelChanges(store, _MOST_VIEWS), RateLimit(_VIEWS_AT_ONCE, _PAIRS_PER_S, store.now_ns)
+
+    def changed(request: Request, site: str, before: int, after: int) -> Changes:
+        if not compared.admits(address_of(request.scope)):
+            raise HTTPException(429, "too many versions are compared; wait some seconds", {"Retry-After": "5"})
+        return changes.between(site, before, after)
+
+    @app.get("/v1/sites/{site}/versions/{before}/diff/{after}/changes.png", response_class=Response)
+    def changes_plan(request: Request, site: Site, before: Version, after: Version) -> Response:
+        """A plan of what appeared (blue) and vanished (orange) in the surfels, 0.1 m a pixel, y upwards; what one did not see is pale."""
+        png = changes_png(changed(request, site, before, after))
+        return bytes_response(request, png, sha256_hex(png), "image/png", immutable=False)
+
+    @app.get("/v1/sites/{site}/versions/{before}/diff/{after}/changes.geojson")
+    def changes_patches(request: Request, site: Site, before: Version, after: Version) -> dict[str, Any]:
+        """The same as GeoJSON, metres in `map` in the place of degrees: boxes with their height and area."""
+        return changes_geojson(changed(request, site, before, after))
 
     @app.get("/v1/failures/{number}/expected.png", response_class=Response)
     def expected(request: Request, number: Number) -> Response:

@@ -200,6 +200,14 @@ class MapData:
             return str(error)
         return None
 
+    def lacks_surfels(self, site: str, version: int) -> str | None:
+        """Why a version has no map that renders; None where it has one."""
+        try:
+            index_address(self._store.manifest(site, version))
+        except FleetmapError as error:
+            return str(error)
+        return None
+
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""
         return releases.difference(self._store, site, before, after)

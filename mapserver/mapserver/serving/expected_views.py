@@ -1,21 +1,23 @@
-"""Expected views of versions in a store: one is drawn at a time, and the surfels around the last place stay in memory."""
+"""Expected views of versions in a store, one at a time, with the surfels around the last place in memory; and what changed between two."""
 
 import threading
 
 import numpy as np
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.mapformat import CameraEntry
 from fleetmap.messages import FailureReport
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.store import MapStore
+from mapserver.surfels.changes import Changes, SeenSite, changes_between
 from mapserver.surfels.expected_view import FAR_M, ExpectedView, expected_view, pinhole, resized
 from mapserver.surfels.surfel_map import TILE_SIZE_M, Surfels, surfels_of
 
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _FARTHEST_M = 1e5  # from the origin of a map: no site is larger
+_PAIRS_KEPT = 4  # of versions
 _REACH_M = min(FAR_M, 25.0)  # around the middle of a tile: what a request may read
 
 
@@ -43,6 +45,34 @@ class ExpectedViews:
                 self._kept = None
                 self._kept = key, surfels_of(manifest, self._store.blob, (float(middle[0]), float(middle[1]), _REACH_M))
             return expected_view(self._kept[1], lens, map_from_cam)
+
+
+class SurfelChanges:
+    """What changed between versions, one pair at a time; the last pairs stay in memory. Methods may be called from any thread."""
+
+    def __init__(self, store: MapStore, most_views: int | None = None) -> None:
+        """most_views: of a version; each costs a twentieth of a second of CPU. None: any number."""
+        self._store, self._most, self._lock = store, most_views, threading.Lock()
+        self._kept: dict[tuple[str, str], Changes] = {}
+
+    def between(self, site: str, before: int, after: int) -> Changes:
+        """From one version to another. StateError for one without surfels or with too many views; errors as of `changes_between`."""
+        key = self._store.version(site, before).manifest_sha256, self._store.version(site, after).manifest_sha256
+        with self._lock:
+            if key not in self._kept:
+                found = changes_between(self._seen(site, before), self._seen(site, after))
+                self._kept = dict([*self._kept.items()][1 - _PAIRS_KEPT :]) | {key: found}
+            return self._kept[key]
+
+    def _seen(self, site: str, version: int) -> SeenSite:
+        manifest = self._store.manifest(site, version)
+        surfels, camera = surfels_of(manifest, self._store.blob), manifest.camera
+        if self._most is not None and len(surfels.exposures) > self._most:
+            raise StateError(
+                f"version {version} of site {site} was seen from {len(surfels.exposures)} places, more than are compared here: "
+                "use `mapserver map changes` on the server"
+            )
+        return SeenSite(surfels, 0.5 * min(camera.width_px, camera.height_px) / camera.focal_px)
 
 
 def failure_camera(report: FailureReport) -> tuple[int, Array, CameraCalibration]:

@@ -33,7 +33,7 @@ _TURN = 1.0 / np.sqrt(2.0)  # about x: z of the map becomes y of SPZ
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """N flat Gaussians in `map`: points_map (N, 3), unit normals (N, 3), greys (N,) of 0 to 255, opacities (N,), sigmas_m (N,) along the disc."""
+    """N flat Gaussians in `map`: points_map, unit normals (N, 3), sigmas_m (N,) along the disc, greys (N,) of 0 to 255, opacities (N,)."""
 
     points_map: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -120,7 +120,7 @@ def _smallest_three(quaternions: Array) -> NDArray[np.uint32]:
     packed = largest.astype(np.uint32)
     for i in range(4):
         packed = np.where(largest == i, packed, packed << np.uint32(10) | codes[:, i])
-    return packed.astype("<u4")
+    return np.asarray(packed.astype("<u4"), np.uint32)
 
 
 def _quaternions(normals: Array) -> Array:

@@ -1,6 +1,7 @@
 """Expected views over HTTP."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter
 from support.fleet.served_api import Server, served_api
-from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
+from support.storage.map_samples import save_sample_draft, save_surfel_draft, seen_wall, wall
 
 POSE = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "yaw_deg": 0.0, "width_px": 188}
 
@@ -62,6 +63,33 @@ def test_many_views_are_slowed_down(server: Server, address: str) -> None:
     codes = [server.client.get(address, params=POSE).status_code for _ in range(12)]
     assert codes[0] == 200
     assert 429 in codes
+
+
+def test_what_changed_between_two_versions_is_a_plan_and_geojson(server: Server) -> None:
+    versions = [save_surfel_draft(server.store, surfels) for surfels in (seen_wall(), seen_wall(with_board=True))]
+    there = f"/v1/sites/lab/versions/{versions[0]}/diff/{versions[1]}/changes"
+    answer = server.client.get(f"{there}.png")
+    assert (answer.status_code, answer.headers["Content-Type"]) == (200, "image/png")
+    image = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (image == (178, 114, 0, 255)).all(axis=-1).any()
+    (feature,) = server.client.get(f"{there}.geojson").json()["features"]
+    (x, y), high = np.mean(feature["geometry"]["coordinates"][0][:4], axis=0), feature["properties"]
+    assert (x, y) == pytest.approx((1.0, 0.0), abs=0.1)
+    assert high["change"] == "appeared"
+    assert high["area_m2"] == pytest.approx(0.36, abs=0.1)
+    back = f"/v1/sites/lab/versions/{versions[1]}/diff/{versions[0]}/changes.geojson"
+    assert server.client.get(back).json()["features"][0]["properties"]["change"] == "vanished"
+    bare = save_sample_draft(server.store)
+    refused = server.client.get(f"/v1/sites/lab/versions/{bare}/diff/{versions[1]}/changes.png")
+    assert (refused.status_code, "surfel_map = true" in refused.json()["detail"]) == (409, True)
+    assert 429 in [server.client.get(f"{there}.png").status_code for _ in range(6)]
+
+
+def test_too_many_views_are_left_to_the_command(server: Server) -> None:
+    many = replace(seen_wall(), exposures=np.tile(seen_wall().exposures[:1], (601, 1)))
+    versions = [save_surfel_draft(server.store, surfels) for surfels in (many, seen_wall())]
+    answer = server.client.get(f"/v1/sites/lab/versions/{versions[0]}/diff/{versions[1]}/changes.png")
+    assert (answer.status_code, "mapserver map changes" in answer.json()["detail"]) == (409, True)
 
 
 def reported(server: Server, version: int | None, **changes: object) -> str:

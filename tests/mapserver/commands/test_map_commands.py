@@ -1,5 +1,6 @@
 """Surfels of a version as a file of Gaussians, read by another program."""
 
+import json
 from pathlib import Path
 
 import gsply
@@ -12,7 +13,7 @@ from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from mapserver.store import MapStore
 from mapserver.surfels.splat_file import Splats, splat_spz
 from mapserver.surfels.surfel_map import Surfels
-from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
+from support.storage.map_samples import save_sample_draft, save_surfel_draft, seen_wall, wall
 
 
 @pytest.fixture
@@ -77,6 +78,22 @@ def test_spz_of_any_direction_and_of_large_sites(tmp_path: Path) -> None:
     far = Surfels(np.array([[1e7, 0, 0]], np.float32), normals[:1], *np.full((2, 1), 3, np.uint8))
     with pytest.raises(UsageError, match="write a PLY"):
         splat_spz(Splats.of(far))
+
+
+def test_what_changed_is_written_as_a_plan_and_as_geojson(run, site, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store") as store:
+        for with_board in (False, True):
+            save_surfel_draft(store, seen_wall(with_board=with_board))
+    said = run("map", "changes", *site, 3, 4, tmp_path / "c.png")
+    assert "1 patches appeared" in said
+    assert "0 patches vanished" in said
+    assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
+    run("map", "changes", *site, 4, 3, tmp_path / "c.geojson")
+    found = json.loads((tmp_path / "c.geojson").read_text())
+    assert [feature["properties"]["change"] for feature in found["features"]] == ["vanished"]
+    assert "must end in .png or .geojson" in run("map", "changes", *site, 3, 4, tmp_path / "c.txt", status=2)
+    assert "surfel_map = true" in run("map", "changes", *site, 1, 4, tmp_path / "d.png", status=2)
+    assert not list(tmp_path.glob("d.*"))
 
 
 def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:

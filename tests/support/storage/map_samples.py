@@ -1,5 +1,7 @@
 """Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 
@@ -129,6 +131,14 @@ def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Su
     normals = np.tile(np.array([-1.0, 0.0, 0.0], np.float32), (len(y), 1))
     greys = np.where((np.abs(points[:, 1]) < 0.2) & (np.abs(points[:, 2]) < 0.2), 250, grey).astype(np.uint8)
     return Surfels(points, normals, np.full(len(y), edge_level, np.uint8), greys)
+
+
+def seen_wall(*, with_board: bool = False) -> Surfels:
+    """The wall as two views from the origin saw it, with a board of 0.6 m halfway before it."""
+    views = np.array([[0.0, y, 0.0, 1.0, 0.0, 0.0, 0.0] for y in (-0.1, 0.1)])
+    board = wall(1.0)
+    board = board[np.abs(board.points_map[:, 1:]).max(axis=1) < 0.3]
+    return replace(Surfels.joined([wall(), board] if with_board else [wall()]), exposures=views)
 
 
 def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -> int:

@@ -302,6 +302,24 @@ async def _difference(
                 )
             )
         html(_difference_facts(found))
+    lacks = [await load(maps.lacks_surfels, context.site, version) for version in (before, after)]
+    html(_changed_things(context, before, after, next((lack for lack in lacks if lack is not None), None)))
+
+
+def _changed_things(context: PageContext, before: int, after: int, lack: str | None) -> Markup:
+    """The plan of what appeared and vanished; lack: why there is none."""
+    if before == after:
+        return Markup()
+    if lack is not None:
+        return Markup('<p class="quiet">No plan of what was moved: {}.</p>').format(lack)
+    words = (
+        f"What stands otherwise in version {after} than in version {before}: blue appeared, orange vanished, pale was not seen by one of "
+        "them, grey is the same."
+    )
+    return Markup(
+        '<figure class="changes"><img src="../v1/sites/{0}/versions/{1}/diff/{2}/changes.png" alt="{3}" loading="lazy">'
+        '<figcaption>{3} <a href="../v1/sites/{0}/versions/{1}/diff/{2}/changes.geojson">As GeoJSON</a></figcaption></figure>'
+    ).format(context.site, before, after, words)
 
 
 def _difference_facts(found: Difference) -> Markup:
