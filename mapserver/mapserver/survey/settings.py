@@ -139,7 +139,7 @@ class SessionSettings(Section, frozen=True):
 class SegmentSettings(Section, frozen=True):
     """How a long survey is cut into segments, which are followed and adjusted in parallel."""
 
-    seconds: float = 0.0  # of a segment, at least; 0: never cut. A survey shorter than two of them stays whole
+    seconds: float = 120.0  # of a segment, at least; 0: never cut. A survey shorter than two of them stays whole
     overlap_s: float = 10.0  # before its first frame, in which its odometry starts
 
     def __post_init__(self) -> None:
