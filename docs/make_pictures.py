@@ -2,7 +2,7 @@
 
 map: docs/map.png, the survey of `make demo` as `mapserver build --picture` draws it; run the demo first.
 aisles: docs/aisles.gif, a robot that wakes among identical aisles; records and builds what it needs in out/pictures (ten minutes).
-dashboard: docs/dashboard.png, the fleet page over a made-up hall; needs Debian's chromium.
+dashboard: docs/dashboard.png, docs/failure.png and docs/walk.png, three pages over a made-up hall; needs Debian's chromium.
 """
 
 import shutil
@@ -129,26 +129,30 @@ def _moment(left: NDArray[np.uint8], landmarks_map: Array, estimates: Sequence[E
 
 
 def draw_dashboard() -> None:
-    """The fleet page of a made-up hall."""
+    """Pages of a made-up hall: the fleet, a failure, the walk through it."""
     sys.path.insert(0, str(REPOSITORY / "tests"))
     from playwright.sync_api import sync_playwright
 
-    from support.fleet.dashboard_scene import chromium, fill_store, serving, talking
+    from support.fleet.dashboard_scene import chromium, serving, talking
+    from support.fleet.operator_scene import fill_shift
 
     folder = WORK / "dashboard"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    fill_store(folder)
+    fill_shift(folder)
     with serving(folder) as served, talking(served.zenoh, 8), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 800})
-        page.goto(f"{served.http}/dashboard/")
-        page.wait_for_timeout(4000)
-        page.screenshot(path=str(folder / "page.png"))
+        page = browser.new_page(viewport={"width": 1100, "height": 700}, timezone_id="UTC")
+        for name, path in {"dashboard": "", "failure": "failures/15", "walk": "space?x=20&y=14"}.items():
+            page.goto(f"{served.http}/dashboard/{path}", timeout=90_000)
+            if name == "walk":
+                page.wait_for_function("document.querySelector('.expected img')?.naturalWidth === 320", timeout=90_000)
+            page.wait_for_timeout(4000)
+            page.screenshot(path=str(folder / f"{name}.png"))
         browser.close()
-    Pillow.open(folder / "page.png").convert("P", palette=Pillow.Palette.ADAPTIVE, colors=96).save(
-        HERE / "dashboard.png", optimize=True
-    )
+    for name in ("dashboard", "failure", "walk"):
+        small = Pillow.open(folder / f"{name}.png").convert("P", palette=Pillow.Palette.ADAPTIVE, colors=64)
+        small.save(HERE / f"{name}.png", optimize=True)
 
 
 PICTURES = {"map": draw_map, "aisles": draw_aisles, "dashboard": draw_dashboard}
