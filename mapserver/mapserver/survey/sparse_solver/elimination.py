@@ -169,4 +169,4 @@ def spread(firsts: AnyArray, counts: AnyArray) -> Indices:
     """Each of `firsts` and the numbers that follow it, as many as `counts` says."""
     ends = np.cumsum(counts)
     numbers = np.arange(int(ends[-1]) if len(ends) else 0)
-    return (numbers + np.repeat(firsts - ends + counts, counts)).astype(np.int32)
+    return np.asarray(numbers + np.repeat(firsts - ends + counts, counts), np.int32)
