@@ -99,7 +99,7 @@ def configuration_row(rows: list[Row], name: str) -> Row:
     shares = {situation: s.weight * sum(s.failures) for situation, s in found.items() if sum(s.failures)}
     causes = sorted(shares, key=lambda situation: -shares[situation])[:3]
     return {
-        "name": name, "failures": written(failures), "silent": written(silent), "robot_days": failures.robot_days,
+        "name": name, "situations": len(found), "failures": written(failures), "silent": written(silent), "robot_days": failures.robot_days,
         "least_days": failures.least_days, "causes": "; ".join(f"{c} {shares[c]:.2g}" for c in causes), "rate": failures,
     }  # fmt: skip
 
@@ -165,9 +165,11 @@ def draw(found: list[Row]) -> Figure:
 def main() -> None:
     """Rows, tables and picture of docs/studies/warehouse.md."""
     rows = results("warehouse", cases(), [SEED, rendered.SEED])
-    found = [extrapolated_row(rows), *(configuration_row(rows, name) for name in CONFIGURATIONS)]
+    driven = [name for name in CONFIGURATIONS if strata(rows, name, "failures")]
+    found = [extrapolated_row(rows), *(configuration_row(rows, name) for name in driven)]
     shown = [
-        Column("name", "configuration"), Column("failures", "failures per robot-day"), Column("silent", "silent ones"),
+        Column("name", "configuration"), Column("situations", "situations"), Column("failures", "failures per robot-day"),
+        Column("silent", "silent ones"),
         Column("robot_days", "effective robot-days", "{:.2g}"), Column("least_days", "of the situation simulated least", "{:.2g}"),
         Column("causes", "most of them"),
     ]  # fmt: skip
