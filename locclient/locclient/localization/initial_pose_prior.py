@@ -120,12 +120,14 @@ class InitialPosePrior:
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self._travelled_m + _PLACE_REACH_M)
 
-    def log_odds(self, hypothesis: PoseHypothesis, settings: TrackSettings) -> float:
-        """What a person's word for this place is worth against another: 0 for places that were not named, and of exact sources, which
-        exclude the others."""
-        if not self.is_revisable or not self.is_compatible(hypothesis):
-            return 0.0
-        return float(np.log1p(-settings.wrong_prior_share) - np.log(settings.wrong_prior_share))
+    def weighed(self, observations: Observations, settings: TrackSettings) -> Observations:
+        """The fixes of a query, with what a person's word for its place is worth to each: 0 for places that were not named. Exact sources
+        exclude the others instead."""
+        for _, hypothesis in observations if self.is_revisable else ():
+            if self.is_compatible(hypothesis):
+                share = settings.wrong_prior_share
+                hypothesis.told_log_odds = float(np.log1p(-share) - np.log(share))
+        return observations
 
     def confirms(self, hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
         """Whether it is so tight that one fix at its place confirms that; of a person's, at the place that was named."""

@@ -320,9 +320,7 @@ class Localizer:
         """The fixes of the query that goes on, with their poses at the present."""
         assert self._query_frame is not None
         found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
-        for _, hypothesis in found if self._prior else ():
-            hypothesis.told_log_odds = self._prior.log_odds(hypothesis, self._track)
-        return found
+        return found if self._prior is None else self._prior.weighed(found, self._track)
 
     def _odom_from_body(self) -> Array:
         assert self._last_odom_from_body is not None
