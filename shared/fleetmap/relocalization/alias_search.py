@@ -26,6 +26,7 @@ _OWN_LANDMARK_M = 0.5  # around what was recognized: it, and what of it was mapp
 _COMPARISONS_PER_SLICE = 3_000_000  # some ten milliseconds
 _MIN_VOTES = 6
 _BORDER_M = 12.0  # around the map's landmarks, where cameras may stand
+_REACH_M = 500.0  # within which look-alikes are looked for: memory must not go with how far away one landmark is
 _QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
 
 
@@ -81,8 +82,11 @@ class _Votes:
 
     def __init__(self, pairs: NDArray[np.int32], points_map: Array, landmarks_map: Array, map_from_cam: Array) -> None:
         self._map_from_cam, self._landmarks_map = map_from_cam, landmarks_map
-        self._low = landmarks_map[:, :2].min(axis=0) - _BORDER_M
-        high = landmarks_map[:, :2].max(axis=0) + _BORDER_M
+        here = map_from_cam[:2, 3]
+        self._low = np.maximum(landmarks_map[:, :2].min(axis=0) - _BORDER_M, here - _REACH_M)
+        high = np.maximum(
+            np.minimum(landmarks_map[:, :2].max(axis=0) + _BORDER_M, here + _REACH_M), self._low + 2 * _CELL_M
+        )
         self._shape = tuple(int(n) for n in np.ceil((high - self._low) / _CELL_M))
         self._offsets = [(points_map[:, :2] - map_from_cam[:2, 3]) @ turn.T for turn in _QUARTER_TURNS]
         # Landmarks of the place itself vote for it alone. Near a camera they lie in the same cell from whichever side they are seen.

@@ -1,9 +1,12 @@
 """Changes of a map by a survey: keyframes and landmarks that moved, landmarks that stand elsewhere or are new."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
+from mapserver.survey.finish.culling import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.joint_adjustment import Joint, free_observations
 from mapserver.survey.merge.landmark_persistence import Shift, shifts
@@ -33,6 +36,7 @@ def what_changes(
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
     fresh = new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
+    fresh &= _known_well(survey, joint, settings)
     again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
     new = chosen(marks, joint.own_points_map, fresh, free)
     added = fewer_keyframes(joined(again, new), settings.sessions.min_confirmations)
@@ -41,6 +45,13 @@ def what_changes(
     places[moved_keyframes] = cameras[moved_keyframes] @ se3_inverse(base.map.body_from_cam)
     change = Change(keep, points, places, added, rows, map_from_cam)
     return change, int(moved_keyframes.sum()), int(alone.sum() + (moved & keep).sum())
+
+
+def _known_well(survey: Survey, joint: Joint, settings: SurveySettings) -> Mask:
+    """(N,) own landmarks of the survey that are seen under an angle that places them, as a survey demands of those it hands on."""
+    marks = replace(survey.state.landmarks, points_map=joint.own_points_map)
+    placed = replace(survey.state, map_from_body=joint.map_from_body, landmarks=marks)
+    return np.asarray(parallax_rad(placed) >= np.radians(settings.cull.min_parallax_deg))
 
 
 def _keyframes_moved(base: BaseMap, joint: Joint, settings: SessionSettings) -> Mask:
