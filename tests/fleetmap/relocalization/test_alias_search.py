@@ -121,3 +121,15 @@ def test_a_twin_next_door_turned_by_little_is_the_place_itself() -> None:
     moved[:2, 3] += (0.2, -0.2)
     hall.camera = moved
     assert len(hall.twins()) == AISLES - 1
+
+
+def test_one_landmark_far_away_costs_no_memory_and_hides_no_twin() -> None:
+    """1500 km: cells for a map of that size would take hundreds of gigabytes."""
+    hall = Hall(np.random.default_rng(0))
+    twins = hall.twins()
+    hall.points_map = np.concatenate([hall.points_map, [[1.5e6, -3.2e4, 1.0]]])
+    hall.descriptors = np.concatenate([hall.descriptors, hall.seen[:1]])
+    found = hall.twins()
+    assert len(found) == len(twins)
+    places = [[np.round(twin.map_from_cam[:2, 3], 1).tolist() for twin in each] for each in (twins, found)]
+    assert sorted(places[0]) == sorted(places[1])

@@ -36,7 +36,7 @@ def what_changes(
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
     fresh = new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
-    fresh &= _known_well(survey, joint, settings)
+    fresh &= known_well(survey, joint, settings)
     again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
     new = chosen(marks, joint.own_points_map, fresh, free)
     added = fewer_keyframes(joined(again, new), settings.sessions.min_confirmations)
@@ -47,11 +47,12 @@ def what_changes(
     return change, int(moved_keyframes.sum()), int(alone.sum() + (moved & keep).sum())
 
 
-def _known_well(survey: Survey, joint: Joint, settings: SurveySettings) -> Mask:
+def known_well(survey: Survey, joint: Joint, settings: SurveySettings) -> Mask:
     """(N,) own landmarks of the survey that are seen under an angle that places them, as a survey demands of those it hands on."""
-    marks = replace(survey.state.landmarks, points_map=joint.own_points_map)
+    took_part = np.isfinite(joint.own_points_map).all(axis=1)
+    marks = replace(survey.state.landmarks, points_map=np.nan_to_num(joint.own_points_map))
     placed = replace(survey.state, map_from_body=joint.map_from_body, landmarks=marks)
-    return np.asarray(parallax_rad(placed) >= np.radians(settings.cull.min_parallax_deg))
+    return np.asarray(took_part & (parallax_rad(placed) >= np.radians(settings.cull.min_parallax_deg)))
 
 
 def _keyframes_moved(base: BaseMap, joint: Joint, settings: SessionSettings) -> Mask:

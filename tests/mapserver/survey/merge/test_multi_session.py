@@ -1,12 +1,19 @@
 """Parts of joining: stamps of several recordings on one clock, and keyframes that are enough for what they show."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 
 from fleetmap.geometry import se3, se3_inverse
-from fleetmap.sensors.samples import Trajectory
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import ImuSamples, Trajectory
+from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
+from mapserver.survey.merge.changes import known_well
 from mapserver.survey.merge.merge import fewer_keyframes
 from mapserver.survey.merge.multi_session import chained
+from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks
 from support.worlds.session_scene import session_scene
 
@@ -66,3 +73,21 @@ def test_a_rig_with_its_body_elsewhere_has_its_cameras_in_the_same_places() -> N
     other = scene.base.map.body_from_cam @ se3(np.eye(3), np.array([0.3, 0.1, -0.2]))
     base = BaseMap(scene.base.map, scene.base.camera, other)
     np.testing.assert_allclose(base.map_from_body @ other, scene.base.map_from_cam, atol=1e-12)
+
+
+def test_a_landmark_seen_under_no_angle_is_not_taken_into_a_map() -> None:
+    """Two landmarks of a drive along x: one beside it, one so far ahead that all rays to it are parallel, and one never adjusted."""
+    places = np.stack([se3(np.eye(3), np.array([0.5 * k, 0.0, 0.0])) for k in range(4)])
+    points = np.array([[1.0, 3.0, 0.0], [1.5e6, 0.0, 0.0], [np.nan] * 3])
+    keyframes = np.tile(np.arange(4, dtype=np.int32), 3)
+    pixels = np.full((12, 3), np.nan)
+    marks = Landmarks(
+        points, keyframes, np.repeat(np.arange(3, dtype=np.int32), 4), np.zeros(12, np.int64), pixels, np.ones((12, 2))
+    )
+    camera = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
+    none = np.zeros((4, 3))
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none, none, [])
+    state = SurveyState(np.arange(4), places, np.eye(4), camera, motion, marks)
+    survey: Any = SimpleNamespace(state=state)
+    joint: Any = SimpleNamespace(own_points_map=points, map_from_body=places)
+    assert known_well(survey, joint, SurveySettings()).tolist() == [True, False, False]
