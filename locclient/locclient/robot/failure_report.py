@@ -100,7 +100,7 @@ _MATCHES_WIDTH_PX = 800
 @dataclass(frozen=True)
 class RobotProfile:
     """What is the same in all reports of a robot: names of its site and itself, mounting, rectified camera, settings, noise and clock of
-    the IMU, and whether its pictures are blurred before anybody else sees them."""
+    the IMU, and how its pictures are seen by others: full, blurred or off (not at all)."""
 
     site: str
     robot: str
@@ -110,7 +110,7 @@ class RobotProfile:
     settings: LocalizerSettings
     imu: ImuNoise | None = None
     imu_minus_cam_s: float = 0.0
-    is_blurred: bool = False
+    pictures: str = "full"
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
@@ -195,8 +195,10 @@ def _has_map_changed(context: FailureContext, profile: RobotProfile, expected: i
 def _thumbnails(
     context: FailureContext, profile: RobotProfile, matches: Matches | None, cause: Cause
 ) -> tuple[Thumbnail, ...]:
+    if profile.pictures == "off":
+        return ()
     unmatched, running = context.unmatched, context.running
-    may_show = without_detail if profile.is_blurred else np.asarray
+    may_show = without_detail if profile.pictures == "blurred" else np.asarray
     pictures = context.onset.pictures
     made = [_thumbnail(stamp_ns, "frame", may_show(left), PICTURE_WIDTH_PX) for stamp_ns, left in pictures]
     if matches is not None and running is not None:

@@ -104,14 +104,17 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     left = frame(60).left
     bright = replace(told[0], unmatched=replace(told[0].unmatched, left=left))
     sharp, blurred = (
-        failure_report(bright, replace(profile, is_blurred=blur), report_id="ab" * 16, wall_ns=7).thumbnails
-        for blur in (False, True)
+        failure_report(bright, replace(profile, pictures=seen), report_id="ab" * 16, wall_ns=7).thumbnails
+        for seen in ("full", "blurred")
     )
     assert [each.stamp_ns for each in blurred] == [each.stamp_ns for each in sharp]
     edges = [cv2.Laplacian(grey(each[0].jpeg), cv2.CV_64F).var() for each in (sharp, blurred)]
     assert edges[1] < 0.1 * edges[0]
     assert is_like(sharp[3].jpeg, left, without_detail(left))
     assert is_like(blurred[3].jpeg, without_detail(left), left)
+    unseen = failure_report(bright, replace(profile, pictures="off"), report_id="ab" * 16, wall_ns=7)
+    assert b"\xff\xd8\xff" not in encode_message(unseen), "the beginning of a JPEG"
+    assert (unseen.thumbnails, unseen.landmarks_expected) == ((), report.landmarks_expected)
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())
     assert written["cause"] == "dark"
     assert all((tmp_path / "failures" / name).stat().st_size > 100 for name in written["thumbnails"])
