@@ -62,6 +62,11 @@ class SiteHistory:
         return newest, trial, tuple((info.version, info.state) for info in self.versions)
 
 
+Span = tuple[int | None, int | None]
+"""From when and until before when, nanoseconds since 1970; None: without an end."""
+EVER: Span = (None, None)
+
+
 class MapData:
     """Reads and changes maps in an open store. Methods may be called from any thread; errors are the store's."""
 
@@ -235,9 +240,13 @@ class MapData:
         end_request(self._store, site, request, actor)
         return f"Survey {request} is done."
 
-    def jobs(self, site: str) -> list[JobInfo]:
-        """The last jobs of a site, newest first."""
-        return self._store.jobs(site, limit=_JOBS_SHOWN)
+    def jobs(self, site: str, span_ns: Span = EVER) -> list[JobInfo]:
+        """The last jobs of a site that began in a time, newest first."""
+        return self._store.jobs(site, span_ns, limit=_JOBS_SHOWN)
+
+    def events(self, site: str, span_ns: Span) -> list[Event]:
+        """The last that happened to a site in a time, newest first."""
+        return self._store.events(site, span_ns)[::-1][:_EVENTS_SHOWN]
 
     def job(self, number: int) -> JobInfo:
         """One job."""

@@ -88,10 +88,18 @@ class HealthData:
         found = self._store.fleet.trace(site, robot, since_hour=hour_of(since_ns))
         return [row for row in found if row.heard_ns is not None and since_ns <= row.heard_ns < until_ns]
 
-    def recent_places(self, site: str) -> list[tuple[float, float]]:
-        """Where failures of the days that are shown began."""
-        since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
-        found = self._store.fleet.failures(FailureFilter(site=site, since_ns=since_ns), limit=_PLACES)
+    def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:
+        """A site's figures of whole hours: those that both ends lie in, too."""
+        first = 0 if since_ns is None else hour_of(since_ns)
+        end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
+        return kpis(_sum(self._store.fleet.hours(site, "site", since_hour=first, until_hour=end), first, end))
+
+    def places(self, site: str, since_ns: int | None = None, until_ns: int | None = None) -> list[tuple[float, float]]:
+        """Where failures of a time began; without one, of the days that are shown."""
+        if since_ns is None and until_ns is None:
+            since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
+        wanted = FailureFilter(site=site, since_ns=since_ns, until_ns=until_ns)
+        found = self._store.fleet.failures(wanted, limit=_PLACES)
         return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
 
     def failure(self, number: int) -> FailureDetail:

@@ -1,6 +1,7 @@
 """The common layout of all pages: navigation, light or dark look, and errors as sentences instead of a broken page."""
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
@@ -28,6 +29,8 @@ T = TypeVar("T")
 
 PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
 RESPONSE_TIMEOUT_S = 30.0
+_HOUR_NS = 3_600_000_000_000
+_WEEK_NS = 7 * 24 * _HOUR_NS
 _LOOK_COOKIE = "fleetmap_look"
 _ZONE_COOKIE = "fleetmap_zone"
 _TELL_ZONE = (
@@ -82,6 +85,35 @@ class PageContext:
     def range_fields(self) -> Markup:
         """Fields to choose that range by."""
         return time_fields(*("" if ns is None else self.written(ns) for ns in self.time_range()))
+
+    def range_form(
+        self, path: str, *, usual: str, chosen: Mapping[str, object] | None = None, fields: Markup | None = None
+    ) -> Markup:
+        """A form that shows a page for a range of time, and presets of one click that keep what is chosen beside it.
+
+        usual: names what is shown without a range. chosen: other query parameters; fields: where those are chosen in the same form.
+        """
+        kept, now_ns = dict(chosen or {}), time.time_ns()
+        day = self.written(now_ns)[:10]
+        spans = (
+            ("Last hour", self.written(now_ns - _HOUR_NS)),
+            ("Today", day),
+            ("Last 7 days", self.written(now_ns - _WEEK_NS)),
+        )
+        presets = [link(self.to(path, **kept | {"since": since}), words) for words, since in spans]
+        hidden = {"site": self.site} | (
+            {name: value for name, value in kept.items() if value} if fields is None else {}
+        )
+        return Markup(
+            '<form class="ask" method="get" action="{}">{}{}{}<button type="submit">Show</button>'
+            '<span class="presets">{}</span></form>'
+        ).format(
+            f"{self.root}/{path}",
+            joined(Markup('<input type="hidden" name="{}" value="{}">').format(*pair) for pair in hidden.items()),
+            fields or "",
+            self.range_fields(),
+            joined([*presets, link(self.to(path, **kept if fields is None else {}), usual)], " "),
+        )
 
     def written(self, stamp_ns: int) -> str:
         """A stamp as `since` and `until` of an address take it, to the minute."""

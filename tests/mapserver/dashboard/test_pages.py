@@ -213,6 +213,10 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("failures?sinc=2026-01-01", "this page knows site, robot"),
         ("failures?since=soon", "is no time; write"),
         ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
+        ("surveys?since=soon", "is no time; write"),
+        ("map?until=soon", "is no time; write"),
+        ("?since=soon", "is no time; write"),
+        ("?sinc=2026-01-01", "this page knows site, since, until"),
     ):
         assert words in httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text, path
     for path in ("plans/hall/99.png", "pictures/1/9.jpg", "underlays/hall/2/floor.png", "underlays/hall/99/grid.png"):
@@ -233,6 +237,21 @@ def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -
     within = shown(f"since={earlier}&until={later}", "Asia/Tokyo")
     assert "No failures match" not in within
     assert later in within, "the form says what was asked"
+
+
+def test_surveys_the_history_and_the_figures_keep_to_a_range(served: Served) -> None:
+    def shown(path: str, **query: str) -> str:
+        return httpx.get(f"{served.http}/dashboard/{path}", params=query, timeout=60).text
+
+    now = datetime.now(ZoneInfo("UTC"))
+    before = {"until": f"{now - timedelta(days=2):%Y-%m-%dT%H:%MZ}"}
+    within = {"since": f"{now - timedelta(hours=2):%Y-%m-%dT%H:%MZ}"}
+    assert "No job began in this time." in shown("surveys", **before)
+    assert "cameras are swapped" in shown("surveys", **within)
+    assert "Nothing happened in this time." in shown("map", **before)
+    assert "first survey" in shown("map", **within), "the reason in the history"
+    assert "Failures per robot-day, chosen hours" in shown("", **within)
+    assert "Failures per robot-day, last 24 h" in shown("")
 
 
 def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:

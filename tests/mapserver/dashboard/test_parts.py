@@ -2,8 +2,12 @@
 
 import base64
 import math
+import re
 from dataclasses import replace
+from datetime import UTC, datetime
+from html import unescape
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 import cv2
 import msgspec
@@ -21,6 +25,7 @@ from mapserver.build.job_lock import recorded_job
 from mapserver.dashboard import bar_chart, fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
+from mapserver.dashboard.layout import PageContext
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
@@ -30,7 +35,7 @@ from mapserver.dashboard.robot_history import SILENT, stretches
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_test import CanarySettings
-from mapserver.fleet_statistics.kpis import Counters, rate
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, rate
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
@@ -323,6 +328,31 @@ def test_health_of_a_site(store: MapStore) -> None:
     assert (known.robots, known.versions, known.tiles) == (["tug-7", "tug-9"], ["2"], ["1,0"])
     assert "dark" in known.causes
     assert health.site(SITE) is found
+    now_ns = time.time_ns()
+    assert health.span(SITE, None, None).failures.events == 1
+    assert health.span(SITE, now_ns - 10**12, now_ns + 1).failures.events == 1
+    assert health.span(SITE, None, now_ns - 2 * HOUR_NS).failures.events == 0
+    assert len(health.places(SITE)) == 2
+    assert health.places(SITE, None, now_ns - HOUR_NS) == []
+
+
+def test_presets_of_time_keep_what_else_is_chosen() -> None:
+    context = PageContext("/dashboard", "failures", SITE, UTC, {"since": "2026-01-02", "area": "aisle 2"})
+    form = context.range_form(
+        "failures", usual="Show all", chosen={"area": "aisle 2", "robot": None}, fields=Markup("")
+    )
+    named = dict(re.findall(r'<a href="/dashboard/failures[?]([^"]*)">([^<]*)</a>', form))
+    now = datetime.now(UTC)
+    assert list(named.values()) == ["Last hour", "Today", "Last 7 days", "Show all"]
+    asked = [dict(parse_qsl(unescape(query))) for query in named]
+    assert [each.get("area") for each in asked] == ["aisle 2"] * 3 + [None]
+    ages_h = [
+        (now - datetime.fromisoformat(each["since"]).replace(tzinfo=UTC)).total_seconds() / 3600 for each in asked[:3]
+    ]
+    assert ages_h[0] == pytest.approx(1, abs=0.02)
+    assert 0 <= ages_h[1] < 24.02
+    assert ages_h[2] == pytest.approx(168, abs=0.02)
+    assert 'name="since" value="2026-01-02T00:00"' in form
 
 
 def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:

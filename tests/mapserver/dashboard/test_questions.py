@@ -94,6 +94,24 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     assert operator.clicks <= MOST_CLICKS
 
 
+def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
+    page = operator.page
+    week = page.get_by_role("table", name="What got worse this week")
+    operator.click(week.get_by_role("link", name="aisle 2"))
+    operator.click(page.get_by_role("link", name="Today", exact=True))
+    expect(page.locator("select[name=area]")).to_have_value("aisle 2")
+    expect(page.locator("input[name=since]")).to_have_value(re.compile(r"^\d{4}-\d\d-\d\dT00:00$"))
+    assert operator.clicks <= MOST_CLICKS
+    operator.clicks = 0
+    operator.click(page.get_by_role("navigation", name="Areas").get_by_role("link", name="aisle 1"))
+    expect(page.locator("select[name=area]")).to_have_value("aisle 1")
+    operator.click(page.get_by_role("link", name="Last 7 days", exact=True))
+    where = page.get_by_role("table", name="Failures").locator("tbody tr td:nth-child(7)")
+    expect(where.first).to_have_text("aisle 1")
+    assert set(where.all_inner_texts()) == {"aisle 1"}
+    assert operator.clicks <= MOST_CLICKS
+
+
 def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
     """Undoing is two clicks and a form: the button, a name and a reason, and yes."""
     page = operator.page

@@ -5,6 +5,7 @@ from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.messages import FailureKind
+from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, FilterChoices
 from mapserver.dashboard.layout import (
     RESPONSE_TIMEOUT_S,
@@ -16,8 +17,8 @@ from mapserver.dashboard.layout import (
     show,
     version_map,
 )
-from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.markup import badge, choices, link, table
+from mapserver.dashboard.map_layers import Box, Layer, Mark, box_of, heat
+from mapserver.dashboard.markup import badge, choices, joined, link, table
 from mapserver.store import FailureFilter, FailureRow
 
 _REFRESH_S = 3.0
@@ -51,20 +52,25 @@ def install(services: Services) -> None:
 
 
 def _filters(context: PageContext, wanted: FailureFilter, known: FilterChoices) -> Markup:
-    return Markup(
-        '<form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}{}{}{}{}{}'
-        '<button type="submit">Show</button> <a href="{}">Show all</a></form>'
-    ).format(
-        f"{context.root}/failures",
-        context.site,
+    fields = [
         choices("robot", "Robot", known.robots, wanted.robot),
         choices("version", "Map version", known.versions, None if wanted.version is None else str(wanted.version)),
         choices("area", "Area", known.areas, wanted.area) if known.areas or wanted.area else "",
         choices("tile", "Tile", known.tiles, wanted.tile),
         choices("cause", "Cause", known.causes, wanted.cause),
-        context.range_fields(),
-        context.to("failures"),
-    )
+    ]
+    chosen = {name: context.query.get(name) for name in _KNOWN if name not in {"since", "until", "before"}}
+    form = context.range_form("failures", usual="Show all", chosen=chosen, fields=joined(fields))
+    return Markup("{}{}").format(form, _areas(context, known.areas))
+
+
+def _areas(context: PageContext, names: list[str]) -> Markup:
+    """Every named area, one click away; what else is chosen stays."""
+    if not names:
+        return Markup("")
+    kept = {name: context.query.get(name) for name in _KNOWN if name not in {"area", "tile", "before"}}
+    links = joined((link(context.to("failures", **kept | {"area": name}), name) for name in names), " ")
+    return Markup('<nav class="areas" aria-label="Areas">{}</nav>').format(links)
 
 
 async def _list(services: Services, context: PageContext, wanted: FailureFilter, before: int | None) -> None:
@@ -107,6 +113,13 @@ def failure_marks(context: PageContext, shown: list[FailureRow]) -> list[Mark]:
             words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
             found.append(Mark(row.x_map_m, row.y_map_m, tone_of(row), "cross", words, to_failure))
     return found
+
+
+async def failure_heat(services: Services, context: PageContext, box: Box) -> Layer:
+    """Where failures of the range in the address are dense, without one those of the last days; not shown until it is chosen."""
+    span_ns = context.time_range()
+    name = "Failures of the last days" if span_ns == EVER else "Failures of the chosen time"
+    return Layer(name, heat(await load(services.health.places, context.site, *span_ns), box), shown=False)
 
 
 def tone_of(row: FailureRow) -> str:

@@ -9,15 +9,17 @@ from nicegui import ui
 
 from fleetmap.messages import Status
 from mapserver.dashboard import fleet_parts
+from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Figure
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, notice, show, version_map
 from mapserver.dashboard.live import STATUSES, LiveRobot, LiveSite
-from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
+from mapserver.dashboard.map_layers import Layer, Mark, box_of
 from mapserver.dashboard.markup import age, badge, joined, link, share, table
+from mapserver.dashboard.pages.failures_page import failure_heat
 from mapserver.dashboard.pages.robot_page import where_words
 from mapserver.dashboard.site_map import SiteMap
-from mapserver.fleet_statistics.kpis import driven_words
+from mapserver.fleet_statistics.kpis import Kpis, driven_words
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
 from mapserver.floor_plan.areas import Areas
 
@@ -55,7 +57,9 @@ def install(services: Services) -> None:
             week = html(fleet_parts.worse_sentence(health.areas))
             trials = html(fleet_parts.trial_notices(health.trials, context.moment))
             drawn = await _map(services, context, live)
-            figures = html(_figures(live, health))
+            html(context.range_form("", usual="Last 24 h"))
+            chosen = await _chosen(services, context)
+            figures = html(_figures(live, health, chosen))
             worse = html(_worse(context, health))
             chart = html(_rates(health))
             robots = _table(context, live, health)
@@ -66,12 +70,14 @@ def install(services: Services) -> None:
                 live = await load(services.robots.look, context.site)
                 health = await load(services.health.site, context.site)
                 attention.set_content(str(_attention(context, live, areas)))
-                figures.set_content(str(_figures(live, health)))
+                figures.set_content(str(_figures(live, health, chosen)))
                 trials.set_content(str(fleet_parts.trial_notices(health.trials, context.moment)))
                 if drawn is not None:
                     drawn.show("Robots", _marks(context, live))
 
             async def refresh_table() -> None:
+                nonlocal chosen
+                chosen = await _chosen(services, context)
                 live = await load(services.robots.look, context.site)
                 health = await load(services.health.site, context.site)
                 rows = _rows(context, live, health)
@@ -85,7 +91,7 @@ def install(services: Services) -> None:
             ui.timer(_MOVE_EVERY_S, move, immediate=False)
             ui.timer(_TABLE_EVERY_S, refresh_table, immediate=False)
 
-        await show(services, request, "", site, build)
+        await show(services, request, "", site, build, ("since", "until"))
 
 
 def _attention(context: PageContext, live: LiveSite, areas: Areas) -> Markup:
@@ -133,14 +139,23 @@ def _since(context: PageContext, robot: LiveRobot) -> str | None:
     return f"{context.moment(robot.since_ns)} ({age(max(0.0, time.time() - robot.since_ns / 1e9))})"
 
 
-def _figures(live: LiveSite, health: SiteHealth) -> Markup:
+async def _chosen(services: Services, context: PageContext) -> Kpis | None:
+    """Figures of the range in the address, None without one."""
+    span_ns = context.time_range()
+    return None if span_ns == EVER else await load(services.health.span, context.site, *span_ns)
+
+
+def _figures(live: LiveSite, health: SiteHealth, chosen: Kpis | None) -> Markup:
+    """The robots now, and the figures of the last 24 h or of the chosen time."""
     heard = len(live.robots) - live.count("quiet")
     lost = live.count("bad")
     several = live.count("bad", STATUSES[Status.AMBIGUOUS][0])
-    day = health.day
+    day, when, trend = health.day, "last 24 h", f"; {health.trend}"
+    if chosen is not None:
+        day, when, trend = chosen, "chosen hours", ""
     return fleet_parts.figures(
         [
-            fleet_parts.localised_figure("Localised while driving, last 24 h", day),
+            fleet_parts.localised_figure(f"Localised while driving, {when}", day),
             Figure("Robots heard now", f"{heard} of {len(live.robots)}", "reported within 10 s"),
             Figure("Localised now", live.count("good"), f"{live.count('warn')} unsure or starting", "good"),
             Figure(
@@ -149,9 +164,9 @@ def _figures(live: LiveSite, health: SiteHealth) -> Markup:
                 f"{lost - several} lost, {several} where several places fit",
                 "bad" if lost else "",
             ),
-            fleet_parts.rate_figure("Failures per robot-day, last 24 h", day.failures, f"; {health.trend}"),
+            fleet_parts.rate_figure(f"Failures per robot-day, {when}", day.failures, trend),
             fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
-            Figure("Time with a usable position", share(day.availability) or "–", "of the last 24 h"),
+            Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
         ]
     )
 
@@ -163,9 +178,8 @@ async def _map(services: Services, context: PageContext, live: LiveSite) -> Site
         html(Markup('<p class="notice">No map is published yet: robots cannot be shown on it.</p>'))
         return None
     box = box_of(await load(services.maps.plan, context.site, version))
-    failures = await load(services.health.recent_places, context.site)
     layers = [
-        Layer("Failures of the last days", heat(failures, box), shown=False),
+        await failure_heat(services, context, box),
         Layer("Robots", _marks(context, live)),
     ]
     shown = await version_map(services, context, version, layers)

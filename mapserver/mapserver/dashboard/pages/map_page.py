@@ -8,12 +8,13 @@ from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from mapserver.dashboard.data import SiteHistory, VersionQuality
+from mapserver.dashboard.data import EVER, SiteHistory, VersionQuality
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
-from mapserver.dashboard.map_layers import Layer, coverage, squares
+from mapserver.dashboard.map_layers import Layer, box_of, coverage, squares
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, share, size, table
 from mapserver.dashboard.pages import survey_requests
 from mapserver.dashboard.pages.confirm import change_button
+from mapserver.dashboard.pages.failures_page import failure_heat
 from mapserver.dashboard.plan import Plan
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
@@ -55,10 +56,10 @@ def install(services: Services) -> None:
             if shown is not None:
                 await _one_version(services, context, shown)
             await _difference(services, context, history, number(before, "version"), number(after, "version"))
-            html(_events(context, history))
+            html(await _events(services, context, history))
             _follow(services, context, history)
 
-        await show(services, request, "map", site, build, ("version", "before", "after"))
+        await show(services, request, "map", site, build, ("version", "before", "after", "since", "until"))
 
 
 def _default_version(history: SiteHistory) -> int | None:
@@ -178,7 +179,9 @@ async def _one_version(services: Services, context: PageContext, version: int) -
         with ui.element("div"):
             html(Markup("<h2>Coverage of version {}</h2>").format(version))
             requests = await load(maps.survey_requests, context.site)
-            over = [Layer("Tiles", coverage(plan)), *survey_requests.layers(requests)]
+            html(context.range_form("map", usual="Last days", chosen={"version": context.query.get("version")}))
+            failed = await failure_heat(services, context, box_of(plan))
+            over = [Layer("Tiles", coverage(plan)), failed, *survey_requests.layers(requests)]
             drawn = await version_map(services, context, version, over)
             html(
                 Markup(
@@ -346,7 +349,10 @@ def _difference_facts(found: Difference) -> Markup:
     return facts(pairs)
 
 
-def _events(context: PageContext, history: SiteHistory) -> Markup:
+async def _events(services: Services, context: PageContext, history: SiteHistory) -> Markup:
+    """What happened to the site, in the range of the address or at last."""
+    span_ns = context.time_range()
+    events = history.events if span_ns == EVER else await load(services.maps.events, context.site, span_ns)
     rows = [
         (
             context.moment(event.stamp_ns),
@@ -355,10 +361,11 @@ def _events(context: PageContext, history: SiteHistory) -> Markup:
             event.actor or "mapserver",
             event.reason,
         )
-        for event in history.events
+        for event in events
     ]
+    empty = "No events yet." if span_ns == EVER else "Nothing happened in this time."
     return Markup("<h2>History</h2>{}").format(
-        table(("When", "What", "Details", "Who", "Why"), rows, empty="No events yet.", name="History")
+        table(("When", "What", "Details", "Who", "Why"), rows, empty=empty, name="History")
     )
 
 

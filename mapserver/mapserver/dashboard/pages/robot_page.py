@@ -179,10 +179,7 @@ def way(rows: list[TraceRow]) -> list[Line]:
 
 
 def _range_form(context: PageContext, robot: str) -> Markup:
-    return Markup(
-        '<h2>What it was, and when</h2><form class="ask" method="get" action="{}"><input type="hidden" name="site" value="{}">{}'
-        '<button type="submit">Show</button> <a href="{}">Last 24 h</a></form>'
-    ).format(f"{context.root}/robots/{robot}", context.site, context.range_fields(), context.to(f"robots/{robot}"))
+    return Markup("<h2>What it was, and when</h2>{}").format(context.range_form(f"robots/{robot}", usual="Last 24 h"))
 
 
 def _failures(context: PageContext, found: list[FailureRow], before: list[FailureRow]) -> Markup:

@@ -29,13 +29,15 @@ def install(services: Services) -> None:
     @ui.page("/surveys", title="Surveys – fleetmap", response_timeout=RESPONSE_TIMEOUT_S)
     async def surveys_page(request: Request, site: str | None = None, job: str | None = None) -> None:
         async def build(context: PageContext) -> None:
-            jobs = await load(services.maps.jobs, context.site)
+            span_ns = context.time_range()
+            jobs = await load(services.maps.jobs, context.site, span_ns)
             html(Markup("<h1>Surveys of {}</h1>").format(context.site))
+            html(context.range_form("surveys", usual="All jobs"))
             listed = html(_jobs(context, jobs))
 
             async def refresh() -> None:
                 nonlocal jobs
-                found = await load(services.maps.jobs, context.site)
+                found = await load(services.maps.jobs, context.site, span_ns)
                 if found != jobs:
                     jobs = found
                     listed.set_content(str(_jobs(context, found)))
@@ -47,13 +49,14 @@ def install(services: Services) -> None:
             if chosen is not None:
                 await _one_job(services, context, chosen)
 
-        await show(services, request, "surveys", site, build, ("job",))
+        await show(services, request, "surveys", site, build, ("job", "since", "until"))
 
 
 def _jobs(context: PageContext, jobs: list[JobInfo]) -> Markup:
+    span = {name: context.query.get(name) for name in ("since", "until")}
     rows = [
         (
-            link(context.to("surveys", job=job.id), f"Job {job.id}"),
+            link(context.to("surveys", **span | {"job": job.id}), f"Job {job.id}"),
             job.kind,
             badge(_TONES.get(job.state, "quiet"), _state(job)),
             context.written_moment(job.started),
@@ -64,6 +67,8 @@ def _jobs(context: PageContext, jobs: list[JobInfo]) -> Markup:
     ]
     head = ("Job", "Kind", "State", "Started", "Finished", "Result")
     empty = "No jobs yet: `mapserver build` and `mapserver nightly` record theirs here."
+    if any(span.values()):
+        empty = "No job began in this time."
     return Markup("<h2>Jobs, newest first</h2>{}").format(table(head, rows, empty=empty, name="Jobs"))
 
 
