@@ -9,6 +9,7 @@ from scipy.special import bdtr
 
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import FailureSummary, decode_summary
+from fleetmap.messages import CameraNote
 from mapserver.dashboard.fleet_parts import Trial, trial_of
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
@@ -105,6 +106,14 @@ class HealthData:
     def failure(self, number: int) -> FailureDetail:
         """One failure."""
         return self._store.fleet.failure(number)
+
+    def cameras(self, site: str) -> dict[str, CameraNote]:
+        """The robots' cameras as the newest failure report of each tells it; robots without one are left out."""
+        newest: dict[str, int] = {}
+        for row in self._store.fleet.failures(FailureFilter(site=site), limit=_PLACES):
+            newest.setdefault(row.robot, row.number)
+        told = {robot: self._store.fleet.failure(number).report.camera for robot, number in newest.items()}
+        return {robot: camera for robot, camera in told.items() if camera is not None}
 
     def replay(self, number: int) -> FailureSummary | None:
         """What the robot said in the seconds around a failure; None without a recording, and for one of another fleetmap."""

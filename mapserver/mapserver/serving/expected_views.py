@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.mapformat import CameraEntry
-from fleetmap.messages import FailureReport
+from fleetmap.messages import CameraNote, FailureReport
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.store import MapStore
@@ -89,13 +89,19 @@ def failure_camera(report: FailureReport) -> tuple[int, Array, CameraCalibration
         raise UsageError("the report does not tell the robot's camera; update fleetmap on the robot")
     map_from_cam = believed.target_from_source @ camera.base_from_cam.target_from_source
     (width_px, height_px), centre_px = camera.size_px, camera.centre_px
-    is_size = 16 <= width_px <= 1 << 14 and 1 <= height_px <= 4 * width_px
-    if not (is_size and np.isfinite(centre_px).all() and 0.1 < camera.focal_px / width_px < 50):
+    if not is_camera(camera):
         raise UsageError("the report's camera is none; check the robot's calibration")
     if not np.isfinite(map_from_cam).all() or np.abs(map_from_cam[:3, 3]).max() > _FARTHEST_M:
         raise UsageError("the reported position is none; check the robot's calibration")
     stereo = StereoCamera(camera.focal_px, *centre_px, 0.0, width_px, height_px)
     return report.version, map_from_cam, pinhole(stereo)
+
+
+def is_camera(camera: CameraNote) -> bool:
+    """Whether what a robot tells of its camera can be one."""
+    width_px, height_px = camera.size_px
+    is_size = 16 <= width_px <= 1 << 14 and 1 <= height_px <= 4 * width_px
+    return bool(is_size and np.isfinite(camera.centre_px).all() and 0.1 < camera.focal_px / width_px < 50)
 
 
 def survey_camera(entry: CameraEntry) -> CameraCalibration:

@@ -1,15 +1,21 @@
 """The map in space, in a real browser: everything that the version holds is drawn, robots move in it, colours mean what the scale says."""
 
+import math
+
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.geometry import Array
+from fleetmap.bus import ZenohBus
+from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
+from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.dashboard.space import points
 from mapserver.dashboard.space.points import space_bytes
-from support.fleet.dashboard_scene import ROBOTS, Served, opened, talking
+from mapserver.dashboard.space.robot_views import robot_views
+from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, talking
 from support.fleet.whole_page import assert_whole
 from support.storage.map_samples import random_tile
 
@@ -88,6 +94,52 @@ def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) ->
     assert_whole(page)
     assert seen.faults == []
     assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+def told_camera(**changes: object) -> CameraNote:
+    """A camera that looks forward from 0.3 m before the robot's middle, with its axis above the middle of the picture."""
+    mounted = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.0, 0.6]))
+    made = CameraNote(size_px=(640, 480), focal_px=320.0, centre_px=(320.0, 160.0), base_from_cam=Placement.of(mounted))
+    return msgspec.structs.replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"focal_px": 0.0},
+        {"focal_px": math.nan},
+        {"size_px": (1 << 20, 4)},
+        {"centre_px": (math.inf, 0.0)},
+        {"base_from_cam": Placement(position_m=(500.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))},
+        {"base_from_cam": Placement(position_m=(0.0, 0.0, 0.0), quat_wxyz=(math.nan, 0.0, 0.0, 0.0))},
+        {"base_from_cam": Placement(position_m=(0.0, 0.0, 0.0), quat_wxyz=(0.0, 0.0, 0.0, 0.0))},
+    ],
+)
+def test_what_is_no_camera_of_a_robot_is_left_out(changes: dict[str, object]) -> None:
+    assert robot_views({"tug-1": told_camera(**changes)}) == {}
+
+
+def test_a_robots_view_has_the_angles_and_the_mounting_of_its_own_camera() -> None:
+    view = robot_views({"tug-1": told_camera()})["tug-1"]
+    assert view.tangents == (-1.0, 1.0, -0.5, 1.0)
+    assert view.base_from_cam == (0, 0, 1, 0.3, -1, 0, 0, 0, 0, -1, 0, 0.6)
+
+
+def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Served) -> None:
+    report = msgspec.structs.replace(failure("tug-3", "f7"), camera=told_camera())
+    with ZenohBus.connect(served.zenoh) as bus:
+        ack = decode_message(bus.get(robot_key(SITE, "tug-3", "failures"), encode_message(report)), FailureAck)
+    assert not ack.refused
+    seen = opened(page, served, "space")
+    expect(page.locator(".nicegui-content")).to_contain_text(
+        "Robots that told their camera in a failure report (1) have its view"
+    )
+    page.wait_for_function(f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    views = {robot["name"]: np.reshape(robot["view"], (-1, 3)) for robot in page.evaluate(SEEN)["robots"]}
+    np.testing.assert_allclose(views["tug-3"].min(axis=0), [0.3, -1, -0.4], atol=1e-3)
+    np.testing.assert_allclose(views["tug-3"].max(axis=0), [1.3, 1, 1.1], atol=1e-3)
+    assert np.ptp(views["tug-2"], axis=0)[1] != pytest.approx(2, abs=0.01), "as wide as the survey's camera"
+    assert seen.faults == []
 
 
 def test_a_version_that_is_not_there_is_named(page: Page, served: Served) -> None:

@@ -18,6 +18,7 @@ from mapserver.dashboard.layout import (
 from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.dashboard.markup import link
 from mapserver.dashboard.site_map import SiteMap
+from mapserver.dashboard.space.robot_views import robot_views
 from mapserver.dashboard.space.space_view import SpaceScene, SpaceView
 
 _MOVE_EVERY_S = 1.0
@@ -64,13 +65,14 @@ async def _page(services: Services, context: PageContext, version: int, start: t
         quality.manifest.camera,
         f"../v1/sites/{context.site}/versions/{version}/view.png" if has_surfels else None,
         await load(maps.loops, context.site, version),
+        robot_views(await load(services.health.cameras, context.site)),
     )
     live = await load(services.robots.look, context.site)
     with ui.element("div").classes("pair"):
         view = SpaceView(scene, live.robots)
         with ui.element("div"):
             drawn = await version_map(services, context, version, [_HERE], is_small=True)
-            html(_words(context, version, has_surfels=has_surfels))
+            html(_words(context, version, len(scene.robot_views), has_surfels=has_surfels))
     _join(view, drawn)
     if start is not None:
         ui.timer(0.1, lambda: view.walk_to(*start), once=True)
@@ -92,17 +94,20 @@ def _join(view: SpaceView, drawn: SiteMap) -> None:
     drawn.on_pick(view.walk_to)
 
 
-def _words(context: PageContext, version: int, *, has_surfels: bool) -> Markup:
+def _words(context: PageContext, version: int, own: int, *, has_surfels: bool) -> Markup:
     walk = "Walk: arrow keys or buttons step along the places of the surveys and turn; a click into this plan goes to the nearest one. "
     drawn = (
         "The picture beside the dots is drawn from the map's surfels: what the survey's camera should see there. "
         if has_surfels
         else f"Version {version} has no surfels, so that one walks among its landmarks; `[survey] surfel_map` makes them. "
     )
+    views = f"Robots that told their camera in a failure report ({own}) have its view, all others that of the survey's camera."
+    if not own:
+        views = "No robot has told its camera, which failure reports do: they are drawn with the survey's."
     rest = (
         "Dots: landmarks. Blue: places that robots recognise, as their cameras stood. Green: revisits that hold the map together; red: "
         "those that were refused. Otherwise drag to turn, right button or two fingers to move, wheel to come nearer. Robots stand where "
-        "they last said that they are, and look where their heading says. "
+        f"they last said that they are, and look where their heading says. {views} "
     )
     back = link(context.to("map", version=version), f"Version {version} from above")
     return Markup('<p class="quiet">{}{}{}{}</p>').format(walk, drawn, rest, back)

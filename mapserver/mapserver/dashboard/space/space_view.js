@@ -5,7 +5,7 @@ import { OrbitControls, THREE } from "nicegui-scene";
 const SCALE = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 const TONES = { good: "#14924b", warn: "#c77700", bad: "#d1342f", quiet: "#8a9099" };
 const LOW_M = 0, HIGH_M = 6;
-const FRUSTUM_M = 0.25;
+const FRUSTUM_M = 0.25, ROBOT_VIEW = 4; // a robot's is so many times as long
 const TURN_DEG = 15, STEP_EVERY_MS = 700, FAR_M = 3;
 const VIEW_EVERY_MS = 1200, STILL_MS = 250; // the server draws one a second for an address
 const LOOPS = { loops: "#14924b", "refused loops": "#d1342f" };
@@ -159,10 +159,11 @@ export default {
       this.box = new THREE.Box3().setFromArray(count ? this.points : [-5, -5, 0, 5, 5, 2]);
       this.paint();
     },
-    frustums(rows) {
-      // Four rays from each camera's centre, and the rectangle that they end at.
-      const [wide, high] = this.scene.tangents.map((tangent) => tangent * FRUSTUM_M);
-      const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => [x * wide, y * high, FRUSTUM_M]);
+    frustums(rows, tangents) {
+      // Four rays from each camera's centre, and the rectangle that they end at; tangents of its edges: the survey's without any.
+      const [wide, high] = this.scene.tangents;
+      const [left, right, upper, lower] = tangents ?? [-wide, wide, -high, high];
+      const corners = [[left, upper], [right, upper], [right, lower], [left, lower]].map((xy) => [...xy, 1].map((side) => side * FRUSTUM_M));
       const lines = [];
       for (let n = 0; n < rows.length; n += 12) {
         const moved = ([x, y, z]) => [0, 4, 8].map((row) => rows[n + row] * x + rows[n + row + 1] * y + rows[n + row + 2] * z + rows[n + row + 3]);
@@ -207,7 +208,9 @@ export default {
       body.position.z = 0.2;
       mark.add(body, nameOf(robot));
       if (robot.heading_rad !== null) {
-        const view = this.frustums(new Float32Array([0, 0, 4, 0.35, -4, 0, 0, 0, 0, -4, 0, 0.4]));
+        const own = this.scene.cameras[robot.name];
+        const mounted = own ? own.slice(4) : [0, 0, 1, 0.35, -1, 0, 0, 0, 0, -1, 0, 0.4];
+        const view = this.frustums(new Float32Array(mounted.map((value, n) => (n % 4 < 3 ? ROBOT_VIEW * value : value))), own?.slice(0, 4));
         view.material.color.set(TONES[robot.tone] || TONES.quiet);
         mark.add(view);
       }
@@ -360,7 +363,8 @@ export default {
     seen() {
       const at = ({ mark, robot }) => {
         const on = mark.position.clone().project(this.camera);
-        return { ...robot, page: [(on.x + 1) / 2, (1 - on.y) / 2] };
+        const view = mark.children[2]?.geometry.getAttribute("position").array;
+        return { ...robot, view: view && Array.from(view), page: [(on.x + 1) / 2, (1 - on.y) / 2] };
       };
       const loops = Object.fromEntries(Object.keys(LOOPS).map((name) => [name, this.scene.loops.filter((loop) => (name === "loops") === !!loop[4]).length]));
       const { x, y, z } = this.camera.position;

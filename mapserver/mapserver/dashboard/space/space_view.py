@@ -1,7 +1,7 @@
 """The element that shows a version in three dimensions. Drawn by three.js, which comes with the page library."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from fleetmap.mapformat import CameraEntry
 from mapserver.dashboard.live import LiveRobot
 from mapserver.dashboard.space.loops import Loop
 from mapserver.dashboard.space.points import COARSEST_M, FINEST_M
+from mapserver.dashboard.space.robot_views import RobotView
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +21,7 @@ class SpaceScene:
     """What is shown. label: for those who cannot see it; address: of the version's bytes (mapserver.dashboard.space.points).
 
     camera: of the survey, through which one walks; view_address: of pictures of what it should see, None for a version without surfels.
+    robot_views: of robots that told their own camera; the others are drawn with the survey's.
     """
 
     label: str
@@ -27,6 +29,7 @@ class SpaceScene:
     camera: CameraEntry
     view_address: str | None
     loops: Sequence[Loop]
+    robot_views: Mapping[str, RobotView]
 
 
 class SpaceView(Element, component="space_view.js", default_classes="space-view"):
@@ -42,6 +45,7 @@ class SpaceView(Element, component="space_view.js", default_classes="space-view"
             "tangents": [side / 2 / camera.focal_px for side in (camera.width_px, camera.height_px)],
             "robots": shown(robots),
             "exactness": [1e3 * FINEST_M, 1e3 * COARSEST_M],
+            "cameras": {name: [*view.tangents, *view.base_from_cam] for name, view in scene.robot_views.items()},
             "loops": [[*loop.start_map_m, *loop.end_map_m, int(loop.is_accepted)] for loop in scene.loops],
         }
 
