@@ -2,7 +2,7 @@
 
 import ssl
 from collections.abc import AsyncIterator
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from fleetmap.foxglove.server import FoxgloveServer
     from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
+    from mapserver.fleet.fleet import Fleet
     from mapserver.operators.openid import Provider
     from mapserver.serving.bus_access import BusGuard
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
 
-_STOP_WITHIN_S = 5
+_STOP_WITHIN_S = 5  # requests under way may take so long still
+_END_WITHIN_S = 5.0  # and what works on threads so long after that
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
 _VIEW_EVERY_S = 0.5
@@ -179,6 +181,20 @@ def serve(
         with bus:
             http = _Http(listener, guard, certificate, bool(at.http_name), signer, shown)
             _run(maps, (bus, robots), http, settings)
+    _end_process()
+
+
+def _end_process() -> None:
+    """Ends with status 0 now. Taking two thousand modules apart changes nothing outside and takes 0.65 s of CPU: 20 s when it is busy."""
+    import atexit
+    import os
+    import sys
+
+    atexit._run_exitfuncs()
+    with suppress(OSError):  # nobody reads them any more
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(0)
 
 
 class _Shown(NamedTuple):
@@ -255,6 +271,7 @@ def _run(
         for task in background:
             task.cancel()
         await asyncio.gather(*background, return_exceptions=True)
+        _bound_the_end(fleet)
 
     api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey, http.signer)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
@@ -289,6 +306,27 @@ def _run(
             webhook.close()
         bus_service.close()
         fleet.flush()
+
+
+def _bound_the_end(fleet: "Fleet") -> None:
+    """Ends the process if a thread keeps it from ending by itself.
+
+    Reports of robots are kept first; a write of the store is whole or none.
+    """
+    import logging
+    import threading
+
+    def end() -> None:
+        others = [thread.name for thread in threading.enumerate() if not thread.daemon]
+        logging.getLogger(__name__).warning("stopped without waiting longer for %s", ", ".join(sorted(others)))
+        try:
+            fleet.flush()
+        finally:
+            _end_process()
+
+    bound = threading.Timer(_END_WITHIN_S, end)
+    bound.daemon = True
+    bound.start()
 
 
 def _listening(host: str, port: int) -> "socket.socket":

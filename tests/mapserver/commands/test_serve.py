@@ -85,6 +85,36 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
         assert process.wait(timeout=20) == 0
 
 
+_ENDS = """
+import atexit, sys, threading
+from mapserver.commands import serve
+class Kept:
+    def __del__(self): print("taken apart", flush=True)
+class Reports:
+    def flush(self): print("reports are kept", flush=True)
+kept = Kept()
+atexit.register(print, "at exit")
+"""
+
+
+@pytest.mark.parametrize(
+    ("ends", "told"),
+    [
+        ("serve._end_process()", ["at exit"]),
+        (
+            "serve._END_WITHIN_S = 0.2; serve._bound_the_end(Reports()); threading.Thread(target=threading.Event().wait).start()",
+            ["reports are kept", "at exit"],
+        ),
+    ],
+)
+def test_the_process_ends_at_once_whatever_it_holds(ends: str, told: list[str]) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", _ENDS + ends], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.stdout.splitlines(), done.returncode) == (told, 0), done.stderr
+
+
 def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     with MapStore.open(tmp_path / "store", create=True) as store:
