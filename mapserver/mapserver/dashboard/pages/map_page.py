@@ -179,7 +179,8 @@ async def _one_version(services: Services, context: PageContext, version: int) -
         with ui.element("div"):
             html(Markup("<h2>Coverage of version {}</h2>").format(version))
             requests = await load(maps.survey_requests, context.site)
-            html(context.range_form("map", usual="Last days", chosen={"version": context.query.get("version")}))
+            html(Markup('<p class="quiet">Time of the failures on this map (a layer) and of the history below:</p>'))
+            html(context.range_form("map", usual="Last 14 days", chosen={"version": context.query.get("version")}))
             failed = await failure_heat(services, context, box_of(plan))
             over = [Layer("Tiles", coverage(plan)), failed, *survey_requests.layers(requests)]
             drawn = await version_map(services, context, version, over)
