@@ -64,7 +64,7 @@ def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Arr
         colour, depth_m = colour / weight, depth_m / weight
         squared = (rays[..., 0] ** 2 + rays[..., 1] ** 2) / rays[..., 2] ** 2
     squared = np.nan_to_num(np.where(rays[..., 2] > 0, squared, _MOST_SQUARED), nan=0.0)
-    colour *= lens_factor(np.minimum(squared, _MOST_SQUARED), np.array(surfels.falloff)) * _brightness(
+    colour *= lens_factor(np.minimum(squared, _MOST_SQUARED), np.array(surfels.falloff)) * brightness(
         surfels, map_from_cam
     )
     picture = np.clip(np.round(filled(colour, unknown)), 0, 255).astype(np.uint8)
@@ -127,7 +127,7 @@ def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[
     return np.where(unknown, coarse, picture)
 
 
-def _brightness(surfels: Surfels, map_from_cam: Array) -> float:
+def brightness(surfels: Surfels, map_from_cam: Array) -> float:
     """That of the drives' views near this place that look this way, as their camera chose it."""
     if not len(surfels.exposures):
         return 1.0

@@ -21,7 +21,6 @@ import cv2
 import msgspec
 import numpy as np
 
-from benchmarks.common.picture_likeness import Grey, psnr_db, ssim
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
@@ -33,6 +32,7 @@ from mapserver.build.build import BuildRequest
 from mapserver.library import BuiltMap, settings_for
 from mapserver.quality.probes import held_out_frames
 from mapserver.surfels.expected_view import expected_view, pinhole, resized
+from mapserver.surfels.picture_likeness import Grey, psnr_db, ssim
 from mapserver.surfels.surfel_map import Surfels, surfels_of
 from mapserver.surfels.survey_surfels import grow_surfels
 

@@ -10,6 +10,8 @@ from plyfile import PlyData
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from fleetmap.preparation.painted_room import Ride, write_ride
+from fleetmap.sensors.samples import SensorSet
 from mapserver.store import MapStore
 from mapserver.surfels.splat_file import Splats, splat_spz
 from mapserver.surfels.surfel_map import Surfels
@@ -100,4 +102,13 @@ def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
     assert "surfel_map = true" in run("map", "splats", *site, 1, tmp_path / "a.ply", status=2)
     assert "has no version 7" in run("map", "splats", *site, 7, tmp_path / "a.ply", status=2)
     assert "must end in .ply or .spz" in run("map", "splats", *site, 2, tmp_path / "a.obj", status=2)
+    assert not list(tmp_path.glob("a.*"))
+
+
+def test_refinement_refuses_what_does_not_fit(run, site, tmp_path: Path) -> None:
+    write_ride(tmp_path / "other.mcap", Ride(), SensorSet.STEREO)
+    wanted = (*site, 2, tmp_path / "other.mcap")
+    assert "must end in .ply or .spz" in run("map", "refine", *wanted, tmp_path / "a.obj", status=2)
+    assert "is not of version 2" in run("map", "refine", *wanted, tmp_path / "a.ply", status=2)
+    assert "surfel_map = true" in run("map", "refine", *site, 1, tmp_path / "other.mcap", tmp_path / "a.ply", status=2)
     assert not list(tmp_path.glob("a.*"))

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import Group
-from fleetmap.errors import UsageError, disk_errors
+from fleetmap.errors import StateError, UsageError, disk_errors
 from mapserver.commands.options import SiteName, StoreFolder, check_output
 
 
@@ -67,4 +67,55 @@ def changes(
     )
 
 
-MAP = Group("What a version knows of how its site looks.", {"splats": splats, "changes": changes})
+def refine(
+    version: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
+    recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
+    site: SiteName,
+    store: StoreFolder,
+    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0,
+) -> None:
+    """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
+    check_output("FILE", file)
+    if file.suffix not in (".ply", ".spz"):
+        raise UsageError(f"{file} must end in .ply or .spz")
+    import numpy as np
+
+    from fleetmap.recordings import open_recording
+    from mapserver.store import MapStore
+    from mapserver.store.archive import decode_archive
+    from mapserver.surfels.refinement import looks_of
+    from mapserver.surfels.refinement import refine as refined_by
+    from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
+    from mapserver.surfels.surfel_map import surfels_of
+
+    with MapStore.open(store, read_only=True) as maps:
+        manifest = maps.manifest(site, version)
+        surfels, archive = surfels_of(manifest, maps.blob), maps.archive(site, version)
+    if archive is None:
+        raise StateError(
+            f"version {version} of site {site} has no archive here, which tells where its pictures were taken"
+        )
+    with open_recording(recording) as opened:
+        if opened.content_hash() not in {entry.sha256 for entry in manifest.recordings}:
+            names = ", ".join(entry.name for entry in manifest.recordings)
+            raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
+        own_rig = len(manifest.recordings) == 1
+        views = looks_of(opened, decode_archive(archive), surfels, own_rig=own_rig)
+    done = refined_by(Splats.of(surfels), views, steps, np.random.default_rng(seed))
+    said = (
+        f"{done.held_out} held-out views: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "
+        f"SSIM {done.before.ssim:.3f} before, {done.after.ssim:.3f} after"
+    )
+    if not done.is_better:
+        raise StateError(
+            f"not better, nothing is written; {said}; `mapserver map splats` writes the surfels as they are"
+        )
+    data = (splat_spz if file.suffix == ".spz" else splat_ply)(done.splats)
+    with disk_errors(f"{file} cannot be written", "choose another place"):
+        file.write_bytes(data)
+    typer.echo(f"{said}, from {done.learned} other views; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
+
+
+MAP = Group("What a version knows of how its site looks.", {"splats": splats, "changes": changes, "refine": refine})
