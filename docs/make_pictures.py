@@ -134,7 +134,7 @@ def draw_dashboard() -> None:
     from playwright.sync_api import sync_playwright
 
     from support.fleet.dashboard_scene import chromium, serving, talking
-    from support.fleet.operator_scene import fill_shift
+    from support.storage.operator_scene import fill_shift
 
     folder = WORK / "dashboard"
     shutil.rmtree(folder, ignore_errors=True)

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import SITE, Served, opened, serving, talking
-from support.fleet.operator_scene import WORSE, fill_shift
+from support.storage.operator_scene import WORSE, fill_shift
 
 MOST_CLICKS = 2
 

@@ -8,8 +8,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from mapserver.dashboard.space.loops import Loop, loops_of_version
 from support.fleet.dashboard_scene import Served, build_report, marks, opened, serving
-from support.fleet.operator_scene import fill_shift
 from support.fleet.whole_page import assert_whole
+from support.storage.operator_scene import fill_shift
 
 SEEN = "document.querySelector('.space-view').seen()"
 

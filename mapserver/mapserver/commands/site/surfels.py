@@ -1,11 +1,12 @@
 """`mapserver map`: what a version knows of how its site looks, for other programs."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import Group
+from fleetmap.cli_options import Group, TopicNames, expand_options
 from fleetmap.errors import StateError, UsageError, disk_errors
 from mapserver.commands.options import SiteName, StoreFolder, check_output
 
@@ -67,14 +68,23 @@ def changes(
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions:
+    """Options of `map refine`."""
+
+    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0
+    topic: TopicNames = None
+
+
+@expand_options
 def refine(
     version: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
     recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
-    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0,
+    options: RefineOptions,
 ) -> None:
     """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
     check_output("FILE", file)
@@ -82,7 +92,7 @@ def refine(
         raise UsageError(f"{file} must end in .ply or .spz")
     import numpy as np
 
-    from fleetmap.recordings import open_recording
+    from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from mapserver.store import MapStore
     from mapserver.store.archive import decode_archive
     from mapserver.surfels.refinement import looks_of
@@ -97,13 +107,13 @@ def refine(
         raise StateError(
             f"version {version} of site {site} has no archive here, which tells where its pictures were taken"
         )
-    with open_recording(recording) as opened:
+    with open_recording(recording, OpenOptions(topics=named_topics(options.topic))) as opened:
         if opened.content_hash() not in {entry.sha256 for entry in manifest.recordings}:
             names = ", ".join(entry.name for entry in manifest.recordings)
             raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
         own_rig = len(manifest.recordings) == 1
         views = looks_of(opened, decode_archive(archive), surfels, own_rig=own_rig)
-    done = refined_by(Splats.of(surfels), views, steps, np.random.default_rng(seed))
+    done = refined_by(Splats.of(surfels), views, options.steps, np.random.default_rng(options.seed))
     said = (
         f"{done.held_out} held-out views: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "
         f"SSIM {done.before.ssim:.3f} before, {done.after.ssim:.3f} after"

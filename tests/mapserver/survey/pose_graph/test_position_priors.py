@@ -17,14 +17,14 @@ _PERIOD_NS = 500_000_000
 BASE_FROM_BODY = se3(np.eye(3), np.array([0.3, 0.1, 0.25]))
 
 
-def _pose(x_m: float, y_m: float, yaw_rad: float) -> Array:
+def _map_from_body(x_m: float, y_m: float, yaw_rad: float) -> Array:
     return se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([x_m, y_m, 0.25]))
 
 
 def _truth() -> Array:
     """Up one aisle of 60 m, down the next: bodies a metre apart, 121 of them."""
-    up = [_pose(float(x), 0.0, 0.0) for x in range(61)]
-    return np.stack([*up, *[_pose(60.0 - x, _AISLE_M, np.pi) for x in range(60)]])
+    up = [_map_from_body(float(x), 0.0, 0.0) for x in range(61)]
+    return np.stack([*up, *[_map_from_body(60.0 - x, _AISLE_M, np.pi) for x in range(60)]])
 
 
 def _graph(rng: np.random.Generator) -> tuple[GraphMarginals, Any]:

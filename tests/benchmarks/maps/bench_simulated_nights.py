@@ -4,7 +4,7 @@ Sessions come from `support.estimator`. Which landmarks of the map they expect a
 is the product's own code; what is left out is the odometry of the surveys and their adjustment: keyframes stand at their true places,
 and a landmark of the map is found where the detector found it. Light hides a share of all landmarks by day and another in the evening.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_simulated_nights.py [--seed 611] [--nights 30] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_simulated_nights.py [--seed 611] [--nights 30] [--out FILE.json]
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Four surveys of a site, rendered, built, joined and published: seconds, memory, error of every frame, and loops that are wrong.
 
-    python tests/benchmarks/survey/bench_drives.py [--recordings FOLDER] [--segments SECONDS] [--scheduler local] [--frames A:B:C]
+    python tests/benchmarks/back_end/bench_drives.py [--recordings FOLDER] [--segments SECONDS] [--scheduler local] [--frames A:B:C]
 
 The site is `fulfilment-wing`: twelve aisles that look alike, driven both ways by surveys of 3 km in all. Recordings that the folder
 lacks are made there, in JPEG: half an hour of two cores. The published map is that of `mapserver build` with four recordings and
