@@ -5,26 +5,23 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-from support.fleet.dashboard_scene import ROBOTS, Served, chromium, fill_store, serving, talking
+from support.fleet.browser import Chromium, running_chromium
+from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
 
 expect.set_options(timeout=30_000)  # a busy machine answers late
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    path = chromium()
-    with sync_playwright() as playwright:
-        # The second name is how a page from elsewhere would reach loopback.
-        rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", rules])
+def browser() -> Iterator[Chromium]:
+    # The second name is how a page from elsewhere would reach loopback.
+    with running_chromium("--host-resolver-rules=MAP elsewhere.example 127.0.0.1") as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with serving(folder) as server:
@@ -38,8 +35,6 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(90_000)
-    yield context.new_page()
-    context.close()
+def page(browser: Chromium) -> Iterator[Page]:
+    with browser.context(viewport={"width": 1280, "height": 900}) as context:
+        yield context.new_page()

@@ -9,7 +9,7 @@ import httpx
 import msgspec
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from fleetmap.failure_summary import Moment
 from fleetmap.geometry import se3
@@ -17,6 +17,7 @@ from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.dashboard.failure import story
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
+from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving
 from support.fleet.failed_robot import send_replay, small_file
 from support.fleet.whole_page import assert_whole
@@ -125,7 +126,7 @@ def report(name: str, **changes: object) -> FailureReport:
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm. 5: with a view."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)

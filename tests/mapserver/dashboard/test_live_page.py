@@ -7,13 +7,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import Page, expect
 
 from fleetmap.bus import ZenohBus
 from fleetmap.live_survey import LiveFinding, LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from mapserver.store import MapStore
-from support.fleet.dashboard_scene import Served, chromium, serving, watch
+from support.fleet.dashboard_scene import Served, serving, watch
 
 STATE = LiveSurveyState(
     site="yard", recording="monday", stamp_ns=5, phase="tracking", seconds=12.0, frames=240, keyframes=40, latency_ms=17.2,
@@ -31,12 +31,9 @@ def served(tmp_path: Path) -> Iterator[Served]:
         yield server
 
 
-def test_a_survey_is_followed_to_its_end(served: Served) -> None:
-    path = chromium()
-    with sync_playwright() as playwright, ZenohBus.connect(served.zenoh) as bus:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
-        seen = watch(page)
+def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
+    seen = watch(page)
+    with ZenohBus.connect(served.zenoh) as bus:
         deadline_s = time.monotonic() + 20
         while time.monotonic() < deadline_s:  # the subscription is known everywhere after a moment
             bus.publish(live_key("yard"), encode_message(STATE))
@@ -93,5 +90,4 @@ def test_a_survey_is_followed_to_its_end(served: Served) -> None:
         finished = msgspec.structs.replace(STATE, phase="stored", version=1, words="")
         bus.publish(live_key("yard"), encode_message(finished))
         expect(page.locator(".notice.good")).to_contain_text("Version 1")
-        assert seen.faults == []
-        browser.close()
+    assert seen.faults == []

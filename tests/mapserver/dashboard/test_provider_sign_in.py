@@ -3,23 +3,20 @@
 import re
 from pathlib import Path
 
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import Page, expect
 
 from mapserver.store import MapStore
-from support.fleet.dashboard_scene import chromium, fill_store, serving
+from support.fleet.dashboard_scene import fill_store, serving
 from support.fleet.identity_provider import CLIENT, SECRET, identity_provider
 
 
-def test_a_browser_signs_in_at_the_provider(tmp_path: Path) -> None:
+def test_a_browser_signs_in_at_the_provider(page: Page, tmp_path: Path) -> None:
     fill_store(tmp_path / "store")
     (tmp_path / "secret").write_text(SECRET)
-    with identity_provider() as provider, sync_playwright() as playwright:
+    with identity_provider() as provider:
         provider.asks = True
         options = ("--oidc-issuer", provider.issuer, "--oidc-client", CLIENT, "--oidc-secret", str(tmp_path / "secret"))
         with serving(tmp_path / "store", *options, "--oidc-group", "map-people=operator") as served:
-            started = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
-            page = started.new_page(viewport={"width": 900, "height": 700})
-            page.set_default_timeout(90_000)
             # The provider stands under 127.0.0.1, which is another site than this.
             home = served.http.replace("127.0.0.1", "localhost")
             page.goto(f"{home}/dashboard/map?site=hall")
@@ -39,7 +36,6 @@ def test_a_browser_signs_in_at_the_provider(tmp_path: Path) -> None:
             page.screenshot(path=tmp_path / "refused.png")
             page.goto(f"{home}/dashboard/")
             expect(page).to_have_url(re.compile("/sign-in"))
-            started.close()
         assert [line for line in served.log if "ERROR" in line or "Traceback" in line or "Warning" in line] == []
     with MapStore.open(tmp_path / "store") as store:
         last = [(line.kind, line.operator) for line in store.audit_lines()][-4:]

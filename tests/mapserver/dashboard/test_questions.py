@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
+from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, opened, serving, talking
 from support.storage.operator_scene import WORSE, fill_shift
 
@@ -16,7 +17,7 @@ MOST_CLICKS = 2
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_shift(folder)
     with serving(folder) as server:

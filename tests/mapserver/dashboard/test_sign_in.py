@@ -12,11 +12,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from playwright.sync_api import BrowserContext, Page, expect
 
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
-from support.fleet.dashboard_scene import SITE, Served, chromium, failure, fill_store, serving, watch
+from support.fleet.browser import Chromium, running_chromium
+from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, serving, watch
 
 PASSWORD = "a password of the test"
 PAGES = ("", "map", "failures", "failures/1", "robots/tug-7", "surveys", "live")
@@ -37,15 +38,13 @@ def make_certificate(folder: Path, number: int) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+def browser() -> Iterator[Chromium]:
+    with running_chromium() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A server beyond loopback, with TLS and four operators."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
@@ -65,11 +64,9 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
-    context = browser.new_context(ignore_https_errors=True, viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(90_000)
-    yield context.new_page()
-    context.close()
+def page(browser: Chromium) -> Iterator[Page]:
+    with browser.context(ignore_https_errors=True, viewport={"width": 1280, "height": 900}) as context:
+        yield context.new_page()
 
 
 def sign_in(page: Page, served: Served, name: str, path: str = "/dashboard/") -> None:
@@ -200,13 +197,9 @@ def injected(context: BrowserContext, served: Served) -> bool:
 
 
 @pytest.mark.parametrize("is_policy_off", [False, True])
-def test_a_script_in_a_failures_words_does_not_run(browser: Browser, served: Served, is_policy_off: bool) -> None:
-    context = browser.new_context(ignore_https_errors=True, bypass_csp=is_policy_off)
-    context.set_default_timeout(90_000)
-    try:
+def test_a_script_in_a_failures_words_does_not_run(browser: Chromium, served: Served, is_policy_off: bool) -> None:
+    with browser.context(ignore_https_errors=True, bypass_csp=is_policy_off) as context:
         assert injected(context, served) is is_policy_off
-    finally:
-        context.close()
 
 
 def test_a_renewed_certificate_is_taken_while_the_server_runs(tmp_path: Path) -> None:

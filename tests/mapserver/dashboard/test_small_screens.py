@@ -4,9 +4,10 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
+from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, opened, serving, talking
 from support.fleet.whole_page import SIZES, WEAKEST_CONTRAST
 
@@ -18,7 +19,7 @@ _LEAST_PX = 32  # of a thing to tap; WCAG 2.2 asks for 24
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with serving(folder) as server, talking(server.zenoh, 8):
@@ -26,16 +27,14 @@ def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
-def phone(browser: Browser) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, color_scheme="dark")
-    context.set_default_timeout(90_000)
-    yield context.new_page()
-    context.close()
+def phone(browser: Chromium) -> Iterator[Page]:
+    with browser.context(viewport={"width": 390, "height": 844}, has_touch=True, color_scheme="dark") as context:
+        yield context.new_page()
 
 
 def assert_in_reach(page: Page, thing: Locator) -> None:
-    """Wholly within the width of the screen, and large enough."""
-    thing.scroll_into_view_if_needed()
+    """Wholly within the width of the screen, and large enough, once it stands still: a dialog opens from a point."""
+    thing.click(trial=True)
     box, size = thing.bounding_box(), page.viewport_size
     assert box["x"] >= 0, thing
     assert box["x"] + box["width"] <= size["width"], thing

@@ -4,9 +4,10 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from mapserver.dashboard.space.loops import Loop, loops_of_version
+from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import Served, build_report, marks, opened, serving
 from support.fleet.whole_page import assert_whole
 from support.storage.operator_scene import fill_shift
@@ -15,7 +16,7 @@ SEEN = "document.querySelector('.space-view').seen()"
 
 
 @pytest.fixture(scope="module")
-def served(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("store")
     fill_shift(folder)
     with serving(folder) as server:

@@ -1,7 +1,6 @@
 """A small hall with versions, jobs, robots and failures, a server over it, and a browser to look at it with."""
 
 import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 from playwright.sync_api import Page, expect
 
 from fleetmap.bus import ZenohBus
@@ -281,16 +279,6 @@ def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[
                 process.kill()
             process.wait(timeout=30)
             process.stdout.close()
-
-
-def chromium() -> str:
-    """The browser of the machine; a machine without one says so and skips."""
-    found = next(
-        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-    )
-    if found is None:
-        pytest.skip("NO BROWSER: the dashboard's pages are not tested; install Debian's chromium to do it")
-    return found
 
 
 @dataclass

@@ -1,0 +1,90 @@
+"""Debian's chromium for tests of the pages; what it takes too long to close is closed by force."""
+
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import psutil
+import pytest
+from playwright.sync_api import Browser, BrowserContext, Error, Playwright, sync_playwright
+
+_CLOSE_S = 30.0
+
+
+def chromium() -> str:
+    """The browser of the machine; a machine without one says so and skips."""
+    found = next(
+        (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+    )
+    if found is None:
+        pytest.skip("NO BROWSER: the dashboard's pages are not tested; install Debian's chromium to do it")
+    return found
+
+
+class Chromium:
+    """A browser that is started anew after it had to be killed.
+
+    Chromium sometimes never answers that a context is to be closed, and Playwright then waits for ever: the test has long
+    passed, and its whole run would fail.
+    """
+
+    def __init__(self, playwright: Playwright, arguments: Sequence[str] = ()) -> None:
+        self._playwright, self._arguments = playwright, ["--no-sandbox", *arguments]
+        self._browser = self._started()
+
+    def _started(self) -> Browser:
+        return self._playwright.chromium.launch(executable_path=chromium(), args=self._arguments)
+
+    @contextmanager
+    def context(self, **settings: Any) -> Iterator[BrowserContext]:
+        """A context of its own, with patience for a busy machine."""
+        if not self._browser.is_connected():
+            self._browser = self._started()
+        made = self._browser.new_context(**settings)
+        made.set_default_timeout(90_000)
+        try:
+            yield made
+        finally:
+            with _killed_when_late():
+                made.close()
+
+    def close(self) -> None:
+        """Ends the browser."""
+        with _killed_when_late():
+            self._browser.close()
+
+
+@contextmanager
+def running_chromium(*arguments: str) -> Iterator[Chromium]:
+    """A browser with further arguments for its command line, until the block ends."""
+    chromium()
+    with sync_playwright() as playwright:
+        started = Chromium(playwright, arguments)
+        try:
+            yield started
+        finally:
+            started.close()
+
+
+@contextmanager
+def _killed_when_late() -> Iterator[None]:
+    """Kills the browsers of this process when the block takes too long, and forgives what the block says of that."""
+    killed = threading.Event()
+
+    def kill() -> None:
+        killed.set()
+        for process in psutil.Process().children(recursive=True):
+            if "chrom" in process.name():
+                process.kill()
+
+    timer = threading.Timer(_CLOSE_S, kill)
+    timer.start()
+    try:
+        yield
+    except Error:
+        if not killed.is_set():
+            raise
+    finally:
+        timer.cancel()
