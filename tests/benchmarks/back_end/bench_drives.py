@@ -38,14 +38,14 @@ GATE = GateSettings(allow_unjudged_calibration=True, max_aliased_share=1.0)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
 
 
-def recordings_in(folder: Path, count: int) -> list[Path]:
+def recordings_in(folder: Path, count: int, seed: int = SEED) -> list[Path]:
     """The first drives; those that are not there are recorded."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"{robot}.mcap" for robot in ROBOTS[:count]]
     for robot, path in zip(ROBOTS, paths, strict=False):
         if not path.exists():
             begun = path.with_suffix(".begun")
-            record_order(Order(SCENARIO, robot=robot, seed=SEED), begun, "mcap", images="jpeg")
+            record_order(Order(SCENARIO, robot=robot, seed=seed), begun, "mcap", images="jpeg")
             begun.rename(path)
     return paths
 
@@ -122,6 +122,7 @@ def main() -> None:
     """Prints one line of JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path, default=Path("out/wing"))
+    parser.add_argument("--seed", type=int, default=SEED, help="of recordings that the folder lacks")
     parser.add_argument("--drives", type=int, default=len(ROBOTS), help="only the first so many")
     parser.add_argument(
         "--segments", type=float, default=None, help="seconds of a segment, 0 for none, default: the product's"
@@ -138,7 +139,7 @@ def main() -> None:
     options = BuildOptions(
         settings=settings, scheduler=given.scheduler, threads=given.threads, frames=given.frames, report=given.report
     )
-    paths = recordings_in(given.recordings, given.drives)
+    paths = recordings_in(given.recordings, given.drives, given.seed)
     with tempfile.TemporaryDirectory(dir=given.recordings) as folder:
         print(json.dumps(measure(paths, Path(folder) / "store", options)))
 
