@@ -1,7 +1,8 @@
 """An aisle of points that look like themselves: maps of it and sessions in it, as the test of joining takes them. No pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,12 +104,15 @@ def frame(seen: Aisle, map_from_body: Array, rng: np.random.Generator) -> FrameF
 
 def join_test(
     known: tuple[Relocalizer, NDArray[np.bool_]],
-    seen: Aisle,
+    seen: Aisle | Sequence[Aisle],
     map_from_body: Array,
     docks_map_from_survey: Array | None,
     seed: int = 0,
 ) -> JoinTest:
-    """The test of a session along these places in an aisle; its own frame begins at its first keyframe, and drifts."""
+    """The test of a session along these places in an aisle; its own frame begins at its first keyframe, and drifts.
+
+    seen: what each place shows, where it is not the same from all.
+    """
     rng = np.random.default_rng([7, seed])
     survey_from_body, chain = [np.eye(4)], []
     for k, (a, b) in enumerate(pairwise(map_from_body)):
@@ -116,6 +120,7 @@ def join_test(
         step[:3, 3] += rng.normal(0, 0.005, 3)
         survey_from_body.append(survey_from_body[-1] @ step)
         chain.append(PoseEdge(k, k + 1, step, _STEP_COV, is_loop=False))
-    frames = [frame(seen, place, rng) for place in map_from_body]
+    shown = repeat(seen) if isinstance(seen, Aisle) else seen
+    frames = [frame(one, place, rng) for one, place in zip(shown, map_from_body, strict=False)]
     visit = Visit(frames, np.stack(survey_from_body), chain, CAMERA, BODY_FROM_CAM, docks_map_from_survey)
     return JoinTest(*known, visit, SETTINGS.sessions)

@@ -143,13 +143,18 @@ class JoinTest:
 
     def _chosen_keyframes(self, most: int) -> list[int]:
         """Keyframes spread over the session, and as many again of those that position priors put beside a place of the map."""
-        visit, places = self._visit, self._relocalizer.view.map_from_cam
-        spread = range(0, len(visit.keyframes), max(1, -(-len(visit.keyframes) // most)))
+        visit = self._visit
+        spread = _spread(range(len(visit.keyframes)), most)
         if visit.map_from_survey is None:
-            return list(spread)
-        expected = visit.map_from_survey @ visit.survey_from_body @ visit.body_from_cam
-        beside = [k for k, at in enumerate(expected) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
-        return sorted({*spread, *beside[:: max(1, -(-len(beside) // most))]})
+            return spread
+        beside = self._beside_the_map(visit.map_from_survey @ visit.survey_from_body)
+        return sorted({*spread, *_spread(beside, most)})
+
+    def _beside_the_map(self, map_from_body: Array) -> list[int]:
+        """Keyframes at map_from_body (K, 4, 4) that look from beside a place of the map, its way."""
+        places = self._relocalizer.view.map_from_cam
+        looking = map_from_body @ self._visit.body_from_cam
+        return [k for k, at in enumerate(looking) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
 
     def _is_where_priors_say(self, placed: Placed) -> bool:
         visit = self._visit
@@ -163,9 +168,13 @@ class JoinTest:
         return bool(np.median(np.linalg.norm((by_fixes - by_priors)[:, :3, 3], axis=1)) < _PRIOR_M)
 
     def confirmation(self, map_from_body: Array) -> Confirmation:
-        """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4)."""
+        """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4).
+
+        Keyframes beside places of the map are asked: what an aisle's survey saw of the next one, through gaps in the racks, other goods
+        hide from within that one. Without any of them all are asked, and few landmarks are expected.
+        """
         visit, view = self._visit, self._relocalizer.view
-        ks = self._chosen_keyframes(_MOST_LOOKS)
+        ks = _spread(self._beside_the_map(map_from_body) or range(len(visit.keyframes)), _MOST_LOOKS)
         looks = [look(view, visit.camera, visit.keyframes[k], map_from_body[k] @ visit.body_from_cam) for k in ks]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
@@ -255,6 +264,11 @@ class JoinTest:
                 evidence=self.evidence(chosen, chosen.seen),
             )
         return chosen
+
+
+def _spread(keyframes: Sequence[int], most: int) -> list[int]:
+    """At most so many of them, evenly chosen."""
+    return list(keyframes[:: max(1, -(-len(keyframes) // most))])
 
 
 def _speaks_for_itself(seen: Confirmation) -> bool:

@@ -34,6 +34,12 @@ def shared_above(height_m: float) -> Aisle:
     return repainted(HOME, aisle(9), HOME.points_map[:, 2] < height_m)
 
 
+def together(*aisles: Aisle) -> Aisle:
+    """All of them as one."""
+    parts = ((one.points_map, one.descriptors, one.reaches_m) for one in aisles)
+    return Aisle(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
 def docks(metres: float = 0.0) -> Array:
     return se3(np.eye(3), np.array([metres, 0.0, 0.0])) @ PLACES[0]
 
@@ -117,12 +123,7 @@ def test_docks_are_not_doubted_because_some_other_place_is_a_little_like_it() ->
 
 def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart() -> None:
     twin = aisle(1, y_m=30.0)
-    both = Aisle(
-        *(
-            np.concatenate(parts)
-            for parts in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (HOME, twin)), strict=True)
-        )
-    )
+    both = together(HOME, twin)
     known = relocalizer(both, np.concatenate([drive(56), drive(56, y_m=30.0)]))
     said, held = verdict(join_test(known, both, PLACES, None))
     assert said is JoinVerdict.UNDECIDED
@@ -148,6 +149,20 @@ def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
 
 
 @pytest.mark.parametrize("is_there", [True, False])
+def test_what_the_map_saw_through_racks_is_not_asked_of_an_aisle_that_it_never_was_in(is_there: bool) -> None:
+    """A sixth of the session lies in the map's aisle. The rest leads through the next one, of whose goods the map knows the backs."""
+    backs, fronts = aisle(2, y_m=3.2), aisle(3, y_m=3.2)
+    known = relocalizer(together(HOME, backs), drive(56))
+    shown = [together(HOME if is_there else aisle(9), backs)] * 10 + [fronts] * 50
+    places = np.concatenate([drive(10, start_m=19.0), drive(50, start_m=3.0, y_m=3.2)])
+    said, located = verdict(join_test(known, shown, places, places[0]))
+    assert (said is JoinVerdict.JOINED) == is_there
+    if is_there:
+        assert isinstance(located, Located)
+        assert np.linalg.norm((located.map_from_body - places)[:10, :3, 3], axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("is_there", [True, False])
 def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_speaks_for_itself(is_there: bool) -> None:
     """A drive that adds an aisle like one of the map: the map has six metres of it, of which a fifth was restocked since, or all."""
     twin = aisle(1, y_m=30.0)
@@ -155,12 +170,7 @@ def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_sp
     shelf = np.unique(np.floor(twin.points_map * 2.0).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
     changed = (rng.random(shelf.max() + 1) < (0.2 if is_there else 1.0))[shelf]
     before = repainted(twin, aisle(77), changed)
-    both = Aisle(
-        *(
-            np.concatenate(parts)
-            for parts in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (HOME, before)), strict=True)
-        )
-    )
+    both = together(HOME, before)
     known = relocalizer(both, np.concatenate([drive(56), drive(16, start_m=2.0, y_m=30.0)]))
     places = drive(40, start_m=2.0, y_m=30.0)
     said, located = verdict(join_test(known, twin, places, places[0]))
