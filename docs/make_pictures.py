@@ -131,25 +131,27 @@ def _moment(left: NDArray[np.uint8], landmarks_map: Array, estimates: Sequence[E
 def draw_dashboard() -> None:
     """Pages of a made-up hall: the fleet, a failure, the walk through it."""
     sys.path.insert(0, str(REPOSITORY / "tests"))
-    from playwright.sync_api import sync_playwright
-
-    from support.fleet.dashboard_scene import chromium, serving, talking
+    from support.fleet.browser import running_chromium
+    from support.fleet.dashboard_scene import serving, talking
     from support.storage.operator_scene import fill_shift
 
     folder = WORK / "dashboard"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     fill_shift(folder)
-    with serving(folder) as served, talking(served.zenoh, 8), sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1100, "height": 700}, timezone_id="UTC")
+    with (
+        serving(folder) as served,
+        talking(served.zenoh, 8),
+        running_chromium() as browser,
+        browser.context(viewport={"width": 1100, "height": 700}, timezone_id="UTC") as context,
+    ):
+        page = context.new_page()
         for name, path in {"dashboard": "", "failure": "failures/15", "walk": "space?x=20&y=14"}.items():
             page.goto(f"{served.http}/dashboard/{path}", timeout=90_000)
             if name == "walk":
                 page.wait_for_function("document.querySelector('.expected img')?.naturalWidth === 320", timeout=90_000)
             page.wait_for_timeout(4000)
             page.screenshot(path=str(folder / f"{name}.png"))
-        browser.close()
     for name in ("dashboard", "failure", "walk"):
         small = Pillow.open(folder / f"{name}.png").convert("P", palette=Pillow.Palette.ADAPTIVE, colors=64)
         small.save(HERE / f"{name}.png", optimize=True)
