@@ -19,6 +19,7 @@ from support.fleet.dashboard_scene import (
     failure,
     marks,
     opened,
+    overlapping,
     place_of,
     talking,
 )
@@ -115,10 +116,9 @@ def test_names_do_not_overlap(page: Page, served: Served) -> None:
     with talking(served.zenoh, ROBOTS):
         opened(page, served, "")
         expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
-        named = [mark["page"] for mark in marks(page) if mark["isNamed"]]
+        named = [mark["nameBox"] for mark in marks(page) if mark["nameBox"]]
         assert 1 < len(named) < ROBOTS / 2
-        for number, (x, y) in enumerate(named):
-            assert all(abs(x - other_x) > 30 or abs(y - other_y) > 16 for other_x, other_y in named[:number])
+        assert not overlapping(named)
 
 
 def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served: Served) -> None:

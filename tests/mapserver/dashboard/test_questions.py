@@ -10,7 +10,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
 from support.fleet.browser import Chromium
-from support.fleet.dashboard_scene import SITE, Served, opened, serving, talking
+from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking
 from support.storage.operator_scene import WORSE, fill_shift
 
 MOST_CLICKS = 2
@@ -50,6 +50,23 @@ def operator(page: Page, served: Served) -> Iterator[Operator]:
         made.begin()
         yield made
     assert made.faults == []
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1280, 800)])
+def test_names_of_robots_keep_off_those_of_areas(page: Page, served: Served, size: tuple[int, int]) -> None:
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    with talking(served.zenoh, 8):
+        opened(page, served, "")
+        expect(page.locator(".figures")).to_contain_text("8 of 8", timeout=60_000)
+        names = [mark["nameBox"] for mark in marks(page) if mark["nameBox"]]
+        areas = page.evaluate(
+            "[...document.querySelectorAll('.area-name')].map(e => e.getBoundingClientRect()).filter(r => r.width)"
+            ".map(r => [r.left, r.top, r.right, r.bottom])"
+        )
+    assert len(areas) >= 3
+    assert len(names) >= 6
+    assert overlapping(names) == []
+    assert overlapping(names, areas) == []
 
 
 def test_which_robots_need_a_person_now(operator: Operator) -> None:

@@ -326,6 +326,19 @@ def marks(page: Page) -> list[dict[str, object]]:
     return page.evaluate("document.querySelector('.site-map').marks()")
 
 
+def overlapping(
+    boxes: Sequence[Sequence[float]], others: Sequence[Sequence[float]] | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of boxes (left, top, right, bottom) that share ground: of `boxes` among themselves, or with `others`."""
+    against = boxes if others is None else others
+    return [
+        (i, j)
+        for i, a in enumerate(boxes)
+        for j, b in enumerate(against)
+        if (others is not None or i < j) and a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+    ]
+
+
 def change(page: Page, words: str, *, name: str | None = "ada") -> None:
     """Asks for a change and confirms it."""
     page.get_by_role("button", name=words, exact=True).click()

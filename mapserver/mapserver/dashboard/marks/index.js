@@ -17,6 +17,7 @@ const JUMP_M = 6; // who goes further within a second did not drive there
 const NAMED_PX_PER_M = 16;
 const FEW = 12;
 const TRAIL = 60;
+const SIDES = [[false, -7], [false, 16], [true, -7], [true, 16]]; // of a mark, for its name: left of it, and where its line stands
 const REACH_PX = 12; // of the pointer
 const TICK_PX = 80;
 const ZOOM_BUTTONS_PX = 84;
@@ -168,7 +169,8 @@ export const Marks = Painted.extend({
     pen.fillStyle = this.tones.ink;
     for (const mark of this.named) {
       const [x, y] = this.at(mark.x, mark.y);
-      this.write(pen, mark.item.name, x + 9, y - 7);
+      const [left, base] = mark.side;
+      this.write(pen, mark.item.name, x + (left ? -9 - mark.width : 9), y + base);
     }
   },
   drawMark(pen, { tone, shape, heading_rad: heading }, x, y) {
@@ -203,20 +205,43 @@ export const Marks = Painted.extend({
     pen.globalAlpha = 1;
   },
   choose(pen) {
-    // Names that have room where marks go, those in trouble first; all others where few marks are or the map is near.
+    // Names that have room where marks go, those in trouble first; all others where few marks are or the map is near. They keep off the
+    // names of areas, but for trouble; a name stays on its side of the mark as long as it can.
     const marks = [...this.shown()].filter((mark) => mark.item.name);
     const [troubled, others] = [[], []];
     for (const mark of marks) (["bad", "warn"].includes(mark.item.tone) ? troubled : others).push(mark);
     const isNear = this.scale >= NAMED_PX_PER_M || marks.length <= FEW;
-    const taken = [];
-    this.named = [...troubled, ...(isNear ? others : [])].filter((mark) => {
-      const [x, y] = this.at(mark.item.x, mark.item.y);
+    const taken = this.areaNames();
+    const place = (mark, obstacles) => {
       mark.width ??= pen.measureText(mark.item.name).width;
-      const box = [x + 6, y - 20, x + 12 + mark.width, y - 3];
-      const hasRoom = taken.every((other) => other[0] > box[2] || box[0] > other[2] || other[1] > box[3] || box[1] > other[3]);
-      if (hasRoom) taken.push(box);
-      return hasRoom;
-    });
+      for (const side of mark.side ? [mark.side, ...SIDES] : SIDES) {
+        const box = this.nameBox(mark, side);
+        if (obstacles.some((other) => other[0] <= box[2] && box[0] <= other[2] && other[1] <= box[3] && box[1] <= other[3])) continue;
+        mark.side = side;
+        taken.push(box);
+        return true;
+      }
+      return false;
+    };
+    const areas = taken.length;
+    this.named = [
+      ...troubled.filter((mark) => place(mark, taken) || place(mark, taken.slice(areas))),
+      ...(isNear ? others : []).filter((mark) => place(mark, taken)),
+    ];
+  },
+  nameBox(mark, [left, base]) {
+    const [x, y] = this.at(mark.item.x, mark.item.y);
+    const [from, to] = left ? [x - 12 - mark.width, x - 6] : [x + 6, x + 12 + mark.width];
+    return [from, y + base - 13, to, y + base + 4];
+  },
+  corner() {
+    const container = this.map.getContainer(), box = container.getBoundingClientRect();
+    return [box.left + container.clientLeft, box.top + container.clientTop];
+  },
+  areaNames() {
+    const [left, top] = this.corner();
+    const boxes = [...this.map.getPane("tooltipPane").querySelectorAll(".area-name")].map((name) => name.getBoundingClientRect());
+    return boxes.filter((box) => box.width > 0).map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top]);
   },
   nearest(point) {
     let best, reach = REACH_PX;
@@ -238,11 +263,11 @@ export const Marks = Painted.extend({
     if (address) isApart ? window.open(address, "_blank", "noopener") : location.assign(address);
   },
   told() {
-    const corner = this.map.getContainer().getBoundingClientRect();
+    const [left, top] = this.corner();
     return [...this.shown()].map((mark) => {
       const [x, y] = this.at(mark.x, mark.y);
-      const isNamed = this.named.includes(mark);
-      return { ...mark.item, isNamed, page: [corner.x + this.map.getContainer().clientLeft + x, corner.y + this.map.getContainer().clientTop + y] };
+      const nameBox = this.named.includes(mark) ? this.nameBox(mark, mark.side).map((px, n) => px + (n % 2 ? top : left)) : null;
+      return { ...mark.item, nameBox, page: [left + x, top + y] };
     });
   },
 });
