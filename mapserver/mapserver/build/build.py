@@ -5,6 +5,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ from mapserver.build.survey_recordings import (
 )
 from mapserver.build.trajectory import OtherTrajectory
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, first_vocabulary, judged
-from mapserver.build.worker import SideProcess, open_executor, open_side_process
+from mapserver.build.worker import SideProcess, open_executor, open_side_process, open_side_thread
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
@@ -60,7 +61,7 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.merge.multi_session import Joined, Session, join_sessions
+from mapserver.survey.merge.multi_session import Joined, Joining, Session
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
@@ -253,13 +254,17 @@ def _survey(
         survey_options = SurveyConfig(settings, chosen.vocabulary, run.zones)
         tools = run.tools(executor, view, told)
 
-        def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
-            return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
+        pinhole, joining = None if base is None else base.camera, Joining(base, settings)
+        with open_side_thread(options.threads) as beside:
 
-        pinhole = None if base is None else base.camera
-        surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
-        tools.progress("joining", 0, 1)
-        joined = join_sessions(base, [Session(s.survey, s.map_from_survey) for s in surveyed], settings)
+            def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+                done = survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
+                beside(partial(joining.add, Session(done.survey, done.map_from_survey)))
+                return done
+
+            surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
+            tools.progress("joining", 0, 1)
+        joined = joining.finish()
     run.times.begin("vocabulary")
     chosen = judged(chosen, surveyed[0].survey, settings)
     run.times.begin("storing")

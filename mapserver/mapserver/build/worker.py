@@ -278,6 +278,26 @@ def open_side_process(threads: int | None) -> AbstractContextManager[SideProcess
     return nullcontext()
 
 
+@contextmanager
+def open_side_thread(threads: int | None) -> Iterator[Callable[[Callable[[], None]], None]]:
+    """Does what it is given, one piece after the other, beside the caller, who waits at the block's end and gets its first error there.
+
+    Where a survey has but one core it is done at once. An error of the block leaves out what has not begun.
+    """
+    if _cores(threads) == 1:
+        yield lambda work: work()
+        return
+    with ThreadPoolExecutor(1, thread_name_prefix="joining") as pool:
+        begun: list[Future[None]] = []
+        try:
+            yield lambda work: begun.append(pool.submit(work))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        for each in begun:
+            each.result()
+
+
 def _cores(threads: int | None) -> int:
     return threads or len(os.sched_getaffinity(0))
 

@@ -18,6 +18,7 @@ from mapserver.survey.bundle.bundle_adjustment import (
     optimize,
 )
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, scaled_noise
+from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.settings import SurveySettings
@@ -56,9 +57,9 @@ def adjust_jointly(
     anchored: the map is published, its keyframes stay within `anchor_sigma_m`; else only its first one holds it. A survey that
     sees nothing of the map keeps its shape, and its first keyframe its place.
     """
-    for _ in range(2):
+    for how in (settings.rough_bundle, settings.bundle):  # the first one tells what does not fit
         problem = _Problem(base, state, map_from_body, sightings, settings, anchored)
-        result = problem.solve()
+        result = problem.solve(how)
         sightings = problem.fitting(result.squared_sigmas, sightings)
         map_from_body = result.map_from_body[problem.old :]
     points = np.full((len(state.landmarks.points_map), 3), np.nan)
@@ -112,8 +113,8 @@ class _Problem:
         numbers = (np.concatenate(keyframes).astype(np.int32), np.concatenate(landmarks).astype(np.int32))
         self.observations = (*numbers, np.concatenate(pixels), np.concatenate(sigmas))
 
-    def solve(self) -> BundleResult:
-        """The optimum."""
+    def solve(self, how: BundleSettings) -> BundleResult:
+        """The optimum, as near as `how` asks for."""
         base, state = self.base, self.state
         turn = self.start[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
         shift = self.start[:, :3, 3] - np.einsum("kij,kj->ki", turn, state.map_from_body[:, :3, 3])
@@ -136,7 +137,7 @@ class _Problem:
             relative=[RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in motion.relative],
             priors=self._anchors(),
         )
-        return optimize(problem, self.settings.bundle)
+        return optimize(problem, how)
 
     def _anchors(self) -> list[PriorTerm]:
         s = self.settings.sessions

@@ -55,43 +55,62 @@ class Joined:
     estimated: tuple[Mask, ...]
 
 
-def join_sessions(base: SurveyMap | None, sessions: Sequence[Session], settings: SurveySettings) -> Joined:
+class Joining:
     """One map of `base` (the published one, None on a new site) and all sessions that find their place in it.
 
-    On a new site the first session with position priors begins, the first of all where none has any. What cannot be
-    joined at once is tried again after the others.
+    On a new site the first session with position priors begins, the first of all where none has any. Sessions with priors are joined
+    in their order as soon as they are added, which needs none that come later; those without, and what could not be joined at
+    once, are tried when all others are there. `add` and `finish` do not depend on when they are called.
     """
-    anchored, current = base is not None, base
-    outcomes: dict[int, Outcome] = {}
-    found: dict[int, tuple[Trajectory, Mask]] = {}
-    waiting = sorted(range(len(sessions)), key=lambda n: sessions[n].map_from_survey is None)
-    if current is None:
-        first = waiting.pop(0)
-        current = _begun(sessions[first])
-        outcomes[first] = Outcome(first, JoinVerdict.JOINED, "begins the map")
-        found[first] = (current.trajectory, current.trajectory_estimated)
-    progress = True
-    while waiting and progress:
-        progress = False
-        for number in list(waiting):
-            session = sessions[number]
-            result = extend(
-                current, session.survey, settings, anchored=anchored, map_from_survey=session.map_from_survey
-            )
+
+    def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
+        self._settings, self._anchored, self._current = settings, base is not None, base
+        self._sessions: list[Session] = []
+        self._waiting: list[int] = []
+        self._outcomes: dict[int, Outcome] = {}
+        self._found: dict[int, tuple[Trajectory, Mask]] = {}
+        self._has_grown = False
+
+    def add(self, session: Session) -> None:
+        """The next session."""
+        self._sessions.append(session)
+        self._waiting.append(len(self._sessions) - 1)
+        if session.map_from_survey is not None:
+            self._try(self._waiting[-1])
+
+    def finish(self) -> Joined:
+        """The map, and what became of every session."""
+        self._waiting.sort(key=lambda n: self._sessions[n].map_from_survey is None)
+        for number in [n for n in self._waiting if self._sessions[n].map_from_survey is None]:
+            self._try(number)
+        while self._waiting and self._has_grown:
+            self._has_grown = False
+            for number in list(self._waiting):
+                self._try(number)
+        if self._current is None:
+            raise ValueError("no session to begin a map with")
+        order = sorted(self._found)
+        trajectories, estimated = tuple(self._found[n][0] for n in order), tuple(self._found[n][1] for n in order)
+        joined_map = with_trajectories(self._current, trajectories, estimated) if order else self._current
+        outcomes = tuple(self._outcomes[n] for n in sorted(self._outcomes))
+        return Joined(joined_map, outcomes, trajectories, estimated)
+
+    def _try(self, number: int) -> None:
+        session = self._sessions[number]
+        if self._current is None:
+            self._current = _begun(session)
+            outcome = Outcome(number, JoinVerdict.JOINED, "begins the map")
+        else:
+            place, anchored = session.map_from_survey, self._anchored
+            result = extend(self._current, session.survey, self._settings, anchored=anchored, map_from_survey=place)
             if isinstance(result, NotJoined):
-                outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
-                continue
-            outcomes[number] = Outcome(number, JoinVerdict.JOINED, _words(result), result.counts, result.evidence)
-            current, progress = result.map, True
-            found[number] = (current.trajectory, current.trajectory_estimated)
-            waiting.remove(number)
-    order = sorted(found)
-    return Joined(
-        with_trajectories(current, [found[n][0] for n in order], [found[n][1] for n in order]) if order else current,
-        tuple(outcomes[n] for n in sorted(outcomes)),
-        tuple(found[n][0] for n in order),
-        tuple(found[n][1] for n in order),
-    )
+                self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
+                return
+            self._current, self._has_grown = result.map, True
+            outcome = Outcome(number, JoinVerdict.JOINED, _words(result), result.counts, result.evidence)
+        self._outcomes[number] = outcome
+        self._found[number] = (self._current.trajectory, self._current.trajectory_estimated)
+        self._waiting.remove(number)
 
 
 def _words(result: Extension) -> str:

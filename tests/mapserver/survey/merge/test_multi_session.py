@@ -4,15 +4,18 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
+from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.changes import known_well
+from mapserver.survey.merge.join_test import JoinVerdict, NotJoined
 from mapserver.survey.merge.merge import fewer_keyframes
-from mapserver.survey.merge.multi_session import chained
+from mapserver.survey.merge.multi_session import Joining, Session, chained
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.tracks.tracks import Landmarks
 from support.worlds.session_scene import session_scene
@@ -91,3 +94,52 @@ def test_a_landmark_seen_under_no_angle_is_not_taken_into_a_map() -> None:
     survey: Any = SimpleNamespace(state=state)
     joint: Any = SimpleNamespace(own_points_map=points, map_from_body=places)
     assert known_well(survey, joint, SurveySettings()).tolist() == [True, False, False]
+
+
+class Sites:
+    """Stands for `extend`: maps are lists of sessions' letters, and each session needs another one in the map."""
+
+    def __init__(self, needs: dict[str, str]) -> None:
+        self.needs, self.tried = needs, ""
+
+    def extend(self, current: Any, survey: Any, *_: object, **__: object) -> Any:
+        self.tried += survey.name
+        if self.needs[survey.name] not in current.letters:
+            return NotJoined(f"{survey.name} needs {self.needs[survey.name]}")
+        evidence = SimpleNamespace(fixes=3, places=3, cells_seen=9, cells_expected=9)
+        grown = made_up_map(current.letters + survey.name)
+        return SimpleNamespace(map=grown, counts=None, evidence=evidence)
+
+
+def made_up_map(letters: str) -> Any:
+    drive = trajectory(10.0 * ord(letters[-1]), 4)
+    return SimpleNamespace(letters=letters, trajectory=drive, trajectory_estimated=np.ones(4, bool))
+
+
+@pytest.mark.parametrize(
+    ("sessions", "needs", "tried", "in_map"),
+    [
+        ("ABcd", {"A": "d", "B": "c", "d": "B"}, "dABdA", "cBdA"),
+        ("abcD", {"b": "c", "c": "a", "D": "b"}, "bcDbD", "acbD"),
+        ("AB", {"B": "x"}, "B", "A"),
+    ],
+)
+def test_sessions_join_when_what_they_need_is_there(
+    sessions: str, needs: dict[str, str], tried: str, in_map: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Small letters have position priors: they are tried as they come, the others behind them, what failed until nothing grows."""
+    sites = Sites(needs)
+    monkeypatch.setattr(multi_session, "extend", sites.extend)
+    monkeypatch.setattr(multi_session, "_begun", lambda session: session.survey.map)
+    monkeypatch.setattr(multi_session, "with_trajectories", lambda found, *_: found)
+    joining = Joining(None, SurveySettings())
+    for letter in sessions:
+        survey: Any = SimpleNamespace(name=letter, map=made_up_map(letter))
+        joining.add(Session(survey, np.eye(4) if letter.islower() else None))
+    joined: Any = joining.finish()
+    assert joined.map.letters == in_map
+    assert sites.tried == tried
+    assert [sessions[o.number] for o in joined.outcomes] == list(sessions)
+    assert {sessions[o.number] for o in joined.outcomes if o.verdict is JoinVerdict.JOINED} == set(in_map)
+    stamps = [t.stamps_ns[0] // (10 * SECOND_NS) for t in joined.trajectories]
+    assert "".join(map(chr, stamps)) == "".join(letter for letter in sessions if letter in in_map)
