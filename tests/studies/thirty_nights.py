@@ -53,9 +53,9 @@ def snake(layout: Layout) -> Route:
     return Route((*points, points[0], (ends[0] + 6.0, points[0][1])))
 
 
-def tour(layout: Layout) -> Route:
-    """An aisle of each third, each in the direction that surveys drive it."""
-    y, left, right = [layout.aisle_y_m(aisle) for aisle in (0, 3, 4)], 2.7, layout.length_m - 2.7
+def tour(layout: Layout, aisles: tuple[int, int, int] = (0, 3, 4)) -> Route:
+    """An aisle of each third, each in the direction that surveys drive it: even ones, odd ones back, even ones."""
+    y, left, right = [layout.aisle_y_m(aisle) for aisle in aisles], 2.7, layout.length_m - 2.7
     return Route(((left, y[0]), (right, y[0]), (right, y[1]), (left, y[1]), (left, y[2]), (right, y[2])))
 
 
@@ -64,13 +64,15 @@ def aisles_of(night: int) -> tuple[int, int]:
     return (3, 4) if night in CLOSED and night % 3 == 1 else THIRDS[night % 3]
 
 
-def scenario(night: int) -> Scenario:
-    """The site on the day after a night, with the survey of that night and the robot of the day."""
+def scenario(night: int, aisles: tuple[int, int, int] = (0, 3, 4)) -> Scenario:
+    """The site on the day after a night, with the survey of that night and the robot of the day, in these aisles."""
     layout = BEFORE if night < MOVED else AFTER
     route = snake(layout) if night == 0 else loop(layout, *aisles_of(night))
     dark = (Fault("camera-dark", 4.0, 1e6),) if night == DARK else ()
     survey = Run("surveyor", (route,), rate_hz=7.5, is_sharp=True, faults=dark)
-    return Scenario("", layout, {f"survey-{night}": survey, f"robot-{night}": Run("tote", (tour(layout),), 10.0)})
+    return Scenario(
+        "", layout, {f"survey-{night}": survey, f"robot-{night}": Run("tote", (tour(layout, aisles),), 10.0)}
+    )
 
 
 def record(night: int, run: str, seed: int = SEED) -> str:

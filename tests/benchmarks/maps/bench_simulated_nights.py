@@ -4,7 +4,10 @@ Sessions come from `support.estimator`. Which landmarks of the map they expect a
 is the product's own code; what is left out is the odometry of the surveys and their adjustment: keyframes stand at their true places,
 and a landmark of the map is found where the detector found it. Light hides a share of all landmarks by day and another in the evening.
 
-    PYTHONPATH=tests python tests/benchmarks/maps/bench_simulated_nights.py [--seed 611] [--nights 30] [--out FILE.json]
+Each day three robots wake in three aisles and drive twice: with the one set of landmarks that the product chooses, and with a set of the
+same size for the light of that day, in which what surveys in that light saw comes first.
+
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_simulated_nights.py [--seed 611] [--nights 30] [--every 1] [--out FILE.json]
 """
 
 import argparse
@@ -49,6 +52,8 @@ from support.estimator.simulated_run import EstimatorSession, Found
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 EVENINGS = range(10, 20)
+TOURS = ((0, 3, 4), (2, 5, 0), (4, 1, 2))  # aisles of the three robots
+SEEN_LATELY = 6  # surveys of a light: two of every third of the site
 HELD = (DARK, *(night for night in CLOSED if night % 3 == 1))  # as the rendered study's nights were
 HIDDEN_SHARE = 0.3  # of all landmarks, in either light; an assumption
 FOUND_SHARE = (
@@ -97,9 +102,9 @@ class Visit(NamedTuple):
         return SessionFrames(self.keyframes, Trajectory(stamps_ns, self.map_from_body), np.ones(len(stamps_ns), bool))
 
 
-def session_of(night: int, run: str, seed: int) -> LitSession:
-    """The survey of a night or the robot of the day after it."""
-    SCENARIOS[SCENARIO] = partial(scenario, night)
+def session_of(night: int, run: str, seed: int, aisles: tuple[int, int, int] = TOURS[0]) -> LitSession:
+    """The survey of a night, or a robot of the day after it in these aisles."""
+    SCENARIOS[SCENARIO] = partial(scenario, night, aisles)
     try:
         session = prepare(Order(SCENARIO, seed=seed, day=night + (run == "robot"), robot=f"{run}-{night}"))
     finally:
@@ -161,6 +166,12 @@ class Nights:
     survey: SurveyMap
     simulated: dict[int, int]
     rng: np.random.Generator
+    seen: dict[int, NDArray[np.uint32]]  # by night, ids of what its survey saw
+
+    def seen_in_light_of(self, night: int) -> NDArray[np.uint32]:
+        """Ids of what the last surveys in the light of a night saw together."""
+        alike = [n for n in sorted(self.seen) if (n in EVENINGS) == (night in EVENINGS)][-SEEN_LATELY:]
+        return np.unique(np.concatenate([np.zeros(0, np.uint32), *(self.seen[n] for n in alike)]))
 
     @classmethod
     def begun(cls, visit: Visit, rng: np.random.Generator) -> "Nights":
@@ -176,7 +187,7 @@ class Nights:
             marks.obs_keyframe, marks.obs_landmark, marks.obs_pixels, np.array(octaves, np.int8), marks.obs_sigma_px,
             frames.trajectory, frames.estimated, np.zeros((count, 21, 21), np.uint8),
         )  # fmt: skip
-        return cls(survey, dict(enumerate(ids.tolist())), rng)
+        return cls(survey, dict(enumerate(ids.tolist())), rng, {0: survey.landmark_ids})
 
     def vocabulary(self) -> Vocabulary:
         """Trained on this map."""
@@ -201,6 +212,8 @@ class Nights:
         rows = np.full(int(fresh.sum()), -1)
         change = Change(~gone, self.survey.points_map, self.survey.map_from_body, added, rows, map_from_cam)
         first = base.history.next_landmark_id
+        seen = [self.survey.landmark_ids[s.rows] for s in sightings if s is not None]
+        self.seen[visit.session.night] = np.concatenate([*seen, np.arange(first, first + len(rows), dtype=np.uint32)])
         self.survey = merged(base, change, counts, visit.frames, SETTINGS.sessions.new_place_landmarks)
         self.simulated |= dict(zip(range(first, first + len(rows)), ids[fresh].tolist(), strict=True))
 
@@ -216,8 +229,16 @@ class Nights:
         return found
 
 
-def versions(seed: int, last: int) -> Iterator[tuple[int, SurveyMap, NDArray[np.bool_], Vocabulary]]:
-    """Each night, its map, and which (N,) of its landmarks robots get."""
+class Version(NamedTuple):
+    """A night's map, and which (N,) of its landmarks robots get: one set, or one for the light of the next day."""
+
+    survey: SurveyMap
+    sets: dict[str, NDArray[np.bool_]]
+    vocabulary: Vocabulary
+
+
+def versions(seed: int, last: int) -> Iterator[tuple[int, Version]]:
+    """Each night and its map."""
     nights = Nights.begun(visit_of(0, seed), np.random.default_rng(seed))
     vocabulary, before, wanted = nights.vocabulary(), None, None
     robots_have = np.zeros(0, np.uint32)
@@ -231,18 +252,18 @@ def versions(seed: int, last: int) -> Iterator[tuple[int, SurveyMap, NDArray[np.
                 wanted = np.union1d(robots_have, survey.landmark_ids[is_new])
             is_chosen = choose_landmarks(survey, SETTINGS.budget, TILE_SIZE_M, wanted)
             robots_have, before = survey.landmark_ids[is_chosen], survey
-        yield night, survey, is_chosen, vocabulary
+        of_light = choose_landmarks(survey, SETTINGS.budget, TILE_SIZE_M, nights.seen_in_light_of(night))
+        yield night, Version(survey, {"one": is_chosen, "of its light": of_light}, vocabulary)
 
 
-def next_day(
-    night: int, seed: int, survey: SurveyMap, is_chosen: NDArray[np.bool_], vocabulary: Vocabulary
-) -> dict[str, Any]:
-    """A robot that wakes in the site on the day after a night."""
+def next_day(night: int, seed: int, version: Version, name: str, aisles: tuple[int, int, int]) -> dict[str, Any]:
+    """A robot that wakes in the first of these aisles on the day after a night, with one of the version's sets."""
+    survey, is_chosen = version.survey, version.sets[name]
     tiles = [encode_tile(tile) for tile in tiles_from_survey(survey, chosen=is_chosen)]
     decoded = [decode_tile(data) for data in tiles]
-    robot = session_of(night, "robot", seed)
+    robot = session_of(night, "robot", seed, aisles)
     robot._features = robot._features._replace(found_share=FOUND_SHARE)
-    estimates = run_localizer(robot, map_view(robot, decoded, vocabulary), has_wheels=True)
+    estimates = run_localizer(robot, map_view(robot, decoded, version.vocabulary), has_wheels=True)
     tracking = np.array([e.status is Status.TRACKING for e in estimates])
     start = int(np.argmax(tracking)) if tracking.any() else len(tracking)
     pairs = zip(estimates, robot.map_from_body, strict=True)
@@ -251,7 +272,8 @@ def next_day(
     )
     median_m = float(np.median(errors_m[tracking])) if tracking.any() else np.nan
     return {
-        "night": night, "localised_share": float(tracking.mean()), "median_mm": 1e3 * median_m, "start_frames": start,
+        "night": night, "set": name, "aisle": aisles[0], "frames": len(tracking),
+        "localised_share": float(tracking.mean()), "median_mm": 1e3 * median_m, "start_frames": start,
         "lost_later": int((~tracking[start:]).sum()), "wrong_frames": int((errors_m[tracking] > WRONG_M).sum()),
         "kb": sum(map(len, tiles)) / 1e3, "landmarks": int(is_chosen.sum()),
         "places": sum(len(tile.place_ids) for tile in decoded), "keyframes": len(survey.map_from_body),
@@ -263,11 +285,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=611)
     parser.add_argument("--nights", type=int, default=NIGHTS)
+    parser.add_argument("--every", type=int, default=1, help="days on which robots drive: each such many-th")
     parser.add_argument("--out", type=Path)
     options, rows, begun_s = parser.parse_args(arguments), list[dict[str, Any]](), time.process_time()
-    for night, *version in versions(options.seed, options.nights):
-        rows.append(next_day(night, options.seed, *version))
-        print("  ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
+    for night, version in versions(options.seed, options.nights):
+        for name in version.sets if night % options.every == 0 else ():
+            for aisles in TOURS:
+                rows.append(next_day(night, options.seed, version, name, aisles))
+                said = (
+                    f"{key} {value if isinstance(value, str) else f'{value:.4g}'}" for key, value in rows[-1].items()
+                )
+                print("  ".join(said), flush=True)
     print(f"{time.process_time() - begun_s:.0f} CPU s")
     if options.out is not None:
         options.out.write_text(json.dumps({"seed": options.seed, "rows": rows}, indent=1) + "\n")
