@@ -9,7 +9,7 @@ busiest worker are taken to wait for each other. Besides: tasks, bytes that trav
 with no part below nothing, over the numbers of processes, from which larger ones are extrapolated, and a site of 13,000 keyframes by its
 length. Pictures are missing as in `bench_site.py`, so that the odometry and sub-pixel alignment are in none of the figures.
 
-    python tests/benchmarks/back_end/bench_scaling.py --drive FILE [--keyframes 250] [--workers 1,2,4]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_scaling.py --drive FILE [--keyframes 250] [--workers 1,2,4]
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Segments of a rendered survey in the processes of a dask cluster: CPU of each process, bytes that travel, the same result.
 
-    python tests/benchmarks/back_end/bench_segments.py --recording FILE [--segments 120] [--workers 1,4]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_segments.py --recording FILE [--segments 120] [--workers 1,4]
 
 The stage is `begin_survey`: images decoded, followed, described, matched and adjusted within each segment, then joined. Wall time of a
 machine with fewer cores than processes says nothing. Had each process a core of its own, the stage would take what the survey's own

@@ -4,7 +4,7 @@ CPU seconds and peak memory by stage and keyframes, the slopes of their growth (
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N] [--drive FILE]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N] [--drive FILE]
 """
 
 import argparse

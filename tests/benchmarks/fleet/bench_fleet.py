@@ -1,6 +1,6 @@
 """A fleet that reports: health at 1 Hz, estimates at 2 Hz and failures of many robots to one server on loopback, counted at both ends.
 
-    python tests/benchmarks/fleet/bench_fleet.py [--robots 300] [--seconds 120] [--month] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/fleet/bench_fleet.py [--robots 300] [--seconds 120] [--month] [--out FILE.json]
 
 Robots have a zenoh session each and clocks that are wrong by seconds. Meanwhile the lists and figures are asked for over HTTP as an
 operator's page does. Every count is compared with what the robots know: reports, failures by site, robot, tile and cause, hours

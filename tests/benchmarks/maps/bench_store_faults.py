@@ -1,6 +1,7 @@
 """A store under faults at every file-system call, and every format under 10^5 damaged inputs.
 
-`python tests/benchmarks/maps/bench_store_faults.py [--every N] [--inputs N] [--out FILE.json]` prints the tables; with `--out` also writes
+`PYTHONPATH=tests python tests/benchmarks/maps/bench_store_faults.py [--every N] [--inputs N] [--out FILE.json]`
+prints the tables; with `--out` also writes
 them as JSON. `tests/support/storage/store_faults.py` says what is tried and what is asked of the store afterwards.
 """
 

@@ -1,6 +1,6 @@
 """How fast a survey is built, and how much memory a long one takes.
 
-    python tests/benchmarks/survey/bench_build.py [--recording FILE] [--minutes M] [--threads N] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_build.py [--recording FILE] [--minutes M] [--threads N] [--out FILE.json]
 
 The speed is that of the five aisles, recorded on the way unless --recording names them, after a build of a short piece that loads
 the compiled kernels. It is told for 20 frames a second whatever the recording's rate is: frames / 20 Hz / seconds, which is less than

@@ -1,6 +1,7 @@
 """How well a rig's calibration is found, and whether its covariance is right.
 
-`python tests/benchmarks/survey/bench_calibration.py drives [--seed 300] [--count 12] [--draws 3]`: simulated drives without pictures, each
+`PYTHONPATH=tests python tests/benchmarks/survey/bench_calibration.py drives [--seed 300] [--count 12] [--draws 3]`:
+simulated drives without pictures, each
 under calibrations that are off at random. `... recordings RECORDING... [--focal 0.05 --baseline -0.05]`: recordings whose own
 calibration is the truth, spoiled by that much. `... good [--seed 400] [--count 90]`: what the doctor says of right calibrations, half a
 minute of each drive. `... faults [--seed 500] [--count 10]`: every fault in each of so many drives, through the doctor and a build's

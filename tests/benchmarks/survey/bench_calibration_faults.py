@@ -1,6 +1,7 @@
 """Calibration faults in recordings: the smallest that the doctor finds, what a build makes of them, and how often good ones are doubted.
 
-`python tests/benchmarks/survey/bench_calibration_faults.py RECORDING [--seconds 20] [--faults NAME...] [--good 10] [--out FILE.json]`
+`PYTHONPATH=tests python tests/benchmarks/survey/bench_calibration_faults.py RECORDING [--seconds 20] [--faults NAME...] [--good 10]
+[--out FILE.json]`
 
 Each fault is put into the calibration (or the images) of one stretch of the recording, the busiest; --good measures so many stretches as
 they are, evenly spread. A fault is found where a check about the calibration warns or fails. `passes` means that a map would be published

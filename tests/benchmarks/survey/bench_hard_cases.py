@@ -1,6 +1,7 @@
 """What a build makes of recordings with something wrong: one line for each case.
 
-`python tests/benchmarks/survey/bench_hard_cases.py SURVEY.mcap OTHER_RUN.mcap [--frames ::2] [--only NAME...] [--out FILE.json]`,
+`PYTHONPATH=tests python tests/benchmarks/survey/bench_hard_cases.py SURVEY.mcap OTHER_RUN.mcap [--frames ::2] [--only NAME...]
+[--out FILE.json]`,
 recordings of `fleetsim record small-loop` and of another robot there. A case is right when it is refused, or when every frame that the
 map claims
 to know is within 0.10 m of the truth.

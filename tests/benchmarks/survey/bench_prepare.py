@@ -1,6 +1,6 @@
 """What `prepare` takes with an empty cache and with a full one, and which kernels a build and a replay still compile after it.
 
-    python tests/benchmarks/survey/bench_prepare.py [--recording PATH] [--out results.json]
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_prepare.py [--recording PATH] [--out results.json]
 
 Without a recording: a ride through a textured room that is not the one of `prepare`. Kernels are told by their files in the cache.
 """

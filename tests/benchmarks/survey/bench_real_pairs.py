@@ -1,6 +1,7 @@
 """What the disparities of real stereo pairs say of their calibration: evidence that a scale error is the rig's, not the images'.
 
-`python tests/benchmarks/survey/bench_real_pairs.py [NAME...]` prints, for each recording: by which factor and offset disparities differ
+`PYTHONPATH=tests python tests/benchmarks/survey/bench_real_pairs.py [NAME...]` prints, for each recording: by which factor and offset
+disparities differ
 from what several views of the same points say at the truth's scale, measured with windows of several sizes and from right to
 left; and how far points of the right picture are off their row, as a function of their place.
 """

@@ -1,6 +1,7 @@
 """Surveys of all recordings beside the figures of the field, with one configuration for each sensor set.
 
-`python tests/benchmarks/survey/bench_survey.py [NAME...]` prints a table and JSON. The real recordings come from the data folder,
+`PYTHONPATH=tests python tests/benchmarks/survey/bench_survey.py [NAME...]`
+prints a table and JSON. The real recordings come from the data folder,
 simulated ones are recorded on the way (some minutes; `--recordings DIR` keeps them there and takes them from there).
 """
 
