@@ -148,6 +148,7 @@ def drive(run: EstimatorSession) -> Drive:
         keyframes=[SimpleNamespace(frame_index=frame) for frame in frames],
         odom_from_body=placed,
         covariances=continued_covariances(trajectory.estimates),
+        inertial=trajectory.estimates[-1].inertial,
     )
     state: Any = SimpleNamespace(map_from_body=placed[frames])
     keyframes = [seen(run, frame) for frame in frames]
