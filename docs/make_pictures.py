@@ -131,8 +131,8 @@ def _moment(left: NDArray[np.uint8], landmarks_map: Array, estimates: Sequence[E
 def draw_dashboard() -> None:
     """Pages of a made-up hall: the fleet, a failure, the walk through it."""
     sys.path.insert(0, str(REPOSITORY / "tests"))
-    from support.fleet.browser import running_chromium
     from support.fleet.dashboard_scene import serving, talking
+    from support.pages.browser import running_chromium
     from support.storage.operator_scene import fill_shift
 
     folder = WORK / "dashboard"

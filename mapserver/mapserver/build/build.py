@@ -14,7 +14,7 @@ from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
-from fleetmap.errors import RecordingError, StoreError, SurveyError, UsageError
+from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
@@ -47,6 +47,7 @@ from mapserver.build.survey_recordings import (
     joined_truth,
     map_trajectories,
     read_zones,
+    say_left_out,
     survey_all,
     survey_recording,
 )
@@ -268,7 +269,7 @@ def _survey(
     run.times.begin("vocabulary")
     chosen = judged(chosen, surveyed[0].survey, settings)
     run.times.begin("storing")
-    _say_left_out(run, surveyed, joined)
+    say_left_out(run.console, run.request.site, surveyed, joined)
     found = accuracy(joined.map, joined_truth(surveyed, joined))
     if options.frame_from_ground_truth:
         if found.rigid is None:
@@ -278,19 +279,6 @@ def _survey(
             )
         joined = replace(joined, map=transform_map(joined.map, found.rigid.frame_from_estimate))
     return Built(surveyed, joined, found, chosen, is_first=base is None)
-
-
-def _say_left_out(run: _Run, surveyed: list[Surveyed], joined: Joined) -> None:
-    """Names the recordings that could not be joined; raises SurveyError where none could."""
-    left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
-    for recording, outcome in left:
-        run.console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
-    if len(left) == len(surveyed):
-        reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
-        raise SurveyError(
-            f"nothing could be joined to the current version of site {run.request.site} ({reasons}); drive through places that are "
-            "in the map, pass its docks, or survey the area as another --site"
-        )
 
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:

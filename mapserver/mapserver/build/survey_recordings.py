@@ -302,6 +302,19 @@ def survey_all(
     return done
 
 
+def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: Joined) -> None:
+    """Names the recordings that could not be joined; raises SurveyError where none could."""
+    left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
+    for recording, outcome in left:
+        console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
+    if len(left) == len(surveyed):
+        reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
+        raise SurveyError(
+            f"nothing could be joined to the current version of site {site} ({reasons}); drive through places that are "
+            "in the map, pass its docks, or survey the area as another --site"
+        )
+
+
 def joined_truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
     """The truth of the joined recordings on one clock, None where one of them has none."""
     truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]

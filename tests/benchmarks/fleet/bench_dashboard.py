@@ -23,8 +23,8 @@ import numpy as np
 from playwright.sync_api import BrowserContext, sync_playwright
 
 from mapserver.api.app import fleetmap_version
-from support.fleet.browser import chromium
 from support.fleet.dashboard_scene import fill_store, serving
+from support.pages.browser import chromium
 
 PAGES = ("", "map", "space", "failures", "failures/1", "robots/tug-7", "surveys", "live")
 _REPEATS = 5

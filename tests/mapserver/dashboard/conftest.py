@@ -7,8 +7,8 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from support.fleet.browser import Chromium, running_chromium
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
+from support.pages.browser import Chromium, running_chromium
 
 expect.set_options(timeout=30_000)  # a busy machine answers late
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 
-from support.fleet.browser import chromium
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.dashboard_scene import fill_store, serving
+from support.pages.browser import chromium
 
 SCRIPT = REPOSITORY / "deploy" / "dashboard_pictures.sh"
 

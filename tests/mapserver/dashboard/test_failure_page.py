@@ -17,10 +17,10 @@ from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.dashboard.failure import story
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
-from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving
 from support.fleet.failed_robot import send_replay, small_file
-from support.fleet.whole_page import assert_whole
+from support.pages.browser import Chromium
+from support.pages.whole_page import assert_whole
 from support.storage.map_samples import save_surfel_draft, wall
 
 BEGAN_NS = 50_000_000_000

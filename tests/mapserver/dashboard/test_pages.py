@@ -23,7 +23,7 @@ from support.fleet.dashboard_scene import (
     place_of,
     talking,
 )
-from support.fleet.whole_page import assert_whole
+from support.pages.whole_page import assert_whole
 
 PAGES = {
     "": "Robots of hall",

@@ -9,8 +9,8 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
-from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking
+from support.pages.browser import Chromium
 from support.storage.operator_scene import WORSE, fill_shift
 
 MOST_CLICKS = 2

@@ -16,8 +16,8 @@ from playwright.sync_api import BrowserContext, Page, expect
 
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
-from support.fleet.browser import Chromium, running_chromium
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, serving, watch
+from support.pages.browser import Chromium, running_chromium
 
 PASSWORD = "a password of the test"
 PAGES = ("", "map", "failures", "failures/1", "robots/tug-7", "surveys", "live")

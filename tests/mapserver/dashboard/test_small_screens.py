@@ -7,9 +7,9 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
-from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, opened, serving, talking
-from support.fleet.whole_page import SIZES, WEAKEST_CONTRAST
+from support.pages.browser import Chromium
+from support.pages.whole_page import SIZES, WEAKEST_CONTRAST
 
 ACTS = {
     "map": ("Publish draft 3", "Roll back to version 1", "Try version 3 on 5% of the robots", "Ask for a survey of it"),

@@ -16,7 +16,7 @@ from mapserver.dashboard.space import points
 from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.space.robot_views import robot_views
 from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, talking
-from support.fleet.whole_page import assert_whole
+from support.pages.whole_page import assert_whole
 from support.storage.map_samples import random_tile
 
 SEEN = "document.querySelector('.space-view').seen()"

@@ -7,9 +7,9 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from mapserver.dashboard.space.loops import Loop, loops_of_version
-from support.fleet.browser import Chromium
 from support.fleet.dashboard_scene import Served, build_report, marks, opened, serving
-from support.fleet.whole_page import assert_whole
+from support.pages.browser import Chromium
+from support.pages.whole_page import assert_whole
 from support.storage.operator_scene import fill_shift
 
 SEEN = "document.querySelector('.space-view').seen()"
