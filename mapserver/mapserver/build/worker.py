@@ -282,10 +282,13 @@ def open_side_process(threads: int | None) -> AbstractContextManager[SideProcess
 def open_side_thread(threads: int | None) -> Iterator[Callable[[Callable[[], None]], None]]:
     """Does what it is given, one piece after the other, beside the caller, who waits at the block's end and gets its first error there.
 
-    Where a survey has but one core it is done at once. An error of the block leaves out what has not begun.
+    Where a survey has but one core all is done at the block's end. An error of the block leaves out what has not begun.
     """
     if _cores(threads) == 1:
-        yield lambda work: work()
+        later: list[Callable[[], None]] = []
+        yield later.append
+        for work in later:
+            work()
         return
     with ThreadPoolExecutor(1, thread_name_prefix="joining") as pool:
         begun: list[Future[None]] = []

@@ -202,12 +202,15 @@ def test_work_beside_is_done_in_its_order_before_the_block_ends(threads: int) ->
     assert done == [(n, threads == 1) for n in range(5)]
 
 
-def test_an_error_beside_is_raised_when_the_block_ends() -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_error_beside_is_raised_when_the_block_ends(threads: int) -> None:
+    """Not before: it would be taken for one of the recording that is surveyed meanwhile."""
+
     def refuse() -> None:
         raise UsageError("no")
 
     reached = []
-    with pytest.raises(UsageError, match="no"), open_side_thread(2) as beside:
+    with pytest.raises(UsageError, match="no"), open_side_thread(threads) as beside:
         beside(refuse)
         beside(lambda: None)
         reached.append(True)

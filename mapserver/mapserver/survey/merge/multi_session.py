@@ -60,7 +60,7 @@ class Joining:
 
     On a new site the first session with position priors begins, the first of all where none has any. Sessions with priors are joined
     in their order as soon as they are added, which needs none that come later; those without, and what could not be joined at
-    once, are tried when all others are there. `add` and `finish` do not depend on when they are called.
+    once, are tried when all others are there. The map depends on the order of the sessions, not on when each is added.
     """
 
     def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
