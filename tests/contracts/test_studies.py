@@ -1,6 +1,7 @@
 """Each study is a short script with a page, figures that are kept with seeds and versions, and a picture."""
 
 import json
+from functools import partial
 from itertools import pairwise
 from time import process_time
 
@@ -198,3 +199,14 @@ def test_a_study_that_may_take_so_long_shows_what_there_is(
     assert [row["case"] for row in study.results("counted", cases)] == ["a"]
     monkeypatch.delenv("CPU_S")
     assert [row["case"] for row in study.results("counted", cases)] == ["a", "b", "c"]
+
+
+def test_cases_in_processes_of_their_own_make_the_same_rows(
+    tmp_path: study.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "PAGES", tmp_path)
+    monkeypatch.setenv("JOBS", "2")
+    rows = study.results("counted", {name: partial(dict, value=ord(name)) for name in "abc"})
+    assert [(row["case"], row["value"]) for row in rows] == [("a", 97), ("b", 98), ("c", 99)]
+    with pytest.raises(ZeroDivisionError):
+        study.results("counted", {"a": partial(dict), "d": partial(divmod, 1, 0)})
