@@ -30,7 +30,7 @@ from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
-from locclient.robot.jit_warmup import gc_frozen, warm_up_kernels
+from locclient.robot.jit_warmup import drop_compiler_code, gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
 from locclient.vda5050.adapter import AdapterParts, FleetAdapter
 from locclient.vda5050.factsheet import read_factsheet
@@ -118,6 +118,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
         warm_up_kernels(calibration, rectifier, config.localizer)
+        drop_compiler_code()
         stack.enter_context(gc_frozen())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
         caches: tuple[TileCache, ...] = ()

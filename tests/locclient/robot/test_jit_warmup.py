@@ -8,7 +8,9 @@ import sys
 import weakref
 from pathlib import Path
 
-from locclient.robot.jit_warmup import gc_frozen
+import pytest
+
+from locclient.robot.jit_warmup import drop_compiler_code, gc_frozen
 from mapserver.store import MapStore
 from support.worlds import robot_world
 
@@ -69,3 +71,34 @@ def test_a_robot_that_drives_uses_no_kernel_that_prepare_left_out(tmp_path: Path
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-2:] == ["True True set()", "True wheels and rest, which this drive lacks"]
+
+
+COMPILER = """
+import re
+from pathlib import Path
+import numba
+from locclient.robot.jit_warmup import drop_compiler_code
+
+def resident_kb():
+    found = re.findall(r"r-xp .*libllvmlite[^\\n]*\\n(?:.*\\n){0,4}?Rss: +([0-9]+) kB", Path("/proc/self/smaps").read_text())
+    return sum(map(int, found))
+
+numba.njit(lambda x: x + 1)(1)
+before, dropped, after = resident_kb(), drop_compiler_code(), resident_kb()
+print(before > 5000, dropped > 5_000_000, after < before / 20, numba.njit(lambda x: x + 2)(1))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its mappings")
+def test_the_compiler_leaves_memory_and_comes_back_when_it_is_needed() -> None:
+    done = subprocess.run([sys.executable, "-c", COMPILER], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["True", "True", "True", "3"]
+
+
+def test_code_that_differs_from_its_file_is_kept(tmp_path: Path) -> None:
+    changed = tmp_path / "smaps"
+    changed.write_text(
+        "10000-20000 r-xp 00000000 fe:01 1  /lib/libllvmlite.so\nRss: 64 kB\nPrivate_Dirty:  4 kB\nAnonymous:  4 kB\n"
+    )
+    assert drop_compiler_code(changed) == 0
+    assert drop_compiler_code(tmp_path / "missing") == 0
