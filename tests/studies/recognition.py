@@ -2,23 +2,41 @@
 
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.common.looks import EVERY_S, LOOK_S, Answer, as_row, curve, looks, map_of, right_at
+from benchmarks.common.place_ranks import BY_WORDS, GROUPINGS, ranks
 from benchmarks.common.recorded_runs import kept_folder, recorded, surveyed
 from benchmarks.robot.bench_real_robots import MAPPED, UNSEEN, mapped
+from fleetmap.relocalization.settings import FixSettings
+from locclient.maps.loaded_map import LoadedMap
 from studies.study import Column, Row, publish, results, table
 from support.recordings.realdata import DATA
 
 SEEDS = 82, 83
 AT_WRONG = 0.01
 _FEW = ("--frames", "240")
-CONDITIONS: dict[str, tuple[str, ...]] = {
-    "next day": ("--robot", "runner-1", "--day", "1", *_FEW),
-    "next night": ("--robot", "runner-1", "--day", "1", "--light", "night", *_FEW),
-    "a week later, night": ("--robot", "runner-1", "--day", "7", "--light", "night", *_FEW),
+
+
+class Condition(NamedTuple):
+    """A site of the simulator, and the drive of a robot in it."""
+
+    scenario: str
+    options: tuple[str, ...]
+
+
+_RUNNER, _TOTE = ("--robot", "runner-1", *_FEW), ("--robot", "tote-1", *_FEW)
+_NIGHT = ("--light", "night")
+CONDITIONS = {
+    "next day": Condition("small-loop", (*_RUNNER, "--day", "1")),
+    "next night": Condition("small-loop", (*_RUNNER, "--day", "1", *_NIGHT)),
+    "a week later, night": Condition("small-loop", (*_RUNNER, "--day", "7", *_NIGHT)),
+    "five aisles, next day": Condition("five-aisles", (*_TOTE, "--day", "1")),
+    "five aisles, a week later, night": Condition("five-aisles", (*_TOTE, "--day", "7", *_NIGHT)),
 }
 REAL = {"V1_01, odd frames": (MAPPED, UNSEEN)}  # frames of the map, of the robot
 BESIDE_M = 1.5  # of a place of the map that looks a like way
@@ -26,18 +44,29 @@ BESIDE_M = 1.5  # of a place of the map that looks a like way
 
 def simulated(condition: str, seed: int) -> Row:
     """Looks of a robot's drive in the map of a survey by day."""
-    work = kept_folder()
+    work, (scenario, options) = kept_folder(), CONDITIONS[condition]
     work.mkdir(parents=True, exist_ok=True)
-    loaded = map_of(surveyed(work, seed))
-    path = recorded(work, (*CONDITIONS[condition], "--seed", str(seed)))
-    return {"condition": condition, "seed": seed, "looks": [as_row(look) for look in looks(path, loaded)]}
+    loaded = map_of(surveyed(work, seed, scenario))
+    return looked(condition, seed, recorded(work, (*options, "--seed", str(seed)), scenario), loaded)
 
 
 def real(name: str) -> Row:
     """Looks of the frames of V1_01 that its map was not made of: the same flight, so the same light."""
     folder, (of_map, of_robot) = DATA / "euroc_v101_keyframes", REAL[name]
-    loaded = map_of(mapped(kept_folder(), folder, of_map))
-    return {"condition": name, "seed": None, "looks": [as_row(look) for look in looks(folder, loaded, of_robot)]}
+    return looked(name, None, folder, map_of(mapped(kept_folder(), folder, of_map)), of_robot)
+
+
+def looked(condition: str, seed: int | None, path: Path, loaded: LoadedMap, frames: str = ":") -> Row:
+    """What all looks of a recording answered, and how soon a right place would be tried."""
+    rows = [as_row(look) for look in looks(path, loaded, frames)]
+    return {"condition": condition, "seed": seed, "looks": rows, "ranks": ranks(path, loaded, frames)}
+
+
+def ranked(rows: Sequence[Row], grouping: str) -> str:
+    """Share of the beginnings of looks at which a right place is among those that are tried, and first of them."""
+    found, tried = [rank for row in rows for rank in row["ranks"][grouping]], FixSettings().top_places
+    among = float(np.mean([rank is not None and rank <= tried for rank in found]))
+    return f"{among:.0%} ({float(np.mean([rank == 1 for rank in found])):.0%})"
 
 
 def answers(rows: Sequence[Row], which: str) -> list[Answer]:
@@ -63,7 +92,7 @@ def summary(condition: str, rows: Sequence[Row]) -> Row:
 
 def draw(grouped: dict[str, list[Row]]) -> Figure:
     """Right over threshold, and wrong below it, of single frames and of looks."""
-    figure = Figure(figsize=(12, 3.4), layout="constrained")
+    figure = Figure(figsize=(2.6 * len(grouped), 3.4), layout="constrained")
     kinds = ("first", "#8b95a1", "single frame"), ("joined", "#2563eb", f"look of {LOOK_S:.0f} s")
     for axes, (condition, rows) in zip(figure.subplots(1, len(grouped), sharey=True), grouped.items(), strict=True):
         for which, color, label in kinds:
@@ -78,7 +107,7 @@ def draw(grouped: dict[str, list[Row]]) -> Figure:
 
 
 def main() -> None:
-    """Rows, table and picture of docs/studies/recognition.md."""
+    """Rows, tables and picture of docs/studies/recognition.md."""
     cases = {f"{name}, seed {seed}": partial(simulated, name, seed) for name in CONDITIONS for seed in SEEDS}
     if (DATA / "euroc_v101_keyframes").is_dir():
         cases |= {name: partial(real, name) for name in REAL}
@@ -94,11 +123,12 @@ def main() -> None:
         Column("tracking", "TRACKING within the look", "{:.0%}"), Column("median_s", "after, median s", "{:.1f}"),
         Column("silent", "TRACKING elsewhere"),
     ]  # fmt: skip
-    publish(
-        "recognition",
-        [table([summary(n, of) for n, of in grouped.items()], shown), f"A look begins every {EVERY_S} s."],
-        draw(grouped),
-    )
+    summaries = table([summary(n, of) for n, of in grouped.items()], shown)
+    voted = [
+        {"grouping": how} | {name: ranked(of, how) for name, of in grouped.items()} for how in (BY_WORDS, *GROUPINGS)
+    ]
+    votes = table(voted, [Column("grouping", "votes of a place"), *(Column(name, name) for name in grouped)])
+    publish("recognition", [summaries, f"A look begins every {EVERY_S} s.", votes], draw(grouped))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
+from fleetmap.relocalization.descriptor_index import DescriptorIndex
 from fleetmap.relocalization.landmark_visibility import (
     Rows,
     VisibleLandmarks,
@@ -20,7 +21,8 @@ from fleetmap.relocalization.landmark_visibility import (
 )
 from fleetmap.sensors.rectification import StereoCamera
 
-_UNSEEN_WEIGHT = 5.0  # of words that no place has: a place of few words is not much like anything
+_NEAR_BITS = 40  # of 256: descriptors of one landmark days apart; two landmarks differ by more, but for look-alikes
+_UNSEEN_LANDMARKS = 8.0  # that no place has: a place of few landmarks is not much like anything
 _COVISIBLE_M, _COVISIBLE_COSINE = 1.0, 0.8
 _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE = 3.0, 0.5
 
@@ -68,32 +70,34 @@ class MapView:
         order = np.argsort(self.landmark_ids, kind="stable")
         self.place_rows = [_rows_of(ids, self.landmark_ids, order) for t in held for ids in t.place_landmark_ids]
         words = vocabulary.words(self.descriptors) if len(self.descriptors) else np.zeros(0, np.int32)
-        held_words = [np.unique(words[rows]) for rows in self.place_rows]
-        counts = [len(unique) for unique in held_words]
-        flat, places = np.concatenate([np.zeros(0, np.int32), *held_words]), np.repeat(np.arange(len(counts)), counts)
-        order = np.argsort(flat, kind="stable")
-        self._place_of_posting = places[order]
-        self._word_starts = np.searchsorted(flat[order], np.arange(vocabulary.word_count + 1))
-        weights = vocabulary.idf[flat].astype(np.float64)
-        self._place_weights = np.bincount(places, weights, minlength=len(counts)) + _UNSEEN_WEIGHT
+        weights = vocabulary.idf[words].astype(np.float64)
+        counts = [len(rows) for rows in self.place_rows]
+        self._index = DescriptorIndex(self.descriptors, vocabulary)
+        self._shown = np.concatenate([np.zeros(0, np.int64), *self.place_rows])
+        self._place_of_shown = np.repeat(np.arange(len(counts)), counts)
+        self._shown_weights = weights[self._shown]
+        unseen = _UNSEEN_LANDMARKS * (float(weights.mean()) if len(weights) else 1.0)
+        self._place_weights = np.bincount(self._place_of_shown, self._shown_weights, minlength=len(counts)) + unseen
 
     def __len__(self) -> int:
         return len(self.points_map)
 
-    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Places of whose words the descriptors hold the largest share, best first.
+    def shown_shares(self, descriptors: NDArray[np.uint8]) -> Array:
+        """(K,) the share of each place's landmarks, by the rarity of their words, that look like one of the descriptors (N, 32).
 
         Not the similarity of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing.
-        Source: the inverted file of Galvez-Lopez and Tardos 2012, section IV.
         """
-        if not len(self.place_rows) or not len(descriptors):
-            return np.zeros(0, np.int64)
-        words = np.unique(self.vocabulary.words(descriptors))
-        starts, ends = self._word_starts[words], self._word_starts[words + 1]
-        postings = np.concatenate([np.arange(a, b) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)])
-        weights = np.repeat(self.vocabulary.idf[words].astype(np.float64), ends - starts)
-        found = np.bincount(self._place_of_posting[postings], weights, minlength=len(self.place_rows))
-        shares = found / self._place_weights
+        if not len(descriptors):
+            return np.zeros(len(self.place_rows))
+        weights = self._shown_weights * self._index.near(descriptors, _NEAR_BITS)[self._shown]
+        return np.asarray(
+            np.bincount(self._place_of_shown, weights, minlength=len(self.place_rows)) / self._place_weights
+        )
+
+    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
+        """Places of whose landmarks the descriptors show the largest share, best first. Each place counts for itself: added up over
+        its neighbours, fewer right ones are among the first (docs/studies/recognition.md)."""
+        shares = self.shown_shares(descriptors)
         if allowed is not None:
             shares = np.where(allowed, shares, 0.0)
         best = np.argsort(-shares, kind="stable")[:top]

@@ -1,4 +1,4 @@
-"""One frame placed in the map: by projection where it nearly is, by words where it might be anywhere. Pure."""
+"""One frame placed in the map: by projection where it nearly is, by the landmarks that it shows where it might be anywhere. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -101,13 +101,15 @@ def recorded(work: Path, options: tuple[str, ...], scenario: str = "small-loop")
     return work / name
 
 
-def surveyed(work: Path, seed: int | None = None) -> Path:
+def surveyed(work: Path, seed: int | None = None, scenario: str = "small-loop") -> Path:
     """The store with the map of the survey of a site, in the frame of the truth; the simulator's first site without a seed."""
     options, name = ((), "") if seed is None else (("--seed", str(seed)), f"-{seed}")
+    if scenario != "small-loop":
+        name = f"-{scenario}{name}"
     store = work / f"store{name}"
     if not (store / "built").exists():
         to_store = ["--site", SITE, "--store", str(store)]
-        survey = recorded(work, options)
+        survey = recorded(work, options, scenario)
         report = ["--report", str(work / f"survey{name}.json")]
         subprocess.run(
             [*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True

@@ -61,6 +61,9 @@ def test_a_place_is_found_by_the_share_of_it_that_is_seen() -> None:
     for place, rows in enumerate(view.place_rows):
         found = view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), None, 3)
         assert found[0] == place
+        flips = np.packbits(np.argsort(rng.random((len(rows), 256)), axis=1) < 25, axis=1)  # another day
+        days_later = np.concatenate([clutter, view.descriptors[rows] ^ flips])
+        assert view.similar_places(days_later, None, 1).tolist() == [place]
         others = np.arange(len(view.place_rows)) != place
         assert place not in view.similar_places(np.concatenate([clutter, view.descriptors[rows]]), others, 3)
     assert len(view.similar_places(np.zeros((0, 32), np.uint8), None, 3)) == 0
