@@ -53,7 +53,13 @@ from mapserver.build.survey_recordings import (
 )
 from mapserver.build.trajectory import OtherTrajectory
 from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, first_vocabulary, judged
-from mapserver.build.worker import SideProcess, open_executor, open_side_process, open_side_thread
+from mapserver.build.worker import (
+    SideProcess,
+    open_executor,
+    open_side_process,
+    open_side_thread,
+    single_threaded_libraries,
+)
 from mapserver.quality.figures import Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
@@ -187,6 +193,7 @@ def build_draft(
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), Console(stderr=True)
     with (
+        single_threaded_libraries(),
         open_side_process(options.threads) as side,
         OpenRecordings(options.reading, request.store) as reading,
         ImageSpill(reading.folder) as images,

@@ -27,6 +27,7 @@ from threading import Thread
 from typing import Any, Self, TypeVar
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 from fleetmap.errors import FleetmapError, UsageError
 from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared, Work
@@ -142,7 +143,7 @@ def _started(theirs: socket.socket) -> int:
 def serve_beside(socket_number: int) -> None:
     """The process: answers (function, arguments) with (whether this is the result, the result or a FleetmapError, most memory it held)."""
     Thread(target=_end_with_parent, args=(socket_number,), daemon=True).start()
-    cv2.setNumThreads(1)
+    _limit_libraries()
     gc.freeze()
     pipe = Connection(socket_number)
     with suppress(EOFError, OSError):
@@ -246,6 +247,7 @@ def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: b
     """One batch in a process of the cluster."""
     name, data = packed
     if name not in _unpacked:
+        _limit_libraries()
         _unpacked.clear()
         _unpacked[name] = pickle.loads(data)
     return pickle.dumps(function(_unpacked[name], pickle.loads(batch)), protocol=5)
@@ -315,7 +317,7 @@ def open_executor(threads: int | None, scheduler: str | None, side: SideProcess 
     if scheduler == EMBEDDED:
         with (
             tempfile.TemporaryDirectory(prefix="fleetmap-") as folder,
-            ProcessPoolExecutor(count, mp_context=get_context("spawn")) as processes,
+            ProcessPoolExecutor(count, get_context("spawn"), _limit_libraries) as processes,
         ):
             yield Processes(processes, count, Path(folder))
     elif scheduler is not None:
@@ -324,19 +326,30 @@ def open_executor(threads: int | None, scheduler: str | None, side: SideProcess 
     elif count == 1:
         yield SERIAL
     else:
-        with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, _opencv_alone():
+        with ThreadPoolExecutor(count, thread_name_prefix="survey") as pool, single_threaded_libraries():
             yield Threads(pool, count, side)
 
 
 @contextmanager
-def _opencv_alone() -> Iterator[None]:
-    """OpenCV without threads of its own: where ours have work for every core, its would only wait for each other."""
+def single_threaded_libraries() -> Iterator[None]:
+    """OpenCV and linear algebra without threads of their own.
+
+    Where ours have work for every core, theirs would only wait for each other, and OpenBLAS's do so at full load: on two busy cores a
+    survey took four times the CPU seconds.
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        yield
+        with threadpool_limits(1, user_api="blas"):
+            yield
     finally:
         cv2.setNumThreads(before)
+
+
+def _limit_libraries() -> None:
+    """As `single_threaded_libraries`, for good: in a process that does nothing else."""
+    cv2.setNumThreads(1)
+    threadpool_limits(1, user_api="blas")
 
 
 @contextmanager

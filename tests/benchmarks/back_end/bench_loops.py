@@ -4,6 +4,9 @@
 not exist yet is made there (minutes), in a temporary folder where none is named.
 """
 
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
 import argparse
 import json
 import platform

@@ -12,6 +12,9 @@ length. Pictures are missing as in `bench_site.py`, so that the odometry and sub
     PYTHONPATH=tests python tests/benchmarks/back_end/bench_scaling.py --drive FILE [--keyframes 250] [--workers 1,2,4]
 """
 
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
 import argparse
 import json
 import pickle

@@ -7,6 +7,9 @@ machine with fewer cores than processes says nothing. Had each process a core of
 process and the busiest worker take one after the other; a model of so many segments on so many cores follows from the segments' own times.
 """
 
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
 import argparse
 import hashlib
 import json

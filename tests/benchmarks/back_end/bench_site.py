@@ -7,6 +7,9 @@ that its cost, which goes with the observations, is not in the figures. Each siz
     PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N] [--drive FILE]
 """
 
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
 import argparse
 import hashlib
 import json

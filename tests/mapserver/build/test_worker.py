@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
@@ -125,6 +126,21 @@ def test_what_processes_share_is_written_once_and_removed() -> None:
         assert len(list(worker._folder.iterdir())) == 2
         assert stat.S_IMODE(worker._folder.stat().st_mode) == 0o700
     assert not worker._folder.exists()
+
+
+def _blas_threads(*_: object) -> list[int]:
+    return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+
+@pytest.mark.parametrize("scheduler", [None, "local"])
+def test_linear_algebra_has_no_threads_beside_those_of_a_survey(scheduler: str | None) -> None:
+    """A program that uses the library may have loaded it with any number of threads, and gets them back."""
+    with threadpool_limits(3, user_api="blas"):
+        with open_executor(2, scheduler) as executor:
+            there = next(iter(executor.map(_blas_threads, 0, [()])))
+        assert there
+        assert set(there) == {1}
+        assert set(_blas_threads()) == {3}
 
 
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
