@@ -112,7 +112,8 @@ def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: boo
     else:
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
-    if status is not Status.TRACKING and confirmed.kidnap_hypotheses:  # it may be at either
+    is_told = any(h.speaks_against_others(settings) for h in confirmed.kidnap_hypotheses)
+    if status is not Status.TRACKING and is_told:  # it may be at either
         places = _published([confirmed, *confirmed.kidnap_hypotheses])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     return _with_pose(estimate, confirmed, settings)

@@ -366,7 +366,8 @@ class Localizer:
         hypotheses = self._confirmed.kidnap_hypotheses
         self._candidates.observe(self._observations(fixes), hypotheses, self._odom_from_body())
         hypotheses = self._confirmed.kidnap_hypotheses = recent(hypotheses, self._track)
-        if max(h.support for h in hypotheses) >= self._track.kidnap_fixes:
+        telling = [h.support for h in hypotheses if h.speaks_against_others(self._track)]
+        if max(telling, default=0) >= self._track.kidnap_fixes:
             self._candidates.reset(self._confirmed, hypotheses)
             self._confirmed = None
             self._prior = None  # it led to that pose

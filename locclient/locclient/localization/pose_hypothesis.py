@@ -87,6 +87,14 @@ class PoseHypothesis:
         """Landmark recall, mean of all queries."""
         return self.recall_total / max(self.looks, 1)
 
+    def speaks_against_others(self, settings: TrackSettings) -> bool:
+        """Whether its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than fixes of
+        one place lie apart.
+
+        Racks repeat. What a standing robot sees by few landmarks of another place is one look, however often it is taken.
+        """
+        return self.mean_inliers >= settings.strong_inliers or self.travelled_m >= settings.hypothesis_distance_m
+
     def decay(self, kept_share: float) -> None:
         """Begins a map query: older ones weigh less."""
         self.inlier_sum, self.recall_sum = kept_share * self.inlier_sum, kept_share * self.recall_sum

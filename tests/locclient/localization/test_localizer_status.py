@@ -162,7 +162,7 @@ def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
 def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Robot) -> None:
     """Carried 8 m away without a turn of its wheels: the fixes say so, three times in a row."""
     tracking.map_from_body[:3, 3] += off(-8.0)
-    said = [tracking.go(0.25).status for _ in range(3)]
+    said = [tracking.go(0.3).status for _ in range(3)]
     assert said[:2] == [Status.TRACKING] * 2
     assert said[2] is not Status.TRACKING
     after = tracking.ride(6, 0.25)
@@ -170,6 +170,18 @@ def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Rob
     assert tracking.error_m(after[-1]) < 1e-6
     moved = [estimate.moved_m for estimate in after if estimate.moved_m is not None]
     assert moved == pytest.approx([float(np.linalg.norm(off(-8.0)))], abs=0.1), "told once, when it was sure"
+
+
+@pytest.mark.parametrize("inliers", [20, 80])
+def test_a_standing_robot_leaves_its_pose_for_strong_fixes_alone(tracking: Robot, inliers: int) -> None:
+    """At a dock, with nothing mapped before it, an end of another aisle agrees a little with what it sees, again and again."""
+    tracking.inliers = inliers
+    said = [tracking.go(0.0, [off(-8.0)]) for _ in range(12)]
+    if inliers < TrackSettings().strong_inliers:
+        assert {e.status for e in said} == {Status.TRACKING, Status.DEGRADED}
+        assert tracking.error_m(said[-1]) < 0.01
+    else:
+        assert tracking.error_m(said[-1]) == pytest.approx(8.0, abs=0.1), "it is where they say"
 
 
 def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> None:
