@@ -29,7 +29,7 @@ from mapserver.config import MapserverConfig
 from mapserver.nightly import NightRequest, last_report, run_night
 from studies.study import PAGES, Column, Row, publish, results, table
 
-SEED, OTHER_SEED, NIGHTS = 501, 777, 30  # of the site, of the building that the foreign recording is from
+SEED, OTHER_SEED, NIGHTS = 547, 787, 30  # of the site, of the building that the foreign recording is from
 WORK = PAGES.parents[1] / "out" / "thirty_nights"
 SCENARIO = "thirty-nights"
 BEFORE = Layout(aisles=6, bays=3, restock_per_day=0.06)
