@@ -174,10 +174,11 @@ def test_playback_is_the_viewers() -> None:
         assert viewer.wait_for_playback(PAUSED, 0).at_ns == 10 * S
         told = viewer.control(play=False, seek_ns=25 * S + 1)
         assert (told.status, told.at_ns, told.did_seek) == (PAUSED, 25 * S + 1, True)
-        assert viewer.wait_for("/fixes", 2)[1][0] == 25 * S
+        viewer.wait_until("/fixes", 25 * S)  # who subscribes while a message goes out may get that message twice
         count = len(viewer.messages["/fixes"])
         viewer.read(0.3)
-        assert len(viewer.messages["/fixes"]) == count, "it is paused"
+        assert {stamp_ns for stamp_ns, _ in viewer.messages["/fixes"][count:]} <= {25 * S}, "it is paused"
+        count = len(viewer.messages["/fixes"])
         assert viewer.control(play=True, seek_ns=12 * S).status == PLAYING
         stamps_ns = [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", count + 6)[count:]]
         assert stamps_ns == [12 * S + n * S // 10 for n in range(6)]

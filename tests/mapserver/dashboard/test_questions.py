@@ -58,7 +58,7 @@ def test_names_of_robots_keep_off_those_of_areas(page: Page, served: Served, siz
     with talking(served.zenoh, 8):
         opened(page, served, "")
         expect(page.locator(".figures")).to_contain_text("8 of 8", timeout=60_000)
-        names = [mark["nameBox"] for mark in marks(page) if mark["nameBox"]]
+        names = [mark["nameBox"] for mark in marks(page, 8) if mark["nameBox"]]
         areas = page.evaluate(
             "[...document.querySelectorAll('.area-name')].map(e => e.getBoundingClientRect()).filter(r => r.width)"
             ".map(r => [r.left, r.top, r.right, r.bottom])"

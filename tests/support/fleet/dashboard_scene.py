@@ -320,9 +320,11 @@ def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
     return seen
 
 
-def marks(page: Page) -> list[dict[str, object]]:
-    """What the map of a page paints: a canvas has no elements to look at."""
-    page.wait_for_function("document.querySelector('.site-map')?.marks?.().length > 0")
+def marks(page: Page, count: int = 1) -> list[dict[str, object]]:
+    """What the map of a page paints, once it is `count` marks: a canvas has no elements to look at."""
+    page.wait_for_function(
+        "count => document.querySelector('.site-map')?.marks?.().length >= count", arg=count, timeout=15_000
+    )
     return page.evaluate("document.querySelector('.site-map').marks()")
 
 
