@@ -105,9 +105,17 @@ def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: boo
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
     cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
+    is_doubted = (
+        confirmed.has_broken and has_failed
+    )  # what it saw vanished, and the map does not say that it is still there
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
-    elif radius_m > settings.degraded_radius_m or age_s > settings.degraded_after_s or cause is Cause.FROZEN:
+    elif (
+        radius_m > settings.degraded_radius_m
+        or age_s > settings.degraded_after_s
+        or cause is Cause.FROZEN
+        or is_doubted
+    ):
         status = Status.DEGRADED
     else:
         status, cause = Status.TRACKING, Cause.NONE

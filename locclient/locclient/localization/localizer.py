@@ -7,9 +7,9 @@ import numpy as np
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
-from fleetmap.messages import Status
+from fleetmap.messages import Cause, Status
 from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
@@ -30,7 +30,7 @@ from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-_SLICES_AT_REST = 3  # of a search, in a frame, where the last one began too: a late estimate costs nothing there
+_MORE_SLICES = 3  # in a frame: of a search where the last one began too, as a late estimate costs nothing there, and where tracks broke
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 
 
@@ -68,7 +68,7 @@ class Localizer:
         self._failed_queries = 0
         self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
         self._search_gate = ViewpointGate()
-        self._is_at_rest = False  # the search that goes on begins where the one before did
+        self._slices, self._is_urgent = 1, False  # of the query that goes on: in a frame; it began where tracks broke
         self._was_tracking = False
         self._query_input: tuple[RectifiedFrame, OdometryEstimate] | None = None  # of that query
         self._query_features: FrameFeatures | None = None
@@ -153,9 +153,11 @@ class Localizer:
         judged_s = self._clock()
         odometry, image = self.perception.follow(frame, image)
         tracked_s = self._clock()
-        self._propagate(odometry)
+        # Tracks are lost though the picture is sound: something came before the cameras, or the robot is elsewhere.
+        has_broken = odometry.status is OdometryStatus.DEGRADED and image.cause is Cause.NONE
+        self._propagate(odometry, has_broken)
         is_reversed = self.perception.is_reversed(frame, is_localized=self._confirmed is not None)
-        result = QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry)
+        result = QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry, has_broken)
         self._last_ns = frame.stamp_ns
         stage_s = {"sight": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
         estimate = Estimate(
@@ -177,7 +179,7 @@ class Localizer:
         assembled = assemble(estimate, state, self._track)
         return self.perception.judged(assembled, last_fix_ns, was_localized=self._was_tracking)
 
-    def _propagate(self, odometry: OdometryEstimate) -> None:
+    def _propagate(self, odometry: OdometryEstimate, has_broken: bool) -> None:
         """Propagates every hypothesis to the present frame."""
         change, last = odometry.new_odom_from_old_odom, self._last_odom_from_body
         if last is not None and change is not None:
@@ -187,6 +189,7 @@ class Localizer:
             step = odometry.previous_from_body
         for hypothesis in [*self._hypotheses(), *([self._query_frame] if self._query_frame else [])]:
             hypothesis.propagate(self.perception, odometry, step, self._track)
+            hypothesis.has_broken |= has_broken
             if change is not None:
                 hypothesis.history.redefine_odom(change)
         if change is not None:
@@ -200,15 +203,17 @@ class Localizer:
         confirmed = [self._confirmed, *self._confirmed.kidnap_hypotheses] if self._confirmed else []
         return [*confirmed, *self._candidates.tracked(), *(self._prior.tracked() if self._prior else [])]
 
-    def _query_map(self, frame: RectifiedFrame, odometry: OdometryEstimate) -> QueryResult:
+    def _query_map(self, frame: RectifiedFrame, odometry: OdometryEstimate, has_broken: bool) -> QueryResult:
         """The result of a map query that is finished with this frame, an empty one otherwise.
 
         Its stamp is that of the frame that it is for. Queries are spread over frames, but for the first one, those after a gap, and
-        those of recordings with hardly more frames than queries.
+        those of recordings with hardly more frames than queries. Where tracks broke one begins at once.
         """
-        is_at_once = False
+        is_at_once, is_urgent = False, has_broken and not self._failed_queries
+        if is_urgent and not self._is_urgent:
+            self._work = self._query_frame = None  # a frame before the break says nothing about where the robot is now
         if self._work is None:
-            if self._relocalizer is None or not self._is_query_due(frame.stamp_ns, odometry):
+            if self._relocalizer is None or not (is_urgent or self._is_query_due(frame.stamp_ns, odometry)):
                 return QueryResult()
             is_at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
             self._query_ns = frame.stamp_ns
@@ -216,19 +221,20 @@ class Localizer:
             self._query_input, self._query_features = (frame, odometry), None
             for hypothesis in self._hypotheses():
                 hypothesis.mark_query()
-            self._is_at_rest = self._confirmed is None and not self._search_gate.is_new(odometry.odom_from_body)
-            if not self._is_at_rest:
+            is_at_rest = self._confirmed is None and not self._search_gate.is_new(odometry.odom_from_body)
+            self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_at_rest or is_urgent else 1
+            if not is_at_rest:
                 self._failed_places.clear()
             self._work = self._query(frame, self._relocalizer)
         assert self._query_frame is not None
         try:
-            for _ in range(_SLICES_AT_REST if self._is_at_rest else 1):
+            for _ in range(self._slices):
                 next(self._work)
             while is_at_once:
                 next(self._work)
         except StopIteration as done:
             result: QueryResult = done.value._replace(fix_stamp_ns=self._query_frame.stamp_ns)
-            self._work = self._query_frame = None
+            self._work, self._query_frame, self._is_urgent = None, None, False
             if self._relocalizer is not None and self._query_input is not None and self._query_features is not None:
                 is_confirmed = self._confirmed is not None
                 looked = FinishedQuery(
@@ -240,11 +246,9 @@ class Localizer:
         return QueryResult()
 
     def _is_query_due(self, stamp_ns: int, odometry: OdometryEstimate) -> bool:
-        interval_s = self._track.fix_interval_s
-        settled = self._confirmed is not None and self._confirmed.support >= self._track.settled_fixes
-        if settled and odometry.inertial and not self._failed_queries:
-            interval_s = max(interval_s, self._track.settled_interval_s)
-        last_ns = self._query_ns
+        support = 0 if self._confirmed is None else self._confirmed.support
+        is_sure = odometry.inertial and not self._failed_queries
+        interval_s, last_ns = self._track.query_interval_s(support, is_sure=is_sure), self._query_ns
         return last_ns is None or odometry.after_gap or (stamp_ns - last_ns) * 1e-9 >= 0.999 * interval_s
 
     def _is_sparse(self, stamp_ns: int) -> bool:
@@ -311,11 +315,6 @@ class Localizer:
     def _is_reliable(self, fix: Fix) -> bool:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
-    def _is_lookalike_excluded(self) -> bool:
-        """Whether the robot cannot be where nothing is mapped and all looks like a place of the map."""
-        is_near = self._prior is not None and self._prior.is_tight(self._track.near_prior_sigma_m)
-        return is_near or self._track.is_whole_site_mapped
-
     def _observations(self, fixes: Sequence[Fix]) -> Observations:
         """The fixes of the query that goes on, with their poses at the present."""
         assert self._query_frame is not None
@@ -375,7 +374,9 @@ class Localizer:
     def _update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
         """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
         candidates = self._candidates
-        is_excluded = self._lookalikes is not None and self._is_lookalike_excluded()
+        is_near = self._prior is not None and self._prior.is_tight(self._track.near_prior_sigma_m)
+        # Whether the robot cannot be where nothing is mapped and all looks like a place of the map.
+        is_excluded = self._lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self._lookalikes
         yield from candidates.update(self._observations(fixes), self._odom_from_body())
         if not fixes:

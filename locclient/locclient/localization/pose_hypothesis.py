@@ -35,7 +35,8 @@ class PoseHypothesis:
     fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: that a person who named its
-    place is right, 0 where nobody did. kidnap_hypotheses: places that rejected fixes name instead.
+    place is right, 0 where nobody did. has_broken: tracks broke since the last fix. kidnap_hypotheses: places that rejected fixes
+    name instead.
     """
 
     frame_index: int
@@ -57,6 +58,7 @@ class PoseHypothesis:
     misses: int = 0
     travelled_m: float = 0.0
     told_log_odds: float = 0.0
+    has_broken: bool = False
     kidnap_hypotheses: list["PoseHypothesis"] = field(default_factory=list)
     history: ObservationHistory = field(default_factory=ObservationHistory)
 
@@ -70,7 +72,7 @@ class PoseHypothesis:
         """A pose at the frame of a map query, propagated to the present. query: the identity at that frame, propagated likewise."""
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
-        return cls(query.frame_index, query.stamp_ns, *then, *now)
+        return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken)
 
     @property
     def mean_inliers(self) -> float:

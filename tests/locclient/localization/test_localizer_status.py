@@ -184,6 +184,25 @@ def test_a_standing_robot_leaves_its_pose_for_strong_fixes_alone(tracking: Robot
         assert tracking.error_m(said[-1]) == pytest.approx(8.0, abs=0.1), "it is where they say"
 
 
+@pytest.mark.parametrize(
+    ("seen", "status"), [(TRUE, Status.TRACKING), (NO_FIX, Status.DEGRADED), ([off(-8.0)], Status.AMBIGUOUS)]
+)
+def test_where_tracks_break_the_map_decides_at_once(tracking: Robot, seen: list[Array], status: Status) -> None:
+    """Somebody stood before the cameras, stands there, or carried the robot: one look tells, not 0.9 s without fixes."""
+    tracking.inliers, tracking.odometry.breaks = 80, True
+    estimate = tracking.go(0.0, seen)
+    assert estimate.status is status
+    assert (estimate.map_from_body is None) == (status is Status.AMBIGUOUS)
+    assert tracking.go(0.0).status is Status.TRACKING
+    assert tracking.go(0.0, NO_FIX).status is Status.TRACKING, "the break is forgotten with the fix after it"
+
+
+def test_a_robot_carried_in_the_dark_is_doubted_as_before(tracking: Robot) -> None:
+    """No picture, no look: the odometry goes on by the IMU, and what it says then is worth as much as after any gap."""
+    tracking.is_dark = tracking.odometry.breaks = True
+    assert tracking.go(0.2, NO_FIX).status is Status.TRACKING
+
+
 def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> None:
     """Odometry that begins anew far off in its own view: what was said before the gap is given up, but had admitted as much."""
     tracking.odometry.drift_share = 0.5
@@ -259,6 +278,18 @@ def test_the_map_is_looked_at_as_often_as_set_over_frames_that_lie_closer(monkey
     said = [robot.go(0.5, [off(0.0)]) for _ in range(11)]
     numbers = {(e.stamp_ns // FRAME_NS, e.fix_stamp_ns // FRAME_NS) for e in said if e.fix_stamp_ns is not None}
     assert numbers == {(1, 1), (5, 4), (8, 7), (11, 10)}
+
+
+def test_where_tracks_break_a_look_begins_and_the_one_before_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a frame that has no turn yet, and at one right after that of a look which is not done."""
+    robot = Robot(monkeypatch, fix_interval_s=0.6, settled_interval_s=0.6).load()
+    robot.inliers, looks = 100, list[int]()
+    for number in range(1, 13):
+        robot.odometry.breaks = number in {6, 10}
+        estimate = robot.go(0.5)
+        looks += [] if estimate.fix_stamp_ns is None else [estimate.fix_stamp_ns // FRAME_NS]
+    assert looks == [1, 4, 6, 10], "without breaks 1, 4, 7, 10; that of 9 was given up"
+    assert estimate.status is Status.TRACKING
 
 
 def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.MonkeyPatch) -> None:
