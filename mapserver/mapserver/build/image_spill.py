@@ -22,7 +22,7 @@ from fleetmap.features.patch_align import half_pyramid
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.survey.keyframes.keyframes import Pictures
+from mapserver.survey.keyframes.keyframes import MemoryImageStore, Pictures
 
 if TYPE_CHECKING:
     import hashlib
@@ -114,6 +114,7 @@ class ImageSpill:
     """An ImageStore over temporary files in `folder`."""
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._file, self._features = _ArrayFile(folder), _MappedFile(folder)
         self._places: list[_Place] = []
         self._held: OrderedDict[int, Pictures] = OrderedDict()
@@ -152,6 +153,14 @@ class ImageSpill:
         """See ImageStore."""
         self._features.release()
         give_back_free_memory()
+
+    def another(self) -> "ImageSpill":
+        """See ImageStore."""
+        return ImageSpill(self._folder)
+
+    def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
+        """As what an empty one is in another process, which need not have the folder."""
+        return MemoryImageStore, ()
 
     def _hold(self, number: int, pictures: Pictures) -> None:
         self._held[number] = pictures

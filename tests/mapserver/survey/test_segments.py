@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,11 +12,13 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, Stamps, Trajectory
+from mapserver.build.image_spill import ImageSpill
 from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.segments.segment import planned
 from mapserver.survey.settings import SegmentSettings
@@ -46,7 +49,12 @@ class Parts:
         return self.frames[first:end]
 
 
-def surveyed(segments: SegmentSettings, executor: Executor = SERIAL, dark: tuple[float, float] = (0.0, 0.0)) -> Survey:
+def surveyed(
+    segments: SegmentSettings,
+    executor: Executor = SERIAL,
+    dark: tuple[float, float] = (0.0, 0.0),
+    images: ImageStore | None = None,
+) -> Survey:
     made, rig = sample(), replace(calibration(), imu=None)
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(made.stamps_ns, made.left, made.right, strict=True)]
     for n in range(round(dark[0] / FRAME_S), round(dark[1] / FRAME_S)):
@@ -54,7 +62,7 @@ def surveyed(segments: SegmentSettings, executor: Executor = SERIAL, dark: tuple
     rectifier = Rectifier(rig)
     inputs = SurveyInputs(iter(frames), len(frames), ImuSamples.empty(), rig, rectifier, parts=Parts(frames))
     config = SurveyConfig(msgspec.structs.replace(SETTINGS, segments=segments), default_vocabulary())
-    return survey(inputs, config, SurveyTools(executor=executor))
+    return survey(inputs, config, SurveyTools(executor=executor, images=images))
 
 
 @lru_cache(maxsize=1)
@@ -92,10 +100,27 @@ def test_segments_make_a_map_as_good_as_the_whole() -> None:
     assert ate_m(done) < max(1.1 * ate_m(whole), ate_m(whole) + 0.001)
 
 
+class WatchedSpill(ImageSpill):
+    """Remembers the stores beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.others: list[ImageSpill] = []
+
+    def another(self) -> ImageSpill:
+        self.others.append(super().another())
+        return self.others[-1]
+
+
 @pytest.mark.parametrize("scheduler", [None, "local"])
-def test_who_makes_them_does_not_matter(scheduler: str | None) -> None:
-    with open_executor(2, scheduler) as executor:
-        assert encode_archive(surveyed(SEGMENTS, executor).map) == encode_archive(alone().map)
+def test_who_makes_them_and_where_pictures_lie_does_not_matter(scheduler: str | None, tmp_path: Path) -> None:
+    """In threads segments set their pictures aside, each in a store of its own; processes send them, by way of memory."""
+    with open_executor(2, scheduler) as executor, WatchedSpill(tmp_path) as images:
+        made = surveyed(SEGMENTS, executor, images=images)
+    assert encode_archive(made.map) == encode_archive(alone().map)
+    assert len(images.others) == 3
+    assert all(other._file._file.closed for other in images.others)
+    assert [bool(other._places) for other in images.others] == [scheduler is None] * 3
 
 
 def test_a_segment_that_cannot_start_is_surveyed_with_the_one_before() -> None:

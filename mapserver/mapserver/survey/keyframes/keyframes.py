@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Container, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
@@ -43,6 +44,9 @@ class ImageStore(Protocol):
     def release(self) -> None:
         """A stage is over: what `keep` returned may leave memory until it is read again."""
 
+    def another(self) -> AbstractContextManager["ImageStore"]:
+        """A store of the same kind, for what a part of the survey needs until it is done; in another process it keeps all in memory."""
+
 
 class MemoryImageStore:
     """Keeps all pictures as they are."""
@@ -65,6 +69,10 @@ class MemoryImageStore:
 
     def release(self) -> None:
         """See ImageStore."""
+
+    def another(self) -> AbstractContextManager[ImageStore]:
+        """See ImageStore."""
+        return nullcontext(MemoryImageStore())
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """One segment of a survey: its frames, what is made of them in any process, and whether its odometry had settled in time."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSampl
 from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
 from mapserver.survey.bundle.odometry_factors import edge_covariance
 from mapserver.survey.chain import AdjustedChain, begun_chain
-from mapserver.survey.keyframes.keyframes import without_pictures
+from mapserver.survey.keyframes.keyframes import ImageStore, Keyframe, without_pictures
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
@@ -37,13 +37,30 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class SegmentTask:
-    """A segment with its frames and the samples of IMU and wheels between them: all that a process needs beside `Rig`."""
+    """A segment with its frames and the samples of IMU and wheels between them: all that a process needs beside `Rig`.
+
+    images: takes the pictures of its keyframes.
+    """
 
     segment: Segment
     frames: Iterable[CameraFrame]
     imu: ImuSamples
     wheel: tuple[WheelSample, ...]
     keyframes_at: frozenset[int]
+    images: ImageStore
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframePictures:
+    """The frames of keyframes, one after the other from their image store; to another process they travel as they are."""
+
+    keyframes: Sequence[Keyframe] = ()
+
+    def __iter__(self) -> Iterator[RectifiedFrame]:
+        return (keyframe.frame for keyframe in self.keyframes)
+
+    def __reduce__(self) -> tuple[type[list[RectifiedFrame]], tuple[list[RectifiedFrame]]]:
+        return list, (list(self),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +76,7 @@ class Rig:
 class SegmentSurvey:
     """What became of a segment: odometry of its frames and state of its keyframes, those at both its ends included.
 
-    Keyframes have their frame's number in the survey, and their pictures in `pictures`, in their order; empty where the survey's image
+    Keyframes have their frame's number in the survey, and their pictures in `pictures`, in their order; nothing where the survey's image
     store has them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
     odometry. unsettled, lost: why its beginning, or its end, cannot be joined to a neighbour.
     """
@@ -68,7 +85,7 @@ class SegmentSurvey:
     odometry: OdometryPass
     state: SurveyState
     matched: set[tuple[int, int]]
-    pictures: list[RectifiedFrame]
+    pictures: Iterable[RectifiedFrame]
     led: Array
     led_covariance: Array
     unsettled: str | None
@@ -89,8 +106,8 @@ def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
     return [Segment(*each) for each in zip(leads.tolist(), begins.tolist(), ends, strict=True)]
 
 
-def task_of(segment: Segment, inputs: SurveyInputs) -> SegmentTask:
-    """The segment with its part of the inputs.
+def task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> SegmentTask:
+    """The segment with its part of the inputs, and with the store of its pictures.
 
     No sample from before its first frame: what the IMU felt while no picture was there would pass for rest where the robot drove evenly.
     """
@@ -105,19 +122,20 @@ def task_of(segment: Segment, inputs: SurveyInputs) -> SegmentTask:
         inputs.imu.between(since_ns, until_ns),
         tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
         frozenset(frame - segment.lead for frame in ends),
+        images,
     )
 
 
 def survey_segment(rig: Rig, task: SegmentTask) -> SegmentSurvey | str:
-    """The chain of one segment, its pictures in memory; in words why there is none."""
+    """The chain of one segment; in words why there is none."""
     try:
-        chain = survey_alone(rig, task, SurveyTools())
+        chain = survey_alone(rig, task, SurveyTools(images=task.images))
     except SurveyError as error:
         return str(error)
     made = segment_survey(chain, task.segment)
     keyframes = made.odometry.keyframes
     bare = replace(made.odometry, keyframes=[without_pictures(k) for k in keyframes])
-    return replace(made, odometry=bare, pictures=[k.frame for k in keyframes])
+    return replace(made, odometry=bare, pictures=KeyframePictures(keyframes))
 
 
 def survey_alone(rig: Rig, task: SegmentTask, tools: SurveyTools) -> AdjustedChain:
@@ -157,7 +175,7 @@ def segment_survey(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
         kept,
         replace(state, motion=replace(state.motion, imu=ImuSamples.empty())),
         matched,
-        [],
+        (),
         se3_inverse(odom_from_body[settled]) @ odom_from_body[first],
         edge_covariance(odometry, settled, first),
         _doubt(chain, slice(settled, first + 1)),

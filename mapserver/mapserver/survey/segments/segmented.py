@@ -1,6 +1,7 @@
 """The beginning of a survey in segments: made in parallel, judged at their joints; what cannot be joined is made in one piece."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 
@@ -52,11 +53,17 @@ def begun_in_segments(inputs: SurveyInputs, settings: SurveySettings, tools: Sur
 
 def _in_parallel(segments: Sequence[Segment], rig: Rig, inputs: SurveyInputs, tools: SurveyTools) -> Iterator[_Made]:
     """What became of each; what processes return of pictures goes into the survey's own store as it comes."""
-    assert tools.images is not None
-    tasks = (task_of(segment, inputs) for segment in segments)
-    for segment, survey in zip(segments, tools.executor.map(survey_segment, rig, tasks), strict=True):
-        tools.at("odometry", segment.last + 1, inputs.frame_count)
-        yield segment, survey if isinstance(survey, str) else _stored(survey, tools.images)
+    images = tools.images
+    assert images is not None
+    with ExitStack() as every:
+        own = {segment: every.enter_context(ExitStack()) for segment in segments}  # open until its survey is stored
+        tasks = (task_of(segment, inputs, own[segment].enter_context(images.another())) for segment in segments)
+        for segment, survey in zip(segments, tools.executor.map(survey_segment, rig, tasks), strict=True):
+            kept = survey if isinstance(survey, str) else _stored(survey, images)
+            own[segment].close()
+            tools.at("odometry", segment.last + 1, inputs.frame_count)
+            tools.release()
+            yield segment, kept
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
@@ -64,7 +71,7 @@ def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
     for keyframe, frame in zip(survey.odometry.keyframes, survey.pictures, strict=True):
         number = images.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
         keyframes.append(set_aside(replace(keyframe, images=images, image_number=number), images))
-    return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes), pictures=[])
+    return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes), pictures=())
 
 
 def _refusals(made: Sequence[_Made]) -> dict[int, str]:
@@ -99,7 +106,8 @@ def _made_again(
         whole = Segment(group[0][0].lead, group[0][0].begin, group[-1][0].last)
         try:
             # Here, not in a process elsewhere: it may be long, and the survey's own store keeps its pictures out of memory.
-            yield whole, segment_survey(survey_alone(rig, task_of(whole, inputs), tools), whole)
+            assert tools.images is not None
+            yield whole, segment_survey(survey_alone(rig, task_of(whole, inputs, tools.images), tools), whole)
         except SurveyError as error:
             yield whole, str(error)
 
