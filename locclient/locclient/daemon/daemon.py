@@ -12,6 +12,7 @@ import cv2
 from fleetmap.bus import Bus, ZenohBus
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import WantedVersion
+from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
@@ -119,6 +120,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         begun_s = time.monotonic()
         warm_up_kernels(calibration, rectifier, config.localizer)
         drop_compiler_code()
+        give_back_free_memory()
         stack.enter_context(gc_frozen())
         _log.info("warm after %.1f s", time.monotonic() - begun_s)
         caches: tuple[TileCache, ...] = ()

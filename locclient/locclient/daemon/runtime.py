@@ -12,6 +12,7 @@ from pathlib import Path
 
 from fleetmap.errors import FleetmapError, LinkError, RecordingError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
+from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from locclient.daemon.publishers import Publisher
@@ -129,6 +130,7 @@ class Runtime:
         bundle = self._parts.intake.take(_TAKE_S)
         while shared.loaded:
             robot.use(shared.loaded.popleft())
+            give_back_free_memory()  # of the version before, and of what reading this one took; half a millisecond
         while self._parts.server is not None and self._parts.server.frames:
             robot.align(self._parts.server.frames.popleft())
         while self._parts.server is not None and self._parts.server.priors:

@@ -10,6 +10,7 @@ import cv2
 from fleetmap.bow import decode_vocabulary
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, rotation_angle_rad
+from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import PositionPrior, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
@@ -72,6 +73,7 @@ def replay(
     settings = (options.settings, TrialSettings(), time.process_time)
     robot = Robot(source.calibration, rectifier, *settings, keeps_replay=keeps_replay)
     robot.use(loaded)
+    give_back_free_memory()
     if prior is not None:
         robot.localizer.handle_prior(prior)
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [])

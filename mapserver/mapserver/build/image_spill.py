@@ -3,7 +3,6 @@
 What is found in keyframes lies in a file too, a tenth of a megabyte for each: it is read where it lies, and leaves memory between stages.
 """
 
-import ctypes
 import mmap
 import os
 import tempfile
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import StoreError, disk_errors
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.geometry import AnyArray
+from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from mapserver.survey.keyframes.keyframes import MemoryImageStore, Pictures
@@ -166,13 +166,6 @@ class ImageSpill:
         self._held[number] = pictures
         while len(self._held) > _HELD:
             self._held.popitem(last=False)
-
-
-def give_back_free_memory() -> None:
-    """Returns to the system what the C library holds for later; without glibc, which holds a third of a long survey's peak, nothing."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 class KeptFrames:

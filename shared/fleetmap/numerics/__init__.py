@@ -1,1 +1,1 @@
-"""Compilation of kernels, and the small dense linear algebra that they share."""
+"""Compilation of kernels, the small dense linear algebra that they share, and memory."""

@@ -33,6 +33,7 @@ from benchmarks.common.recorded_runs import (
     surveyed,
     write_results,
 )
+from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
@@ -125,6 +126,7 @@ def drive(store: Path, recording: Path, minutes: float) -> dict[str, Any]:
         rectifier = Rectifier(source.calibration)
         warm_up_kernels(source.calibration, rectifier, LocalizerSettings())
         drop_compiler_code()
+        give_back_free_memory()
         robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
         bound, first_ns = PositionBound(), None
         for number, imu in enumerate(source.imu_before_each()):

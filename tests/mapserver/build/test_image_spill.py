@@ -1,8 +1,6 @@
 """Pictures that were set aside come back as they were, however many there are."""
 
-import ctypes
 import errno
-import mmap
 from pathlib import Path
 
 import numpy as np
@@ -57,22 +55,6 @@ def test_features_stay_what_they_are_out_of_memory_and_after_the_store(tmp_path:
         assert own.flags.c_contiguous
         assert own.flags.writeable
         assert own.flags.aligned
-
-
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="the C library is not glibc")
-def test_what_was_freed_below_something_that_is_in_use_is_given_back() -> None:
-    def resident_mb() -> float:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 2**20
-
-    blocks = [
-        np.ones(6_000) for _ in range(3_000)
-    ]  # 137 MB in the heap, as they are too small for a mapping of their own
-    last = blocks[-1]
-    blocks.clear()
-    held_mb = resident_mb()
-    image_spill.give_back_free_memory()
-    assert resident_mb() < held_mb - 100
-    assert last[0] == 1
 
 
 def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
