@@ -303,11 +303,11 @@ class InertialMode(WindowMode):
 
     def __init__(self, window: SlidingWindow, imu: ImuInputs) -> None:
         super().__init__(window)
-        settings = self._rig.settings.filter
-        self._imu = imu
+        settings, self._imu = self._rig.settings.filter, imu
         self._zero_velocity = ZeroVelocityDetector(settings.still_window_s, settings.still_flow_px)
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.state.odom_from_body  # at the frame before
+        self._seen: Array | None = None  # the last motion that images showed
 
     @classmethod
     def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
@@ -334,7 +334,8 @@ class InertialMode(WindowMode):
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; an IMU that contradicts the images is given up, a filter that diverged begins again."""
-        window, monitor, seen = self.window, self._imu.monitor, tracked.cam_from_previous
+        window, monitor = self.window, self._imu.monitor
+        self._seen = seen = tracked.cam_from_previous
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
@@ -352,13 +353,18 @@ class InertialMode(WindowMode):
         return Step(self, used)
 
     def _bridge_gap(self, end_ns: int) -> None:
-        """Without samples: as fast as between the last two frames that are held, as uncertain as without an IMU."""
+        """Without samples: as all points of the last two frames moved, as uncertain as without an IMU.
+
+        Not as the estimates of those frames differ: what an update moved would be taken for a speed, and grow from frame to frame.
+        """
         window, settings = self.window, self._rig.settings.filter
         held = window.filter.clone_ids[-2:]
-        earlier, last = (window.filter.odom_from_clone(clone) for clone in held)
+        body_from_next = window.filter.motion_between(*held)
+        if self._seen is not None:
+            body_from_next = self._rig.body_from_cam @ se3_inverse(self._seen) @ self._rig.cam_from_body
         duration_s = max(end_ns - window.stamp_ns, 0) * 1e-9
         between_s = window.seconds_between(*held)
-        motion = interpolate_se3(np.eye(4), se3_inverse(earlier) @ last, duration_s / max(between_s, 1e-3))
+        motion = interpolate_se3(np.eye(4), body_from_next, duration_s / max(between_s, 1e-3))
         sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
         window.filter.predict_random_walk(motion, *sigmas, duration_s)
         window.filter.inflate_velocity(settings.initial_velocity_sigma_mps)

@@ -10,7 +10,7 @@ from fleetmap.odometry import sensor_kernels
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, Stamps, WheelSample
 
-IMU_GAP_NS = 50_000_000  # a longer time without samples is bridged as without an IMU
+IMU_GAP_NS = 35_000_000  # a longer time without samples is bridged as without an IMU; one of 30 Hz has none
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.common import consistency, estimator_loop
-from fleetmap.odometry import OdometryEstimate, OdometrySettings
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
+from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import FilterSettings
 from fleetsim.sensors.faults import Fault
 from support.estimator.simulated_run import EstimatorSession
@@ -75,6 +76,30 @@ def test_a_short_fault_leaves_the_speed_alone(site: consistency.Site, fault: str
     estimates = estimator_loop.run_odometry(session, 136, settings=WITHOUT_WHEELS)
     assert speed_error_mps(session, estimates, 6.0, 9.0) < 0.15
     assert consistency.figures(session, estimates, inertial=True).position_rms_m < 0.1
+
+
+def test_over_a_gap_of_the_imu_a_corrected_estimate_is_no_speed(site: consistency.Site) -> None:
+    """An update moved the last frame by half a metre; what comes next is as the pictures moved, not half a metre more in each frame."""
+    session, settings = site.session(2031, "tote-1"), WITHOUT_WHEELS
+    nominal = session.session.nominal
+    rig = nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s
+    odometry = Odometry(*rig, settings)
+    odometry._tracker = estimator_loop.EstimatorTracker(session, session.camera, settings.tracker)
+    last = 100
+    odometry.handle_imu(session.session.imu.between(0, session.stamps_ns[last]))
+    for frame in range(last + 1):
+        estimate = odometry.handle_stereo(estimator_loop.blank(session, frame))
+    assert estimate.inertial
+    mode = odometry._mode
+    assert isinstance(mode, InertialMode)
+    before = mode._seen
+    mode.window.filter.state.position_m += 0.5
+    mode.window.filter._positions[-1] += 0.5
+    mode.predict(session.stamps_ns[last + 1] + int(nominal.cameras[0].imu_minus_cam_s * 1e9))
+    predicted = mode.cam_from_earlier(last)
+    assert before is not None
+    assert predicted is not None
+    np.testing.assert_allclose(predicted[:3, 3], before[:3, 3], atol=0.03)
 
 
 def test_stamps_20_ms_too_early_are_found_out_and_cost_nothing(site: consistency.Site) -> None:
