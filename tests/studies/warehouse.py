@@ -18,7 +18,7 @@ from studies.robot_days.tails import TailStratum
 from studies.study import Column, Row, publish, results, table
 
 _BESIDE = "with pictures and without: "
-SEED = 131  # of the site
+SEED = 163  # of the site
 EXTRAPOLATED = f"{FULL}, extrapolated"
 _ROUNDS, _ABLATED, _ABLATED_SHORT = (
     8,
