@@ -108,9 +108,12 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
     is_live = config.source.kind != "recording"
     frame_hz = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9) if len(stamps) > 1 else 0.0
     text = f"{frame_hz:.1f} Hz of frames"
+    unreadable = f"{counts.unreadable} unreadable messages"
+    if counts.unreadable:
+        unreadable += f" ({intake.unreadable_why})"
     if frame_hz < _MIN_FRAME_HZ:
         hint = "check the camera, [topics] and the endpoint of [source]"
-        yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {counts.unreadable} unreadable messages; {hint}")
+        yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {unreadable}; {hint}")
     else:
         bad = counts.frames_disordered + counts.unreadable
         hint = f", {bad} of them out of order or unreadable: check the driver" if bad else ""

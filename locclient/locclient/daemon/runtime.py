@@ -139,7 +139,7 @@ class Runtime:
         try:
             outcome = robot.handle(bundle)
         except RecordingError as error:
-            self._parts.intake.count_unreadable()
+            self._parts.intake.count_unreadable(str(error))
             _log.warning("a frame is skipped: %s", error)
         now_s = time.monotonic()
         if outcome is not None:

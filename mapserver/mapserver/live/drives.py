@@ -202,7 +202,7 @@ class SensorDrive:
 
     def _unreadable(self) -> str:
         count = self._intake.counts.unreadable
-        return f"; {count} messages could not be read" if count else ""
+        return f"; {count} messages could not be read ({self._intake.unreadable_why})" if count else ""
 
     def _feed(self) -> None:
         try:
@@ -219,8 +219,8 @@ class SensorDrive:
         try:
             frame = decode_frame(bundle.frame) if isinstance(bundle.frame, StoredFrame) else bundle.frame
             rectified = self.rectifier.rectify(frame)
-        except FleetmapError:
-            self._intake.count_unreadable()
+        except FleetmapError as error:
+            self._intake.count_unreadable(str(error))
             return None
         writer.write_frame(bundle.frame)
         self._recorded_frames += 1

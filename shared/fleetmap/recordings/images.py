@@ -2,7 +2,7 @@
 
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -91,6 +91,9 @@ RAW_ENCODINGS = {
     "8UC3": (np.uint8, 3),
     "rgba8": (np.uint8, 4),
     "bgra8": (np.uint8, 4),
+    "8UC4": (np.uint8, 4),
+    **dict.fromkeys(("rgb16", "bgr16"), (np.uint16, 3)),
+    **dict.fromkeys(("rgba16", "bgra16"), (np.uint16, 4)),
     **{f"bayer_{order}8": (np.uint8, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
     **{f"bayer_{order}16": (np.uint16, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
     # Two bytes a pixel, of which one is luma; ROS's older names and newer ones
@@ -113,7 +116,28 @@ _GREY_FROM = {
     "8UC3": cv2.COLOR_BGR2GRAY,
     "rgba8": cv2.COLOR_RGBA2GRAY,
     "bgra8": cv2.COLOR_BGRA2GRAY,
+    "rgb16": cv2.COLOR_RGB2GRAY,
+    "rgba16": cv2.COLOR_RGBA2GRAY,
 }
+INVERSE_DEPTH = "32FC1; compressedDepth"  # what ROS calls its quantized inverse depths
+_DEPTH_HEAD = struct.Struct("<iff")
+# Words in the `format` of a message, and the first bytes, of what holds images and is not read
+_VIDEO = "; one picture of a video cannot be read alone: record JPEG (`ros2 run image_transport republish ffmpeg compressed`) or raw images"
+_OTHER_IMAGE = "; record JPEG, PNG or raw images"
+_UNREAD_FORMS = {
+    "rvl": "depths packed as RVL; set the publisher's parameter compressedDepth.format to png, or record raw depth images",
+    **dict.fromkeys(("h264", "h.264", "avc"), "H.264 video" + _VIDEO),
+    **dict.fromkeys(("h265", "h.265", "hevc"), "H.265 video" + _VIDEO),
+    **{word: f"{word.upper()} video{_VIDEO}" for word in ("vp8", "vp9", "av1", "theora", "mpeg4")},
+}
+_UNREAD_STARTS = (
+    (re.compile(rb"\0\0\0?\x01"), "H.264 or H.265 video" + _VIDEO),
+    (re.compile(rb"RIFF....WEBP", re.DOTALL), "a WebP image" + _OTHER_IMAGE),
+    (re.compile(rb"....ftyp(?:avi|hei|mif)", re.DOTALL), "an AVIF or HEIC image" + _OTHER_IMAGE),
+    (re.compile(rb"\xff\x0a|\0\0\0\x0cJXL "), "a JPEG XL image" + _OTHER_IMAGE),
+    (re.compile(rb"\xff\x4f\xff\x51|\0\0\0\x0cjP  "), "a JPEG 2000 image" + _OTHER_IMAGE),
+    (re.compile(rb"GIF8"), "a GIF image" + _OTHER_IMAGE),
+)
 _MOSAIC_SHARE, _LEAST_MOSAIC_PX, _LEAST_MOSAIC_GREY = 0.04, 100, 20.0
 MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -126,8 +150,8 @@ _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 class StoredImage:
     """An image as it lies in the recording; `where` names it in error messages.
 
-    encoding: "file" for the bytes of an image file (JPEG, PNG, ...), else a key of RAW_ENCODINGS with rows of
-    step_bytes.
+    encoding: "file" for the bytes of an image file (JPEG, PNG, ...), INVERSE_DEPTH for those of a PNG behind the head of
+    compressed_depth_image_transport, else a key of RAW_ENCODINGS with rows of step_bytes. form: the `format` of a CompressedImage.
     """
 
     encoding: str
@@ -137,6 +161,7 @@ class StoredImage:
     height_px: int = 0
     step_bytes: int = 0
     big_endian: bool = False
+    form: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,8 +187,10 @@ def decode_frame(stored: StoredFrame) -> CameraFrame:
 def decode_grey(stored: StoredImage) -> Image:
     """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights; of YUV luma is taken as it is."""
     pixels = _decode(stored)
-    if stored.encoding.startswith("bayer_"):
-        pixels = cv2.cvtColor(pixels, _GREY_FROM_MOSAIC[stored.encoding[6:10]])
+    # image_transport packs a mosaic as it is, and names it in front of its format
+    mosaic = stored.form if stored.encoding == "file" and pixels.ndim == 2 else stored.encoding
+    if mosaic.startswith("bayer_") and mosaic[6:10] in _GREY_FROM_MOSAIC:
+        pixels = cv2.cvtColor(pixels, _GREY_FROM_MOSAIC[mosaic[6:10]])
     elif stored.encoding in _LUMA_AT:
         pixels = pixels[:, :, _LUMA_AT[stored.encoding]]
     elif pixels.ndim == 3:
@@ -241,6 +268,8 @@ def store_frame(frame: CameraFrame) -> StoredFrame:
 def _decode(stored: StoredImage) -> AnyArray:
     if stored.encoding == "file":
         return _decode_file(stored)
+    if stored.encoding == INVERSE_DEPTH:
+        return _decode_inverse_depth(stored)
     if stored.encoding not in RAW_ENCODINGS:
         raise RecordingError(
             f"{stored.where}: image encoding {stored.encoding!r}; known are {', '.join(RAW_ENCODINGS)}, jpeg, png"
@@ -266,10 +295,34 @@ def _decode(stored: StoredImage) -> AnyArray:
     return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
 
 
+def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
+    """(H, W) metres, NaN where unknown. Source: compressed_depth_image_transport, whose 16 bits q mean a / (q - b) m, 0 unknown."""
+    if len(stored.data) < _DEPTH_HEAD.size:
+        raise RecordingError(f"{stored.where}: a depth image of {len(stored.data)} bytes; remove it from the recording")
+    _, a, b = _DEPTH_HEAD.unpack_from(stored.data)
+    if not (np.isfinite([a, b]).all() and a > 0):
+        raise RecordingError(
+            f"{stored.where}: {stored.form!r} needs two numbers that say what its values mean, there are {a:g} and {b:g}; "
+            "record raw depth images, or 16UC1"
+        )
+    quantized = _decode_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))
+    if quantized.dtype != np.uint16 or quantized.ndim != 2:
+        raise RecordingError(
+            f"{stored.where}: {stored.form!r} with {quantized.dtype} pixels of shape {quantized.shape}; "
+            "16 bits and one channel are expected"
+        )
+    with np.errstate(divide="ignore"):
+        depth_m = np.float32(a) / (quantized.astype(np.float32) - np.float32(b))
+    return np.where(quantized == 0, np.float32(np.nan), depth_m)
+
+
 def _decode_file(stored: StoredImage) -> AnyArray:
     data = stored.data
     if not data:
         raise RecordingError(f"{stored.where}: the image has no bytes; remove it from the recording")
+    unread = _unread(data, stored.form)
+    if unread:
+        raise RecordingError(f"{stored.where}: {unread}")
     # OpenCV fills the missing part of a cut image with grey and says nothing
     kind, tail = file_kind(data), data.rstrip(b"\0")[-64:]
     if (kind == "jpeg" and _JPEG_END not in tail) or (kind == "png" and _PNG_END not in tail):
@@ -282,10 +335,18 @@ def _decode_file(stored: StoredImage) -> AnyArray:
     pixels = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise RecordingError(
-            f"{stored.where}: {len(data)} bytes that cannot be read as an image (JPEG, PNG, TIFF, BMP, PNM); "
-            "remove it from the recording"
+            f"{stored.where}: {len(data)} bytes that cannot be read as an image (JPEG, PNG, TIFF, BMP, PNM)"
+            f"{f', their format is {stored.form[:80]!r}' if stored.form else ''}; remove it from the recording"
         )
     return np.asarray(pixels)
+
+
+def _unread(data: bytes, form: str) -> str:
+    """What the bytes are and what to do, where they are known to be no image that is read; else nothing."""
+    if file_kind(data) != "other":
+        return ""
+    said = next((what for word, what in _UNREAD_FORMS.items() if word in form.lower()), "")
+    return said or next((what for start, what in _UNREAD_STARTS if start.match(data)), "")
 
 
 def _check_size(width_px: int, height_px: int, where: str) -> None:

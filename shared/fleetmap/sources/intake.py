@@ -45,11 +45,12 @@ class _ImuQueue:
 
 
 class Intake:
-    """Put to from any thread; taken from by one."""
+    """Put to from any thread; taken from by one. unreadable_why: the reason of the last message or picture that could not be read."""
 
     def __init__(self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float) -> None:
         """frames: how many may wait. imu_wait_s: how long a frame waits for the inertial samples up to it."""
         self.counts = IntakeCounts()
+        self.unreadable_why = ""
         self._frames: deque[CameraFrame | StoredFrame] = deque()
         self._limit = frames
         self._offset_ns = int(imu_minus_cam_s * 1e9)
@@ -109,10 +110,11 @@ class Intake:
             self._priors.clear()
             self._forget = True
 
-    def count_unreadable(self) -> None:
-        """A message or picture that could not be read."""
+    def count_unreadable(self, why: str) -> None:
+        """A message or picture that could not be read; the last reason is kept."""
         with self._changed:
             self.counts.unreadable += 1
+            self.unreadable_why = why
 
     def finish(self) -> None:
         """Ends the stream: no more samples will come."""

@@ -37,8 +37,8 @@ class RecordingSource:
                 intake.put_prior(prior)
             try:
                 intake.put_frame(self._recording.stored_frame(int(self._source.indices[number])))
-            except RecordingError:
-                intake.count_unreadable()
+            except RecordingError as error:
+                intake.count_unreadable(str(error))
 
     def close(self) -> None:
         """See Source."""

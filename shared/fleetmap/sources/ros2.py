@@ -6,6 +6,7 @@ from functools import partial
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import StoredFrame, Topics
+from fleetmap.recordings.bags.topics import transports
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
@@ -18,7 +19,7 @@ Take = Callable[[Intake, bool, bytes], None]
 
 
 class Ros2Source:
-    """Subscribes to the topics, to image topics also with `/compressed` appended; the key names the type of a message."""
+    """Subscribes to the topics, to image topics also as image_transport sends them; the key names the type of a message."""
 
     def __init__(
         self,
@@ -41,9 +42,12 @@ class Ros2Source:
         if calibration.imu is not None:
             self._topics.append((topics.imu, _take_imu))
         if images:
-            sides = [("left", topics.left), ("right", topics.depth if has_depth else topics.right)]
-            for side, topic in sides if has_depth or len(calibration.cameras) > 1 else sides[:1]:
-                self._topics += [(name, partial(self._take_image, side)) for name in (topic, f"{topic}/compressed")]
+            roles = (
+                ("left", "depth" if has_depth else "right") if has_depth or len(calibration.cameras) > 1 else ("left",)
+            )
+            for side, role in zip(("left", "right"), roles, strict=False):
+                names = transports(getattr(topics, role), role)
+                self._topics += [(name, partial(self._take_image, side)) for name in names]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         """See Source."""
@@ -70,11 +74,13 @@ class Ros2Source:
     def _handle(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
         try:
             # A bridge's key names no type.
-            is_compressed = (self._layout.type_of(key) or key).endswith(("CompressedImage", "/compressed"))
+            is_compressed = (self._layout.type_of(key) or key).endswith(
+                ("CompressedImage", "/compressed", "/compressedDepth")
+            )
             take(intake, is_compressed, payload)
-        except (ValueError, FleetmapError):
+        except (ValueError, FleetmapError) as error:
             # An unreadable message is skipped; the health report has their number.
-            intake.count_unreadable()
+            intake.count_unreadable(str(error))
 
     def _take_image(self, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
         stamp_ns, _ = messages.header_of(payload)

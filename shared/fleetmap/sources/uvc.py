@@ -87,8 +87,8 @@ class UvcSource:
                 return
             try:
                 intake.put_frame(split_frame(np.asarray(picture), self._stamp_ns(capture)))
-            except RecordingError:
-                intake.count_unreadable()
+            except RecordingError as error:
+                intake.count_unreadable(str(error))
 
     def _stamp_ns(self, capture: cv2.VideoCapture) -> int:
         now_s, wall_ns = self._monotonic_s(), self._wall_ns()

@@ -311,7 +311,7 @@ def test_other_formats_are_measured_as_well(suffix: str) -> None:
 def test_formats_that_nobody_measures_are_refused() -> None:
     webp = encoded(".webp", 4, 4)
     assert cv2.imdecode(np.frombuffer(webp, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (4, 4)
-    with pytest.raises(RecordingError, match="cannot be read as an image"):
+    with pytest.raises(RecordingError, match="a WebP image; record JPEG, PNG or raw images"):
         decode_grey(StoredImage("file", webp))
 
 

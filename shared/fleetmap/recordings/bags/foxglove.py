@@ -39,7 +39,7 @@ class FoxgloveCodec:
         """RawImage or CompressedImage."""
         message = self._parse(channel, data)
         if channel.schema.name.endswith("CompressedImage"):
-            return StoredImage("file", message.data, where)
+            return StoredImage("file", message.data, where, form=message.format)
         return StoredImage(message.encoding, message.data, where, message.width, message.height, message.step)
 
     def imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:

@@ -16,7 +16,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.codecs import ros1_digest
 from fleetmap.recordings.bags.container import MAX_MESSAGE_BYTES, Channel, KeptBytes, Message, Place, Schema
 from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.bags.topics import KNOWN_TYPES, type_name
+from fleetmap.recordings.bags.topics import KNOWN_TYPES, type_name, video_issues
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
 
@@ -83,6 +83,7 @@ class BagFile(KeptBytes):
         if not known:
             there = ", ".join(f"{c.topic} ({c.msgtype})" for c in self._connections.values()) or "none"
             self._issues.append(DataIssue("no topic of a known type", there[:500]))
+        self._issues += video_issues(channels.values())
         last: dict[int, tuple[int, int]] = {}
         wanted = [c for c in known if c not in strange]
         try:

@@ -14,7 +14,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.bags.calibration import InfoCamera, calibration_of_messages
 from fleetmap.recordings.bags.codecs import CODECS, Codec
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT, Channel, Container, Place
-from fleetmap.recordings.bags.topics import IMAGE_TYPES, KNOWN_TYPES, choose_topics, type_name
+from fleetmap.recordings.bags.topics import IMAGE_TYPES, KNOWN_TYPES, choose_topics, type_name, video_issues
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import hash_file
@@ -133,8 +133,9 @@ def _parts(
 ) -> tuple[RecordingParts, ReadLog]:
     streams, others = _collect(container, options.topics)
     channels = [stream.channel for stream in streams.values() if len(stream)]
+    log = ReadLog([*container.issues(), *video_issues(others)], list(container.files))
     if not channels:
-        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in container.issues())
+        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in log.issues)
         damaged = sum(stream.damaged for stream in streams.values())
         issues = issues or (f"{damaged} damaged messages" if damaged else "")
         there = ", ".join(f"{c.topic} ({type_name(c)} in {c.message_encoding or 'no encoding'})" for c in others[:8])
@@ -143,7 +144,6 @@ def _parts(
             f"{container.path} holds no message that can be read ({issues or there or 'it is empty'}{known})"
         )
     topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
-    log = ReadLog(container.issues(), list(container.files))
     chosen = choose_topics(channels, topics, str(container.path), log)
     roles = {role: [streams[channel_id] for channel_id in ids] for role, ids in chosen.items()}
     imu, imu_frame = _imu(roles.get("imu", ()), log)

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.ordering import ReadLog
+from fleetmap.sensors.samples import DataIssue
 from fleetmap.sensors.source_settings import Topics
 
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
@@ -20,14 +21,36 @@ _TYPES = {
     "ground_truth": ("geometry_msgs/PoseStamped", "foxglove.PoseInFrame"),
     "tf_static": ("tf2_msgs/TFMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms"),
 }
+_VIDEO_TYPES = (
+    "foxglove.CompressedVideo",
+    "foxglove_msgs/CompressedVideo",
+    "ffmpeg_image_transport_msgs/FFMPEGPacket",
+    "theora_image_transport/Packet",
+)
 KNOWN_TYPES = frozenset(name for names in _TYPES.values() for name in names)
 _ALONE = ("imu", "wheel", "prior", "ground_truth")
 _LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", "cam1", "infra2"), ("depth",)
 
 
+def transports(topic: str, role: str) -> tuple[str, ...]:
+    """The topics on which ROS's image_transport may send the images of `topic`; the topic alone for other roles."""
+    if role not in ("left", "right", "depth") or not topic:
+        return (topic,)
+    return (topic, f"{topic}/compressed", *([f"{topic}/compressedDepth"] if role == "depth" else []))
+
+
 def type_name(channel: Channel) -> str:
     """The message type without ROS 2's `/msg/`."""
     return channel.schema.name.replace("/msg/", "/")
+
+
+def video_issues(channels: Iterable[Channel]) -> list[DataIssue]:
+    """A note of the topics whose messages are pieces of a video; none without such topics."""
+    names = sorted(
+        f"{channel.topic} ({type_name(channel)})" for channel in channels if type_name(channel) in _VIDEO_TYPES
+    )
+    advice = "record JPEG or raw images, or write the video to an .mp4 file, which is read with --calibration FILE"
+    return [DataIssue("video not read", f"{', '.join(names)}; {advice}")] if names else []
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: ReadLog) -> dict[str, list[int]]:
@@ -42,7 +65,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
     chosen: dict[str, str] = {}
     for role, types in _TYPES.items():
         name = getattr(wanted, role)
-        found = next((t for t in (name, f"{name}/compressed") if _type_of(by_topic, t) in types), None)
+        found = next((t for t in transports(name, role) if _type_of(by_topic, t) in types), None)
         candidates = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in types)
         if found is not None:
             chosen[role] = found
@@ -54,7 +77,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
             chosen[role] = candidates[0]
         elif role in _ALONE and name and candidates:
             log.note(f"{role} not chosen", f"{', '.join(candidates)} could be it; name one with --topic {role}=/NAME")
-    _choose_images(by_topic, chosen, where)
+    _choose_images(by_topic, chosen, where, log)
     _choose_infos(by_topic, chosen)
     return {role: [channel.id for channel in by_topic[topic]] for role, topic in chosen.items()}
 
@@ -64,7 +87,7 @@ def _type_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
     return type_name(by_topic[topic][0]) if topic in by_topic else ""
 
 
-def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str) -> None:
+def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str, log: ReadLog) -> None:
     if "left" in chosen:
         return
     images = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in IMAGE_TYPES)
@@ -79,8 +102,9 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
     elif not lefts and len(others) == 1:
         chosen["left"] = others[0]
     else:
+        issues = "".join(f". {issue.what}: {issue.detail}" for issue in log.issues)
         raise RecordingError(
-            f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {_listed(by_topic)}"
+            f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {_listed(by_topic)}{issues}"
         )
     if len(depth) == 1 and "right" not in chosen:
         chosen.setdefault("depth", depth[0])

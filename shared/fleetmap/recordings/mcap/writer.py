@@ -14,7 +14,17 @@ from mcap.writer import CompressionType, Writer
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, file_kind, grey_image, store_frame
+from fleetmap.recordings.images import (
+    INVERSE_DEPTH,
+    StoredFrame,
+    StoredImage,
+    decode_depth,
+    decode_grey,
+    depth_image,
+    file_kind,
+    grey_image,
+    store_frame,
+)
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording
 from fleetmap.recordings.ros2 import messages
@@ -135,13 +145,19 @@ class McapRecordingWriter:
     def _write_image(
         self, topic: str, stamp_ns: int, frame_id: str, image: StoredImage, *, is_depth: bool = False
     ) -> None:
+        if image.encoding == INVERSE_DEPTH:
+            data = messages.encode_compressed_image(stamp_ns, frame_id, image, image.form)
+            self._write(f"{topic}/compressedDepth", "sensor_msgs/CompressedImage", stamp_ns, data)
+            return
         kind = file_kind(image.data) if image.encoding == "file" else "rows"
         if kind in ("jpeg", "png"):
-            form = f"16UC1; {kind} compressed" if is_depth else kind
+            form = f"16UC1; {kind} compressed" if is_depth else image.form or kind
             data = messages.encode_compressed_image(stamp_ns, frame_id, image, form)
             self._write(f"{topic}/compressed", "sensor_msgs/CompressedImage", stamp_ns, data)
             return
-        rows = image if kind == "rows" else grey_image(decode_grey(image))
+        rows = image
+        if kind != "rows":
+            rows = depth_image(decode_depth(image)) if is_depth else grey_image(decode_grey(image))
         if rows.step_bytes == 0:
             raise RecordingError(f"{image.where or topic} at {stamp_ns}: an image in rows needs its step_bytes")
         self._write(topic, "sensor_msgs/Image", stamp_ns, messages.encode_image(stamp_ns, frame_id, rows))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
-from fleetmap.recordings.images import StoredImage, file_kind
+from fleetmap.recordings.images import INVERSE_DEPTH, StoredImage, file_kind
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
@@ -69,16 +69,15 @@ def encode_image(stamp_ns: int, frame_id: str, image: StoredImage) -> bytes:
 
 
 def decode_compressed_image(data: bytes, where: str) -> StoredImage:
-    """sensor_msgs/CompressedImage.
-
-    The bytes of an image file, or of compressed_depth_image_transport behind its 12-byte head.
-    """
+    """sensor_msgs/CompressedImage: an image file's bytes, behind a 12-byte head where compressed_depth_image_transport packed them."""
     reader = CdrReader(data)
     reader.stamp_ns(), reader.text()
     form, content = reader.text(), reader.blob()
+    if "compressedDepth" in form and form.strip().startswith("32FC1"):
+        return StoredImage(INVERSE_DEPTH, content, where, form=form)
     if "compressedDepth" in form and file_kind(content[12:]) == "png":
         content = content[12:]
-    return StoredImage("file", content, where)
+    return StoredImage("file", content, where, form=form)
 
 
 def encode_compressed_image(stamp_ns: int, frame_id: str, image: StoredImage, form: str) -> bytes:
