@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Self
 import msgspec
 
 from fleetmap.bus import TlsFiles, ZenohBus, check_endpoint, handshake_fault, has_tls, is_loopback
+from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
 from fleetmap.mapformat import check_name
 from fleetmap.messages import decode_message, robot_key
@@ -107,7 +108,7 @@ class RobotIdentity:
             ("servers.ca", given.servers.encode()),
             ("root.json", given.root.encode()),
             ("bundle.pem", given.own.encode()),
-            ("identity.json", msgspec.json.encode(who)),
+            ("identity.json", to_json(who)),
         ):
             made._write(name, data)
         first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")

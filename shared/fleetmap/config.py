@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
@@ -103,5 +104,5 @@ def over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
 
 def to_dict(section: Section) -> dict[str, object]:
     """The effective configuration as plain values, for reports and manifests."""
-    built: dict[str, object] = msgspec.to_builtins(section)
+    built: dict[str, object] = to_plain(section)
     return built

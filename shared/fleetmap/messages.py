@@ -24,6 +24,7 @@ from typing import Annotated, Any, Self, TypeVar
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_msgpack, to_plain
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
@@ -328,7 +329,7 @@ M = TypeVar("M", bound=msgspec.Struct)
 
 def encode_message(message: msgspec.Struct) -> bytes:
     """MessagePack of a message."""
-    return msgspec.msgpack.encode(message)
+    return to_msgpack(message)
 
 
 def decode_message(data: bytes, message_type: type[M]) -> M:
@@ -352,7 +353,7 @@ def part_of(data: bytes, question: bytes) -> bytes:
 
 def report_dict(message: msgspec.Struct) -> dict[str, Any]:
     """The message as plain values, for reports."""
-    built: dict[str, Any] = msgspec.to_builtins(message)
+    built: dict[str, Any] = to_plain(message)
     return built
 
 

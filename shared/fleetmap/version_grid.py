@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Manifest, sha256_hex
@@ -70,7 +71,7 @@ def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
         data = encode_grid_tile((x, y), cells)
         entries.append(TileEntry(x=x, y=y, sha256=sha256_hex(data), bytes=len(data), landmarks=0))
         blobs.append(data)
-    return [msgspec.json.encode(GridIndex(tiles=tuple(entries)), order="deterministic"), *blobs] if blobs else []
+    return [to_json(GridIndex(tiles=tuple(entries)), order="deterministic"), *blobs] if blobs else []
 
 
 def grid_report(blobs: list[bytes], without: dict[str, str]) -> GridReport:

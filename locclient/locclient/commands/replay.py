@@ -116,12 +116,10 @@ def _run(
     files: ResultFiles,
     settings: "LocclientConfig",
 ) -> None:
-    import json
-
-    import msgspec
     from rich.console import Console
     from rich.progress import Progress
 
+    from fleetmap.encoding import to_json
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
@@ -150,7 +148,7 @@ def _run(
                 result = play(source, connection, options, prior)
             report = result.report
             if files.report is not None:
-                files.report.write_text(json.dumps(msgspec.to_builtins(report), indent=2) + "\n")
+                files.report.write_bytes(to_json(report, indent=2) + b"\n")
             if files.trajectory is not None:
                 write_tum(files.trajectory, result.trajectory)
             if files.picture is not None:

@@ -22,8 +22,7 @@ def replay_failure(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
     """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
-    import msgspec
-
+    from fleetmap.encoding import to_json
     from locclient.delivery.failure_file import read_failure_file
     from locclient.maps.connection import connected
     from locclient.replay.failure_replay import compare_failure, phases
@@ -35,7 +34,7 @@ def replay_failure(
     if json:
         shown = {"answer": found.answer, "version": found.version, "has_same_statuses": found.has_same_statuses}
         told = {"then": summary.moments, "now": found.now}
-        typer.echo(msgspec.json.encode(shown | told).decode())
+        typer.echo(to_json(shown | told).decode())
         return
     typer.echo(
         f"{summary.robot}, version {summary.version}, fleetmap {summary.client}; seconds since the failure began"

@@ -17,6 +17,7 @@ import zstandard
 from numpy.typing import NDArray
 
 import fleetmap
+from fleetmap.encoding import to_msgpack
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import FailureSummary, Moment, decode_summary
 from fleetmap.features import stereo
@@ -96,7 +97,7 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "failure.mcap"
         with McapRecordingWriter(path, _reduced_rig(frames, profile), name=f"{report.robot} {report.id}") as writer:
-            writer.attach(SUMMARY, "application/msgpack", msgspec.msgpack.encode(summary))
+            writer.attach(SUMMARY, "application/msgpack", to_msgpack(summary))
             writer.attach(LOCALIZER, "application/zstd", state)
             for frame in frames:
                 for samples in frame.inputs.imu if profile.imu is not None else ():

@@ -1,11 +1,11 @@
 """Delivery of reports of failures: to the server from the outbox, and into a folder of the robot."""
 
-import json
 import logging
 from pathlib import Path
 
 import msgspec
 
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import LinkError, UnreachableError, disk_errors
 from fleetmap.messages import FailureReport, decode_message
 from locclient.delivery.outbox import Outbox, QueuedReport
@@ -58,7 +58,7 @@ def _is_whole(report: QueuedReport) -> bool:
 def write_failure(folder: Path, report: FailureReport) -> Path:
     """The path of `STAMP-KIND-CAUSE.json`, written with its pictures beside it; raises StoreError where the disk refuses."""
     name = f"{report.stamp_ns}-{report.kind}-{report.cause}"
-    fields = msgspec.to_builtins(msgspec.structs.replace(report, thumbnails=()))
+    fields = to_plain(msgspec.structs.replace(report, thumbnails=()))
     fields["thumbnails"] = []
     with disk_errors(f"{folder} cannot be written", "choose another folder with [run] failures"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -67,5 +67,5 @@ def write_failure(folder: Path, report: FailureReport) -> Path:
             path.write_bytes(picture.jpeg)
             fields["thumbnails"].append(path.name)
         target = folder / f"{name}.json"
-        target.write_text(json.dumps(fields, indent=2) + "\n")
+        target.write_bytes(to_json(fields, indent=2) + b"\n")
     return target

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
 from fleetmap.messages import WantedVersion
@@ -102,7 +103,7 @@ class TileCache:
                 f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
-        if not self._write(self._active_path(site), msgspec.json.encode(record)):
+        if not self._write(self._active_path(site), to_json(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
         self._reserved.pop(site, None)
@@ -116,7 +117,7 @@ class TileCache:
         """Keeps a whole version until `release`, however full the cache is; errors as of `activate`."""
         missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
         record = ActiveVersion(version, tuple(blobs))
-        if missing or not self._write(self._kept_path(site, version), msgspec.json.encode(record)):
+        if missing or not self._write(self._kept_path(site, version), to_json(record)):
             raise StoreError(
                 f"version {version} of {site} is not kept: {self._last_fault or f'{missing[0]} is missing'}"
             )

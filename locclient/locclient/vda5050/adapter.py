@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_definition import is_driving
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
@@ -356,16 +356,16 @@ class FleetAdapter:
             place = now.mobile_robot_position(self.map_id, self._parts.lost_radius_m)
             if place is not None:
                 found["mobileRobotPosition"] = place
-            found["errors"] = msgspec.to_builtins(errors) + found.get("errors", [])
-            found["instantActionStates"] = msgspec.to_builtins(self._book.states) + found.get("instantActionStates", [])
+            found["errors"] = to_plain(errors) + found.get("errors", [])
+            found["instantActionStates"] = to_plain(self._book.states) + found.get("instantActionStates", [])
             return found
 
     def _robots_own(self) -> dict[str, Any]:
         part, age_s = self._known.robot.part, self._clock_s() - self._known.robot.heard_s
         if part is not None and age_s <= self._section.robot_silent_s:
-            own: dict[str, Any] = msgspec.to_builtins(part)
+            own: dict[str, Any] = to_plain(part)
             return own
-        return {**_UNKNOWN, "errors": msgspec.to_builtins([_silent(part is None, age_s)])}
+        return {**_UNKNOWN, "errors": to_plain([_silent(part is None, age_s)])}
 
 
 def _silent(is_first: bool, age_s: float) -> Error:

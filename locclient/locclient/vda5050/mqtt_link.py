@@ -8,8 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
+from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from locclient.vda5050.adapter import FleetAdapter
 from locclient.vda5050.messages import MAJOR, MAX_PAYLOAD_BYTES, VERSION, timestamp
@@ -144,4 +143,4 @@ class MqttLink:
             "serialNumber": self._section.serial_number,
         }
         self._sent[topic] += 1
-        return msgspec.json.encode({**header, **content})
+        return to_json({**header, **content})

@@ -8,12 +8,12 @@ from http import HTTPMethod
 from importlib import metadata
 from itertools import accumulate
 
-import msgspec
 from fastapi import Depends, FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleetmap.bus import Bus
+from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
 from mapserver.api.body_limit import BodyLimit
@@ -178,7 +178,7 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
         found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
         shown, following = page(found, limit, lambda robot: f"{robot.site}/{robot.robot}")
-        sizes = accumulate(len(msgspec.json.encode(robot)) for robot in shown)
+        sizes = accumulate(len(to_json(robot)) for robot in shown)
         fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
         if fitting < len(shown):
             return RobotList(*page(shown, fitting, lambda robot: f"{robot.site}/{robot.robot}"))

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings import OpenOptions, Topics
@@ -322,7 +323,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         configuration=_configuration(run, parent),
         libraries=library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
-        report={key: value for key, value in msgspec.to_builtins(report).items() if key not in _NOT_FOR_ROBOTS},
+        report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS},
     )
     job = run.request.options.job
     content = DraftContent(
@@ -336,7 +337,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     draft = Draft(
         version,
         maps.areas(site).name_tiles(words, TILE_SIZE_M),
-        msgspec.to_builtins(report),
+        to_plain(report),
         {s.entry.sha256: o.reason for s, o in zip(built.surveyed, built.joined.outcomes, strict=True) if not o.joined},
     )
     _write_files(run, built, draft)
@@ -396,5 +397,5 @@ def _write_files(run: _Run, built: Built, draft: Draft) -> None:
         full: dict[str, Any] = {"site": site, "version": draft.version}
         full = draft.report | full | report_details(built.taken, built.joined, built.accuracy, run.times.seconds)
         full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
-        full["vocabulary"]["trial"] = msgspec.to_builtins(built.vocabulary.trial)
-        write_file(options.report, msgspec.json.format(msgspec.json.encode(full), indent=2) + b"\n")
+        full["vocabulary"]["trial"] = to_plain(built.vocabulary.trial)
+        write_file(options.report, to_json(full, indent=2) + b"\n")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
@@ -202,13 +203,11 @@ def report_details(
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
-        "pair_turn": [msgspec.to_builtins(s.survey.stereo_yaw) for s in surveyed],
+        "pair_turn": [to_plain(s.survey.stereo_yaw) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
-        "parts": [msgspec.to_builtins(s.survey.components) for s in surveyed],
+        "parts": [to_plain(s.survey.components) for s in surveyed],
         "loop_records": [
-            {"recording": s.entry.name} | record
-            for s in surveyed
-            for record in msgspec.to_builtins(s.survey.loops.records)
+            {"recording": s.entry.name} | record for s in surveyed for record in to_plain(s.survey.loops.records)
         ],
     }
 

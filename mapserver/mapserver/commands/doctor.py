@@ -72,9 +72,7 @@ def _print(console: "Console", source: "Recording", findings: "list[Finding]") -
 
 
 def _as_json(source: "Recording", findings: "list[Finding]") -> str:
-    import json
-    from dataclasses import asdict
-
+    from fleetmap.encoding import to_json
     from mapserver.doctor.findings import worst
 
     report = {
@@ -85,6 +83,6 @@ def _as_json(source: "Recording", findings: "list[Finding]") -> str:
         "imu_samples": len(source.imu),
         "duration_s": float(source.frame_stamps_ns[-1] - source.frame_stamps_ns[0]) * 1e-9,
         "verdict": worst(findings).value,
-        "findings": [asdict(finding) for finding in findings],
+        "findings": findings,
     }
-    return json.dumps(report, indent=2, sort_keys=False) + "\n"
+    return to_json(report, indent=2).decode() + "\n"

@@ -52,8 +52,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
 
 
 def _write(options: NightlyOptions) -> None:
-    import msgspec
-
+    from fleetmap.encoding import to_json
     from mapserver.nightly import last_report
 
     report = options.report
@@ -61,4 +60,4 @@ def _write(options: NightlyOptions) -> None:
     if report is None or content is None:
         return
     with disk_errors(f"{report} cannot be written", "the store's jobs say the same"):
-        report.write_bytes(msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n")
+        report.write_bytes(to_json(content, indent=2) + b"\n")

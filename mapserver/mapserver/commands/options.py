@@ -116,6 +116,6 @@ def check_output(option: str, path: Path | None) -> None:
 
 def print_json(value: object) -> None:
     """Writes a value to stdout, indented; dataclasses become objects."""
-    import msgspec
+    from fleetmap.encoding import to_json
 
-    typer.echo(msgspec.json.format(msgspec.json.encode(value), indent=2).decode())
+    typer.echo(to_json(value, indent=2).decode())

@@ -1,6 +1,5 @@
 """Failures for other programs: JSON lines, and MCAP in the channels of viewers."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import appearing_file
 from fleetmap.foxglove import require_foxglove
 from fleetmap.mapformat import decode_tile
@@ -44,7 +44,7 @@ def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
     count = 0
     with appearing_file(path) as file:
         for found in failures_oldest_first(store, wanted):
-            file.write(json.dumps(as_plain(found), sort_keys=True).encode() + b"\n")
+            file.write(to_json(as_plain(found), order="sorted") + b"\n")
             count += 1
     return count
 

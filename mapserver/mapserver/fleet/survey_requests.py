@@ -1,11 +1,11 @@
 """Places that people ask to survey again, drawn as polygons: kept with the site until a version surveyed them, or somebody says so."""
 
 import hashlib
-import json
 from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError
 from mapserver.floor_plan.areas import read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, open_requests
@@ -32,7 +32,7 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
     who = {"name": "survey", "asked_ns": asked_ns, "actor": actor.name, "reason": actor.reason}
     geometry = {"type": "Polygon", "coordinates": [[*ring, *ring[:1]]]}
     feature = {"type": "Feature", "geometry": geometry, "properties": who}
-    data = json.dumps({"type": "FeatureCollection", "frame": "map", "features": [feature]}, allow_nan=False).encode()
+    data = to_json({"type": "FeatureCollection", "frame": "map", "features": [feature]})
     (area,) = read_areas(data, None).areas  # refuses what is no simple polygon
     sides_m = np.ptp(np.array(ring), axis=0)
     if sides_m.max() > MOST_SIDE_M:

@@ -5,6 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import StoreError
 from fleetmap.geometry import Array, transform_points
 from fleetmap.mapformat import Manifest
@@ -29,7 +30,7 @@ class Alignment(msgspec.Struct, frozen=True, kw_only=True):
 
 def encode_alignment(alignment: Alignment) -> bytes:
     """As JSON."""
-    return msgspec.json.encode(alignment, order="deterministic")
+    return to_json(alignment, order="deterministic")
 
 
 def decode_alignment(data: bytes) -> Alignment:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from fleetmap.config import Section
+from fleetmap.encoding import to_plain
 from fleetmap.mapformat import Manifest
 from mapserver.quality.figures import Aliasing, Compared, Evidence, RigEvidence
 
@@ -88,7 +89,7 @@ def judge(
         shares = _shares(draft, current)
         report |= {"compared_with": current.version, **shares}
         found.reasons.extend(_size_reasons(shares, current.version, settings))
-    report |= {"evidence": msgspec.to_builtins(examined), "not_judged": found.not_judged}
+    report |= {"evidence": to_plain(examined), "not_judged": found.not_judged}
     return GateVerdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report)
 
 

@@ -5,6 +5,7 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import StateError
 from mapserver.store import Actor, JobInfo, MapStore
 from mapserver.store.rows import REQUEST
@@ -46,7 +47,7 @@ class Desk:
             )
         wish = Wish(version=version, share=share, actor=actor.name, reason=actor.reason)
         words = "waits for the signer; is `mapserver signer` running?"
-        return self._answered(self._store.begin_job(site, REQUEST + what, words, msgspec.to_builtins(wish)))
+        return self._answered(self._store.begin_job(site, REQUEST + what, words, to_plain(wish)))
 
     def _answered(self, number: int) -> JobInfo:
         until_s = time.monotonic() + _ANSWERED_WITHIN_S

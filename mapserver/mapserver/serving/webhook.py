@@ -5,7 +5,6 @@ some seconds whatever comes. A thread of its own sends, so that nobody waits for
 """
 
 import http.client
-import json
 import logging
 import queue
 import socket
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
 from mapserver.fleet.alerts import Alert, AlertSettings
@@ -51,7 +51,7 @@ class Webhook:
     def put(self, body: Body) -> None:
         """Takes a message to send; never waits."""
         try:
-            self._waiting.put_nowait(json.dumps(body, allow_nan=False).encode())
+            self._waiting.put_nowait(to_json(body))
         except queue.Full:
             self._refusals.warning("full", "an alert is dropped: %d wait for the webhook", _MOST_WAITING)
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import AnyArray
 from fleetmap.mapformat import pack, unpack
@@ -74,7 +75,7 @@ def encode_archive(survey: SurveyMap) -> bytes:
     """The survey's bytes, without loss."""
     dtypes, history = _ALL_DTYPES[ARCHIVE_FORMAT], history_of(survey)
     arrays = {name: np.ascontiguousarray(values, dtypes[name]) for name, values in _arrays(survey, history).items()}
-    head = msgspec.json.encode(
+    head = to_json(
         {
             "camera": asdict(survey.camera),
             "scale_known": survey.scale_known,

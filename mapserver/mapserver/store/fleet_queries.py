@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from fleetmap.encoding import to_json, to_msgpack
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
@@ -101,7 +102,7 @@ class FleetQueries:
             **{name: getattr(report, name) for name in _REPORT_COLUMNS},
             **{"failure_id": report.id, "received_ns": received_ns, "happened_ns": happened_ns},
             **{"tile": tile_key(report.tile), "x_map_m": x_map_m, "y_map_m": y_map_m, "area": area},
-            "report": msgspec.msgpack.encode(msgspec.structs.replace(report, thumbnails=())),
+            "report": to_msgpack(msgspec.structs.replace(report, thumbnails=())),
         }
         with self._transactions.write() as connection:
             done = connection.execute(
@@ -259,7 +260,7 @@ def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> N
            ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
            last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
         [
-            (site, robot, version, seen_ns, msgspec.json.encode(report).decode())
+            (site, robot, version, seen_ns, to_json(report).decode())
             for (site, robot), (version, seen_ns, report) in reports.items()
         ],
     )

@@ -16,8 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Self
 
-import msgspec
-
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import NewerFormatError, StateError, StoreError
 from fleetmap.mapformat import (
     BlobEntry,
@@ -165,7 +164,7 @@ class MapStore(StoreQueries):
                 if content.evidence is not None:
                     connection.execute(
                         "INSERT INTO evidence (site, version, figures) VALUES (?, ?, ?)",
-                        (site, manifest.version, msgspec.json.encode(content.evidence).decode()),
+                        (site, manifest.version, to_json(content.evidence).decode()),
                     )
         return draft
 
@@ -282,7 +281,7 @@ class MapStore(StoreQueries):
         A first version, without a current one before it, has a frame of its own.
         """
         alignment = self.alignment(site)
-        return {} if alignment is None else {BUILDING_KEY: msgspec.to_builtins(alignment.frame)}
+        return {} if alignment is None else {BUILDING_KEY: to_plain(alignment.frame)}
 
     def _put_tile(self, tile: Tile) -> TileEntry:
         data = encode_tile(tile)

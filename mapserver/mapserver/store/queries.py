@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
@@ -275,7 +276,7 @@ class StoreQueries:
         with self._transactions.write(durable=False) as connection:
             connection.execute(
                 "UPDATE jobs SET report = json_set(report, '$.progress', json(?)) WHERE id = ? AND state = 'running'",
-                (json.dumps(progress), job),
+                (to_json(progress).decode(), job),
             )
 
     def running_jobs(self) -> list[JobInfo]:
@@ -312,7 +313,7 @@ class StoreQueries:
         with self._transactions.write() as connection:
             done = connection.execute(
                 "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, ?, ?)",
-                (check_name(site, "site"), kind, self._now(), message, json.dumps(report or {})),
+                (check_name(site, "site"), kind, self._now(), message, to_json(report or {}).decode()),
             )
             return int(done.lastrowid or 0)
 
@@ -322,7 +323,7 @@ class StoreQueries:
         with self._transactions.write() as connection:
             connection.execute(
                 "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?",
-                (state, None if state == "running" else self._now(), message, json.dumps(report), job),
+                (state, None if state == "running" else self._now(), message, to_json(report).decode(), job),
             )
 
     def _check_site(self, site: str) -> None:

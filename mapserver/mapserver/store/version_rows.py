@@ -1,9 +1,9 @@
 """SQL over versions, canaries and the record of what was current. `releases` decides what changes."""
 
-import json
 import sqlite3
 from collections.abc import Iterable, Mapping
 
+from fleetmap.encoding import to_json
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import FOR_ROBOTS
 from mapserver.store.database import Transactions
@@ -83,7 +83,7 @@ def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: s
 def insert_verdict(connection: sqlite3.Connection, version: tuple[str, int], verdict: VerdictRow) -> None:
     """A verdict on (site, number)."""
     judged = (verdict.stamp_ns, int(verdict.accepted), int(verdict.forced))
-    texts = (json.dumps(verdict.reasons), json.dumps(verdict.report, sort_keys=True))
+    texts = (to_json(verdict.reasons).decode(), to_json(verdict.report, order="sorted").decode())
     columns = "site, version, stamp_ns, accepted, forced, reasons, report"
     connection.execute(f"INSERT INTO verdicts ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*version, *judged, *texts))
 

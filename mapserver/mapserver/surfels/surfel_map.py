@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat import Manifest, sha256_hex
@@ -109,7 +110,7 @@ def encode_surfels(surfels: Surfels) -> list[bytes]:
         blobs.append(data)
     views = tuple(tuple(row) for row in surfels.exposures.round(4).tolist())
     index = SurfelIndex(falloff=surfels.falloff, exposures=views, tiles=tuple(entries))
-    return [msgspec.json.encode(index, order="deterministic"), *blobs] if blobs else []
+    return [to_json(index, order="deterministic"), *blobs] if blobs else []
 
 
 def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, StoreError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList
 from mapserver.store import VersionInfo
@@ -114,4 +115,4 @@ class BuilderFolder:
         path = self._path(site, version)
         with disk_errors(f"{path} cannot be written", "check whose account this is, and the space"):
             make_folder(path.parent)
-            write_atomically(path, [msgspec.json.encode(built)])
+            write_atomically(path, [to_json(built)])

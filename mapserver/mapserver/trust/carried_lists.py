@@ -5,6 +5,7 @@ from pathlib import Path
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import UntrustedError, UsageError, disk_errors
 from fleetmap.mapformat.version_file import open_export
 from fleetmap.messages import WantedVersion
@@ -33,7 +34,7 @@ def carry_lists(store: Path, site: str, export: Path) -> None:
     paths += [lists.path(role, named[role]) for role in ("snapshot", "targets", site_role(site))]
     with disk_errors(f"{lists_path(export)} cannot be written", "check the folder, its space and rights"):
         files = {path.name: path.read_bytes() for path in paths}
-        write_atomically(lists_path(export), [msgspec.json.encode(files)])
+        write_atomically(lists_path(export), [to_json(files)])
 
 
 def check_carried(export: Path, root: Path) -> None:

@@ -14,6 +14,7 @@ import msgspec
 
 from fleetmap.access import Access, Holder, Purpose
 from fleetmap.bus import TlsFiles
+from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.mapformat import check_name
 from fleetmap.messages import encode_message
@@ -167,7 +168,7 @@ class RobotRegister:
                     root=root,
                     own=own.decode(),
                 )
-                bundles[robot] = msgspec.json.format(msgspec.json.encode(bundle)) + b"\n"
+                bundles[robot] = to_json(bundle, indent=2) + b"\n"
         for robot in bundles:
             self._store.audit("robot enrolled", robot, actor=actor, site=site)
         return bundles
@@ -255,7 +256,7 @@ class RobotRegister:
                 yield entries
                 if entries != before:
                     ordered = [entries[key] for key in sorted(entries)]
-                    write_atomically(self._path, [msgspec.json.encode(ordered)])
+                    write_atomically(self._path, [to_json(ordered)])
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

@@ -3,7 +3,6 @@
 Messages are protobuf in Foxglove's own schemas; a failure's whole report is JSON, because it has none. Stamps are nanoseconds.
 """
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, BinaryIO, NamedTuple
@@ -43,9 +42,10 @@ from foxglove.messages import (
 )
 from mcap.writer import CompressionType, Writer
 
+from fleetmap.encoding import to_json
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
 from fleetmap.live_survey import LiveSurveyState
-from fleetmap.messages import EstimateMessage, FailureKind, FailureReport, Status, finite, report_dict
+from fleetmap.messages import EstimateMessage, FailureKind, FailureReport, Status, report_dict
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
@@ -273,7 +273,7 @@ def failure(
         found.append(jpeg("/failures/matches" if kind == "matches" else "/failures/frame", stamp_ns, data))
     plain = report_dict(report)
     plain.pop("thumbnails")
-    found.append(ChannelMessage("/failures/report", stamp_ns, json.dumps(finite(plain), sort_keys=True).encode()))
+    found.append(ChannelMessage("/failures/report", stamp_ns, to_json(plain, order="sorted")))
     return found
 
 

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat.building import BUILDING_KEY, BuildingFrame
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
@@ -90,7 +91,7 @@ def encode_manifest(manifest: Manifest) -> bytes:
     Raises MapFormatError for values that JSON can't hold.
     """
     try:
-        return msgspec.json.encode(manifest, order="deterministic")
+        return to_json(manifest, order="deterministic")
     except (TypeError, ValueError) as error:
         raise MapFormatError(
             f"manifest of {manifest.site} version {manifest.version}: {error}; use plain values"

@@ -24,6 +24,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, disk_errors
 from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_tile, verified
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
@@ -67,7 +68,7 @@ class ExportHead(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def start(self) -> bytes:
         """The bytes of the file before the first blob."""
-        text = msgspec.json.encode(self, order="deterministic")
+        text = to_json(self, order="deterministic")
         number = max({"grid": 2, "surfel": 3}.get(blob.kind, 1) for blob in self.blobs)
         return _START.pack(EXPORT_MAGIC, number, 0, len(text)) + text
 

@@ -213,7 +213,7 @@ def _imu_noise(values: Values, where: str) -> ImuNoise | None:
             raise CalibrationError(
                 f"{where}: {_NOISE_KEYS[name]} is {value}; noise densities in SI units are small and positive"
             )
-    return ImuNoise(**{name: float(value) for name, value in given.items()})
+    return ImuNoise(**given)
 
 
 def _model(camera_model: object, distortion_model: object, where: str) -> str:

@@ -25,6 +25,11 @@ class CameraCalibration:
     body_from_cam: Array
     imu_minus_cam_s: float = 0.0
 
+    def __post_init__(self) -> None:
+        # Files are read by numpy, whose scalars no encoder knows.
+        _set_numbers(self, int, "width_px", "height_px")
+        _set_numbers(self, float, "imu_minus_cam_s")
+
     def pixel_from_ray(self, rays_cam: Array) -> Array:
         """(N, 2) pixels of rays (N, 3)."""
         return CAMERA_MODELS[self.model].pixel_from_ray(self.intrinsics_px, self.distortion, rays_cam)
@@ -43,6 +48,9 @@ class ImuNoise:
     accel_noise_mps2_rthz: float = 4.0e-3
     accel_walk_mps3_rthz: float = 6.0e-3
 
+    def __post_init__(self) -> None:
+        _set_numbers(self, float, *self.__slots__)
+
 
 @dataclass(frozen=True, slots=True)
 class RigCalibration:
@@ -51,6 +59,11 @@ class RigCalibration:
     cameras: tuple[CameraCalibration, ...]
     imu: ImuNoise | None = None
     base_from_body: Array = field(default_factory=lambda: np.eye(4))
+
+
+def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> None:
+    for name in names:
+        object.__setattr__(record, name, kind(getattr(record, name)))
 
 
 def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:

@@ -74,9 +74,9 @@ def bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
 def _print_json(
     info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
 ) -> None:
-    import msgspec
+    from fleetmap.encoding import to_plain
 
-    built: dict[str, Any] = msgspec.to_builtins(manifest)
+    built: dict[str, Any] = to_plain(manifest)
     shown = {
         "state": info.state,
         "manifest_sha256": info.manifest_sha256,

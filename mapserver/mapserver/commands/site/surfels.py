@@ -46,15 +46,15 @@ def changes(
     check_output("FILE", file)
     if file.suffix not in (".png", ".geojson"):
         raise UsageError(f"{file} must end in .png or .geojson")
-    import msgspec
 
+    from fleetmap.encoding import to_json
     from mapserver.serving.expected_views import SurfelChanges
     from mapserver.store import MapStore
     from mapserver.surfels.changes import APPEARED, CELL_M, VANISHED, changes_geojson, changes_png
 
     with MapStore.open(store, read_only=True) as maps:
         found = SurfelChanges(maps).between(site, before, after)
-    data = changes_png(found) if file.suffix == ".png" else msgspec.json.encode(changes_geojson(found))
+    data = changes_png(found) if file.suffix == ".png" else to_json(changes_geojson(found))
     with disk_errors(f"{file} cannot be written", "choose another place"):
         file.write_bytes(data)
     x, y = found.corner_m
