@@ -17,7 +17,7 @@ PACKAGES = {
     "mapserver": REPOSITORY / "mapserver" / "mapserver",
     "locclient": REPOSITORY / "locclient" / "locclient",
 }
-MOST_MODULES, MOST_LINES, MOST_PARAMETERS, MOST_SKIPS = 15, 400, 6, 29
+MOST_SKIPS = 29
 
 # Private words that the project once had, by the field's word that replaced them. Whole words of identifiers, not parts of words.
 # Where a package uses a word in the field's own sense (anchors of features, shelves of racks), the others are named.
@@ -94,32 +94,6 @@ def _tree(path: Path) -> ast.Module:
 
 def _python_files() -> list[Path]:
     return [*_modules().values(), *sorted((REPOSITORY / "tests").rglob("*.py"))]
-
-
-def test_no_folder_holds_more_modules_than_a_reader_can_take_in() -> None:
-    counts: dict[Path, int] = defaultdict(int)
-    for path in _python_files():
-        counts[path.parent] += 1
-    assert {str(k.relative_to(REPOSITORY)): n for k, n in counts.items() if n > MOST_MODULES} == {}
-
-
-def test_no_file_does_two_things() -> None:
-    lengths = {str(path.relative_to(REPOSITORY)): len(path.read_text("utf-8").splitlines()) for path in _python_files()}
-    assert {name: lines for name, lines in lengths.items() if lines > MOST_LINES} == {}
-
-
-def test_signatures_are_short() -> None:
-    """Outside kernels, which compile to flat arguments: an argument train gets a name instead."""
-    long = []
-    for module, path in _modules().items():
-        if path.stem.endswith("_kernels"):
-            continue
-        for node in ast.walk(_tree(path)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                names = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
-                if len([name for name in names if name not in ("self", "cls")]) > MOST_PARAMETERS:
-                    long.append(f"{module}.{node.name}: {len(names)}")
-    assert long == []
 
 
 def test_the_formatter_is_hardly_ever_switched_off() -> None:

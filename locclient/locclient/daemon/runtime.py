@@ -1,4 +1,4 @@
-"""Threads of the daemon: sensors, disk, network, and the calling one that localizes. An error in one of them ends all."""
+"""Threads of the daemon: sensors, disk, network, and the calling one that localizes. An error in any thread ends all."""
 
 import logging
 import threading
@@ -15,6 +15,7 @@ from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
+from fleetmap.threads import ended_by_threads
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
@@ -68,11 +69,10 @@ class _Shared:
     held: list[WantedVersion] = field(default_factory=list)
     loaded: deque[LoadedMap] = field(default_factory=deque)
     failures: deque[tuple[FailureContext, int]] = field(default_factory=lambda: deque(maxlen=_MAX_PENDING))
-    errors: list[BaseException] = field(default_factory=list)
 
 
 class Runtime:
-    """Runs until `stop` is called, the source has ended, or a thread has died, which `run` raises again."""
+    """Runs until `stop` is called, the source has ended, or a thread has died, whose error `run` raises."""
 
     def __init__(
         self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
@@ -98,9 +98,16 @@ class Runtime:
 
     def run(self) -> None:
         """Localizes on the calling thread until it is over; threads are joined, and what they held is on the disk."""
-        threads = [self._start("sensors", self._run_sensors), self._start("disk", self._run_disk)]
+        with ended_by_threads(self.stop):
+            self._run()
+
+    def _run(self) -> None:
+        works: dict[str, Callable[[], None]] = {"sensors": self._run_sensors, "disk": self._run_disk}
         if self._parts.server is not None:
-            threads.append(self._start("network", partial(self._run_network, self._parts.server)))
+            works["network"] = partial(self._run_network, self._parts.server)
+        threads = [threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()]
+        for thread in threads:
+            thread.start()
         if self._parts.fleet_manager is not None:
             self._parts.fleet_manager.start()
         self._manager.ready()
@@ -120,8 +127,6 @@ class Runtime:
                 self._parts.robot.ring.finish()
                 self._parts.replays.work()
             _log.info("stopped: %s", self._health(is_silent=False))
-        if self._shared.errors:
-            raise self._shared.errors[0]
 
     # --- the thread that localizes ------------------------------------------------------------------------------------
 
@@ -211,19 +216,6 @@ class Runtime:
 
     # --- the other threads --------------------------------------------------------------------------------------------
 
-    def _start(self, name: str, work: Callable[[], None]) -> threading.Thread:
-        def guarded() -> None:
-            try:
-                work()
-            except BaseException as error:
-                _log.exception("the thread %s died", name)
-                self._shared.errors.append(error)
-                self.stop()
-
-        thread = threading.Thread(target=guarded, name=name, daemon=True)
-        thread.start()
-        return thread
-
     def _run_sensors(self) -> None:
         try:
             self._parts.source.run(self._parts.intake, self._sensors_stop.wait)
@@ -280,7 +272,7 @@ class Runtime:
                 self._fetched_again.add(key)
                 self._parts.server.refetch.append(version)
                 return
-        publisher.show_grid(version.version or 0, grid, why)
+        _send(partial(publisher.show_grid, version.version or 0, grid, why))
 
     def _note_unusable(self, version: WantedVersion, reason: str) -> None:
         """A version without manifest or any tile is fetched again, once, and dropped where there is no server."""
@@ -328,4 +320,4 @@ def _send(publish: Callable[[], None]) -> None:
     try:
         publish()
     except FleetmapError as error:
-        _log.warning("an estimate was not sent: %s", error)
+        _log.warning("the robot's own programs or the server missed a message: %s", error)

@@ -222,6 +222,7 @@ def _run(
     import uvicorn
 
     from fleetmap.log_lines import log_to_stderr
+    from fleetmap.threads import ended_by_threads
     from mapserver.api.app import create_app
     from mapserver.api.body_limit import MAX_BODY_BYTES
     from mapserver.api.metrics import Metrics
@@ -299,8 +300,10 @@ def _run(
         signal.signal(number, lambda *_: None)
     # The bus last: whoever answers before this program does could be heard in its place.
     bus.open()
+    server = uvicorn.Server(config)
     try:
-        uvicorn.Server(config).run(sockets=[http.listener])
+        with ended_by_threads(lambda: setattr(server, "should_exit", True)):
+            server.run(sockets=[http.listener])
     finally:
         if webhook is not None:
             webhook.close()

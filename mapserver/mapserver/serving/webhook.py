@@ -95,7 +95,7 @@ class Webhook:
                 made.sock.do_handshake()
             made.request("POST", self._path, body, self._headers)
             status = made.getresponse().status
-        except (OSError, http.client.HTTPException, ValueError) as error:
+        except Exception as error:  # whatever it is, the next alert is tried all the same
             return f"{type(error).__name__}: {error}"[:200]
         finally:
             watch.cancel()

@@ -120,7 +120,7 @@ def test_a_failure_has_line_place_pictures_and_report() -> None:
     assert (line.level, line.name, line.message) == (4, "r1", "blind: dark, 3.0 s, version 4, tile 1,-2")
     np.testing.assert_allclose(matrix(decoded(found[1]).pose), TURNED, atol=1e-12)
     assert [decoded(message).data for message in found[2:4]] == [b"one", b"two"]
-    assert b'"radius_95_m": null' in found[4].data
+    assert b'"radius_95_m":null' in found[4].data
     assert b"thumbnails" not in found[4].data
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.errors import RecordingError
+from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import (
     FailureAck,
@@ -242,7 +242,7 @@ def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
         raise RuntimeError("the driver broke")
 
     source = ScriptedSource(list(robot_world.bundles(3)), {1: die})
-    with pytest.raises(RuntimeError, match="the driver broke"):
+    with pytest.raises(FleetmapError, match=r"the thread sensors died \(RuntimeError: the driver broke\)"):
         Runtime(world.parts(source, robot, Listener()), ServiceManager("")).run()
     assert not [thread for thread in threading.enumerate() if thread.name in {"sensors", "disk", "network"}]
 
