@@ -16,7 +16,6 @@ from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems
-from mapserver.api.body_limit import BodyLimit
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.exact_json import ExactJson
 from mapserver.api.file_routes import install_file_routes
@@ -38,6 +37,7 @@ from mapserver.api.parameters import (
     page,
     time_range,
 )
+from mapserver.api.request_limits import RequestLimits
 from mapserver.api.version_routes import ApiSettings, install_version_routes
 from mapserver.api.views import (
     EventList,
@@ -82,7 +82,7 @@ def create_app(
     problems.install(app)
     guard = settings.guard
     app.add_middleware(Guard, settings=guard if guard.operators else replace(guard, operators=Operators(store)))
-    app.add_middleware(BodyLimit)
+    app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
     _install_service_routes(app, store, fleet, metrics, bus)
     _install_list_routes(app, store, fleet)

@@ -15,8 +15,6 @@ from mapserver.commands.oidc_options import OidcOptions
 from mapserver.commands.options import StoreFolder
 
 if TYPE_CHECKING:
-    import socket
-
     from fastapi import FastAPI
 
     from fleetmap.bus import ZenohBus
@@ -26,6 +24,7 @@ if TYPE_CHECKING:
     from mapserver.fleet.fleet import Fleet
     from mapserver.operators.openid import Provider
     from mapserver.serving.bus_access import BusGuard
+    from mapserver.serving.http_connections import BoundedListener
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
 
@@ -163,6 +162,9 @@ def serve(
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
+    from mapserver.serving.http_connections import raise_file_limit
+
+    raise_file_limit()
     host, port = at.host_and_port()
     from fleetmap.bus import check_endpoint
     from mapserver.serving.bus_access import check_binding, prepare_bus
@@ -173,7 +175,11 @@ def serve(
 
     certificate, provider, settings = at.load_certificate(), at.load_provider(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
-    with _listening(host, port) as listener, at.viewers() as viewers, MapStore.open(store) as maps:
+    with (
+        _listening(host, port, is_behind_proxy=bool(at.http_name)) as listener,
+        at.viewers() as viewers,
+        MapStore.open(store) as maps,
+    ):
         shown = None if viewers is None else _Shown(viewers, at.viewed_site(maps))
         guard = at.guard(maps, certificate, provider, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
@@ -203,7 +209,7 @@ class _Shown(NamedTuple):
 
 
 class _Http(NamedTuple):
-    listener: "socket.socket"
+    listener: "BoundedListener"
     guard: "GuardSettings"
     certificate: "HttpCertificate | None"
     is_behind_proxy: bool
@@ -224,8 +230,8 @@ def _run(
     from fleetmap.log_lines import log_to_stderr
     from fleetmap.threads import ended_by_threads
     from mapserver.api.app import create_app
-    from mapserver.api.body_limit import MAX_BODY_BYTES
     from mapserver.api.metrics import Metrics
+    from mapserver.api.request_limits import MAX_BODY_BYTES
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
@@ -237,6 +243,7 @@ def _run(
         server_tasks,
     )
     from mapserver.serving.bus_service import BusService
+    from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
     from mapserver.serving.webhook import Webhook
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
@@ -262,6 +269,7 @@ def _run(
             viewer = FleetViewer(maps, fleet, bus_service.surveys, http.shown.site, http.shown.viewers)
             groups.append([BackgroundTask("showing the site to viewers", _VIEW_EVERY_S, viewer.look)])
         background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
+        background.append(asyncio.create_task(http.listener.watch(server.server_state.connections)))
         host, port = http.listener.getsockname()[:2]
         typer.echo(f"http: {'https' if http.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
@@ -279,8 +287,12 @@ def _run(
     install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
     config = uvicorn.Config(
         app,
+        loop="asyncio",  # uvloop would not ask the listener
+        http="h11",  # httptools takes heads of any size
+        h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+        backlog=BACKLOG,
         log_config=None,
-        log_level="warning",
+        log_level="error",  # each request that is none would be a warning
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
         ws_max_size=MAX_BODY_BYTES,
@@ -298,9 +310,9 @@ def _run(
     # the default ones would end the process with a status that says it was killed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
+    server = uvicorn.Server(config)
     # The bus last: whoever answers before this program does could be heard in its place.
     bus.open()
-    server = uvicorn.Server(config)
     try:
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
             server.run(sockets=[http.listener])
@@ -332,17 +344,17 @@ def _bound_the_end(fleet: "Fleet") -> None:
     bound.start()
 
 
-def _listening(host: str, port: int) -> "socket.socket":
+def _listening(host: str, port: int, *, is_behind_proxy: bool) -> "BoundedListener":
     import socket
 
     from fleetmap.errors import UsageError
+    from mapserver.serving.http_connections import BACKLOG, BoundedListener
 
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener = BoundedListener(socket.AF_INET6 if ":" in host else socket.AF_INET, is_behind_proxy=is_behind_proxy)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen(1024)
+        listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise UsageError(f"--http {host}:{port}: cannot listen there ({error.strerror}); choose another") from error

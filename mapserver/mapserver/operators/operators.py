@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 
 IDLE_S, LIFE_S = 3600, 12 * 3600
 TRIES, TRY_EVERY_S = 5, 12
+ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = (
+    20,
+    2,
+)  # under whatever names: one address leaves half of the server's time to others
 MIN_PASSWORD, MAX_PASSWORD = 12, 1000
 MAX_TOKEN_DAYS = 400
 _WAITING = 4  # sign-ins that may wait for their turn: more would hold the threads that answer everybody else
@@ -48,6 +52,7 @@ class Operators:
         self._store, self._now_ns = store, store.now_ns
         self._verifying, self._waiting = threading.Lock(), threading.BoundedSemaphore(_WAITING)
         self._tries = RateLimit(TRIES, 1 / TRY_EVERY_S, self._now_ns)
+        self._addresses = RateLimit(ADDRESS_TRIES, 1 / ADDRESS_TRY_EVERY_S, self._now_ns)
         self._notes = RateLimit(_NOTES, 1 / _NOTE_EVERY_S, self._now_ns)
         self._unnoted = 0
         self._are_there, self._looked_ns = False, -(10**18)
@@ -86,7 +91,7 @@ class Operators:
     def _sign_in(self, name: str, password: str, address: str) -> SignIn:
         name = ascii(name[:64])[1:-1]  # as names are, or else nobody's
         who = Actor(name, address=address)
-        if not self._tries.admits((name, address)):
+        if not (self._addresses.admits(address) and self._tries.admits((name, address))):
             self.note("sign-in refused", "too many tries", who)
             return SignIn(refusal="Too many tries. Wait before the next one.", retry_s=TRY_EVERY_S)
         row = self._store.operators.find(name)

@@ -12,7 +12,7 @@ from fleetmap.errors import StoreError
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
 from fleetmap.messages import RobotAck, RobotHealth
 from mapserver.api import app as app_module
-from mapserver.api import body_limit
+from mapserver.api import request_limits
 from mapserver.store import DraftContent
 from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -209,7 +209,7 @@ def test_a_body_is_measured_before_it_is_read(server: Server, monkeypatch: pytes
         yield from (b" " * 100_000 for _ in range(20))
 
     check_problem(server.client.post(address, content=pieces()), 413, "1048576 bytes")
-    monkeypatch.setattr(body_limit, "MAX_BODY_BYTES", 1 << 40)
+    monkeypatch.setattr(request_limits, "MAX_BODY_BYTES", 1 << 40)
     assert server.client.post(address, content=content).status_code == 422, "the control: it is read, and is no JSON"
 
 

@@ -14,13 +14,15 @@ import pytest
 from fastapi import Request, Response
 from fastapi.testclient import TestClient
 from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from mapserver.api import request_limits
 from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
+from mapserver.dashboard.pages.sign_in_page import install as install_sign_in
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
 from support.fleet.quick_passwords import use_quick_passwords
@@ -284,3 +286,43 @@ def test_whoever_leaves_before_the_answer_is_no_error_of_the_server(has_left: bo
     else:
         with pytest.raises(RuntimeError, match="No response returned"):
             anyio.run(guard, scope, receive, send)
+
+
+def test_a_slow_or_large_sign_in_is_refused_and_one_that_leaves_is_no_error(
+    server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(request_limits, "SIGN_IN_S", 0.1)
+    headers = [(b"host", b"127.0.0.1"), (b"content-type", b"application/x-www-form-urlencoded")]
+    scope = {"type": "http", "method": "POST", "path": "/sign-in", "raw_path": b"/sign-in", "query_string": b""}
+    scope |= {"headers": headers, "client": ("10.0.0.1", 1), "scheme": "http", "http_version": "1.1", "root_path": ""}
+    part = {"type": "http.request", "body": b"x" * 3000, "more_body": True}
+
+    async def ask(app: ASGIApp, *messages: Message) -> list[int]:
+        """The statuses that answer these messages and, behind them, nothing more."""
+        waiting, answered = list(messages), []
+
+        async def receive() -> Message:
+            if not waiting:
+                await anyio.sleep(20)
+            return waiting.pop(0)
+
+        async def send(message: Message) -> None:
+            answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
+
+        await app(dict(scope), receive, send)
+        return answered
+
+    with client_of(server) as client:
+        Operators(server.store).add("ada", "admin", PASSWORD, Actor("root"))
+        install_sign_in(client.app, GuardSettings(operators=Operators(server.store)))
+        for messages, statuses in (
+            ([part], [408]),
+            ([part, part], [413]),
+            ([part, {"type": "http.disconnect"}], []),
+            ([part | {"more_body": False}], [401]),
+        ):
+            assert anyio.run(ask, client.app, *messages) == statuses
+        long = [*headers, *((b"cookie", b"a" * 3000) for _ in range(6))]
+        scope["headers"] = long
+        assert anyio.run(ask, client.app, part | {"more_body": False}) == [431]
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]

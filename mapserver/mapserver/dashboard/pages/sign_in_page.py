@@ -25,6 +25,7 @@ from mapserver.operators.operators import Operators
 from mapserver.operators.roles import PROVIDER_PREFIX
 from mapserver.store import Actor
 
+_MAX_ADDRESS = 300  # percent-encoded it must fit into the sign-in's body, beside name and password
 _STYLE = Path(__file__).parents[1] / "style.css"
 _PAGE = Markup(
     '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Sign in – fleetmap</title><link rel="icon" href="data:,">'
@@ -143,4 +144,5 @@ def _page(settings: GuardSettings, then: str, name: str = "", refusal: str = "",
 def _local(address: str) -> str:
     """The address where it is one of this server, else the first page: a link from elsewhere must not lead on to elsewhere."""
     is_local = address.startswith("/") and not address.startswith(("//", "/\\")) and address.isprintable()
+    is_local = is_local and len(address) <= _MAX_ADDRESS
     return address if is_local and not address.startswith((SIGN_IN, SIGN_OUT)) else "/"

@@ -1,0 +1,86 @@
+"""Limits on requests, outside of everything else: they hold before anything of a body is kept or any token is looked at."""
+
+import asyncio
+from contextlib import suppress
+
+from starlette.requests import ClientDisconnect
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mapserver.api.guard import SIGN_IN
+from mapserver.api.problems import problem
+from mapserver.serving.http_connections import MAX_HEAD_BYTES
+
+MAX_BODY_BYTES = 1 << 20  # an act has some hundred bytes; the pages' socket falls back to posts of less than this
+SIGN_IN_BYTES = 4 << 10  # anybody may send one
+BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is there
+
+
+class RequestLimits:
+    """Answers 431 to a large head, 413 to a large body, stated or not, and 408 to a slow one, and closes the connection.
+
+    Whoever leaves before the body is there causes no line in the log.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] not in {"http", "websocket"}:
+            return await self._app(scope, receive, send)
+        if "://" in scope["path"][:8]:  # the absolute form of an address, which h11 leaves as it is
+            scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
+            scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
+        head_bytes = len(scope["raw_path"]) + len(scope["query_string"])
+        head_bytes += sum(len(name) + len(value) + 4 for name, value in scope["headers"])
+        if scope["type"] == "websocket":
+            if head_bytes > MAX_HEAD_BYTES:
+                await receive()
+                return await send({"type": "websocket.close", "code": 4431})
+            return await self._app(scope, receive, send)
+        is_sign_in = scope["path"] == SIGN_IN
+        most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if is_sign_in else (MAX_BODY_BYTES, BODY_S)
+        too_large = 413, f"the body has more than {most_bytes} bytes"
+        stated = dict(scope["headers"]).get(b"content-length", b"0")
+        if head_bytes > MAX_HEAD_BYTES:
+            words = f"the request's head has {head_bytes} bytes; the limit is {MAX_HEAD_BYTES}"
+            return await _refuse(scope, receive, send, 431, words)
+        if not stated.isdigit() or len(stated) > 15 or int(stated) > most_bytes:
+            return await _refuse(scope, receive, send, *too_large)
+        taken, is_whole, is_refused, is_answered = 0, False, False, False
+        until_s = asyncio.get_running_loop().time() + within_s
+
+        async def limited() -> Message:
+            nonlocal taken, is_whole, is_refused
+            if is_refused:
+                return {"type": "http.disconnect"}
+            refusal = too_large
+            try:
+                # Behind the body this waits for the end of the connection.
+                async with asyncio.timeout_at(None if is_whole or is_answered else until_s):
+                    message = await receive()
+            except TimeoutError:
+                refusal = 408, f"the body was not there within {within_s:g} s"
+            else:
+                taken += len(message.get("body", b""))
+                is_whole = is_whole or not message.get("more_body", False)
+                if taken <= most_bytes:
+                    return message
+            if not is_answered:
+                is_refused = True
+                await _refuse(scope, receive, send, *refusal)
+            return {"type": "http.disconnect"}
+
+        async def answered(message: Message) -> None:
+            nonlocal is_answered
+            if not is_refused:
+                is_answered = True
+                await send(message)
+
+        with suppress(ClientDisconnect):
+            await self._app(scope, limited, answered)
+        return None
+
+
+async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, words: str) -> None:
+    await problem(status, words, scope["path"], {"Connection": "close"})(scope, receive, send)
