@@ -30,7 +30,8 @@ class RunOptions:
     light: Annotated[str, Option(help="day, evening or night.")] = "day"
     robot: Annotated[str | None, Option(help="Which of the scenario's robots; its first one unless given.")] = None
     lens: Annotated[
-        str | None, Option(help="pinhole, radial-tangential or equidistant instead of the robot's own.")
+        str | None,
+        Option(help="pinhole, radial-tangential, plumb-bob, rational or equidistant instead of the robot's own."),
     ] = None
 
 

@@ -21,6 +21,7 @@ from mapserver.calibration.parameters import (
     RigAxes,
     corrected_rig,
     right_camera,
+    with_distortion,
 )
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.calibration.schur_kernels import ImageRows, weigh
@@ -141,7 +142,7 @@ def _by_distortion(camera: CameraCalibration, pixels: Array, rect_from_cam: Arra
     for step in np.eye(DISTORTION) * _STEP_DISTORTION:
         ends = []
         for change in (step, -step):
-            other = replace(camera, distortion=camera.distortion + change)
+            other = replace(camera, distortion=with_distortion(camera.distortion, change))
             ends.append(_pixels(other.ray_from_pixel(pixels) @ rect_from_cam.T, view))
         columns.append((ends[0] - ends[1]) / (2.0 * _STEP_DISTORTION))
     return np.stack(columns, axis=2)

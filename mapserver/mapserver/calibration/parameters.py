@@ -129,13 +129,19 @@ def right_camera(axes: RigAxes, theta: Array) -> tuple[Array, Array]:
     return turn @ axes.rect_from_cam[1], direction * (length / np.linalg.norm(direction))
 
 
+def with_distortion(distortion: Array, change: Array) -> Array:
+    """The coefficients (k,) with a change (DISTORTION,) of the first ones; what a lens has beyond them is held."""
+    size = max(DISTORTION, len(distortion))
+    return np.pad(distortion, (0, size - len(distortion))) + np.pad(change, (0, size - DISTORTION))
+
+
 def _camera(camera: CameraCalibration, theta: Array, number: int) -> CameraCalibration:
     zoom = (1.0 + theta[INDEX[P.FOCAL]]) * (1.0 + theta[INDEX[P.FOCAL_RATIO]] if number else 1.0)
     shift = theta[[INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]]]
     distortion, lens = camera.distortion, theta[len(COLUMNS) :]
     if len(lens):
-        distortion = np.pad(distortion, (0, DISTORTION - len(distortion))) + lens[:DISTORTION]
-        distortion = distortion + (number - 0.5) * lens[DISTORTION : 2 * DISTORTION]
+        change = lens[:DISTORTION] + (number - 0.5) * lens[DISTORTION : 2 * DISTORTION]
+        distortion = with_distortion(distortion, change)
         shift = shift + number * lens[2 * DISTORTION :]
     intrinsics = np.concatenate([camera.intrinsics_px[:2] * zoom, camera.intrinsics_px[2:] + shift])
     offset_s = camera.imu_minus_cam_s + float(theta[INDEX[P.TIME_OFFSET]])

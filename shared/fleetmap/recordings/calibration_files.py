@@ -28,19 +28,13 @@ import yaml
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetmap.sensors.cameras import lens_of
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 MAX_CALIBRATION_BYTES = 1 << 20  # a camchain of two cameras has 2 kB
 _MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 20_000
 _WORDS = reprlib.Repr()
 _WORDS.maxlevel = 2
-_MODELS = {
-    ("pinhole", "radial-tangential"): "radial-tangential",
-    ("pinhole", "radtan"): "radial-tangential",
-    ("pinhole", "plumb_bob"): "radial-tangential",
-    ("pinhole", "none"): "radial-tangential",
-    ("pinhole", "equidistant"): "equidistant",
-}
 _NOISE_KEYS = {
     "gyro_noise_radps_rthz": "gyroscope_noise_density",
     "gyro_walk_radps2_rthz": "gyroscope_random_walk",
@@ -81,10 +75,13 @@ def read_calibration(path: Path) -> RigCalibration:
 def parse_calibration(text: str, where: str) -> CalibrationFile:
     """The calibration in the text of a camchain; `where` names it in error messages."""
     values = _parse_yaml(text, where)
+    if "camera_matrix" in values:
+        return CalibrationFile(RigCalibration((_ros_camera(values, where),)), {})
     names = sorted((key for key in values if key.startswith("cam") and key[3:].isdigit()), key=lambda key: int(key[3:]))
     if not names:
         raise CalibrationError(
-            f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...)"
+            f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...), or for a "
+            "single camera ROS's camera_info file"
         )
     noise = _imu_noise(values, where)
     first = _section(values, names[0], where)
@@ -128,8 +125,7 @@ def format_calibration(calibration: RigCalibration) -> str:
 def read_euroc_camera(path: Path) -> CameraCalibration:
     """The camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
     where, values = str(path), read_yaml(path)
-    model = _model(values.get("camera_model", "pinhole"), values.get("distortion_model", "none"), where)
-    camera = _camera(values, model, values.get("distortion_coefficients", []), where)
+    camera = _camera(values, "distortion_coefficients", where)
     return check_camera(
         replace(camera, body_from_cam=matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")), where
     )
@@ -173,13 +169,26 @@ def matrix_4x4(value: object, where: str) -> Array:
 
 
 def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: str) -> CameraCalibration:
-    model = _model(_need(values, "camera_model", where), values.get("distortion_model", "none"), where)
-    camera = _camera(values, model, values.get("distortion_coeffs", []), where)
+    camera = _camera(values, "distortion_coeffs", where)
     shift = values.get("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
     body_from_cam = _body_from_cam(values, previous, where)
     return check_camera(
         replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=_numbers([shift], 1, where)[0]), where
     )
+
+
+def _ros_camera(values: Values, where: str) -> CameraCalibration:
+    """The camera of a file that ROS's camera_calibration wrote: its raw images, not the rectified ones."""
+    fx, _, cx, _, fy, cy, *_ = _numbers(_need(values, "camera_matrix", where), 9, f"{where}: camera_matrix")
+    translated = {
+        "camera_model": "pinhole",
+        "resolution": [_need(values, "image_width", where), _need(values, "image_height", where)],
+        "intrinsics": [fx, fy, cx, cy],
+        "distortion_model": values.get("distortion_model"),
+        "distortion_coefficients": values.get("distortion_coefficients"),
+    }
+    present = {key: value for key, value in translated.items() if value is not None}
+    return check_camera(_camera(present, "distortion_coefficients", where), where)
 
 
 def _body_from_cam(values: Values, previous: CameraCalibration | None, where: str) -> Array:
@@ -194,13 +203,20 @@ def _body_from_cam(values: Values, previous: CameraCalibration | None, where: st
     return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
 
 
-def _camera(values: Values, model: str, distortion: object, where: str) -> CameraCalibration:
+def _camera(values: Values, distortion_key: str, where: str) -> CameraCalibration:
+    camera_model, name = str(_need(values, "camera_model", where))[:80], str(values.get("distortion_model"))[:80]
+    if camera_model.lower() != "pinhole":
+        raise CalibrationError(
+            f"{where}: camera model {camera_model} with distortion {name} is not known; calibrate as pinhole with radtan, or "
+            "a fisheye as pinhole with equidistant"
+        )
     width, height = _numbers(_need(values, "resolution", where), 2, f"{where}: resolution")
     intrinsics = _numbers(_need(values, "intrinsics", where), 4, f"{where}: intrinsics (fx fy cx cy)")
-    coefficients = _numbers(distortion, None, f"{where}: distortion coefficients")
-    if not np.any(coefficients) and model == "radial-tangential" and len(coefficients) not in (4, 5):
-        coefficients = np.zeros(0)
-    return CameraCalibration(model, int(width), int(height), intrinsics, coefficients, np.eye(4))
+    if _need(values, "distortion_model", where) != "none":
+        _need(values, distortion_key, where)
+    coefficients = _numbers(values.get(distortion_key, []), None, f"{where}: {distortion_key}")
+    model, distortion = lens_of(name, coefficients, where)
+    return CameraCalibration(model, int(width), int(height), intrinsics, distortion, np.eye(4))
 
 
 def _imu_noise(values: Values, where: str) -> ImuNoise | None:
@@ -216,20 +232,10 @@ def _imu_noise(values: Values, where: str) -> ImuNoise | None:
     return ImuNoise(**given)
 
 
-def _model(camera_model: object, distortion_model: object, where: str) -> str:
-    pair = (str(camera_model)[:80].lower(), str(distortion_model)[:80].lower())
-    if pair not in _MODELS:
-        known = ", ".join(f"{camera} with {lens}" for camera, lens in _MODELS)
-        raise CalibrationError(
-            f"{where}: camera model {pair[0]} with distortion {pair[1]} is not known; known are {known}"
-        )
-    return _MODELS[pair]
-
-
 def _numbers(value: object, count: int | None, where: str) -> Array:
+    data: Any = value.get("data") if isinstance(value, dict) else value  # OpenCV's and ROS's {rows, cols, data}
     try:
-        # YAML 1.1 reads 1e-5 as text
-        numbers = np.array([float(v) for v in value], np.float64)  # type: ignore[attr-defined]
+        numbers = np.array([float(v) for v in data], np.float64)  # YAML 1.1 reads 1e-5 as text
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{where}: {_brief(value)} are not numbers") from None
     if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
@@ -239,7 +245,8 @@ def _numbers(value: object, count: int | None, where: str) -> Array:
 
 def _need(values: Values, key: str, where: str) -> Any:
     if key not in values:
-        raise CalibrationError(f"{where}: {key} is missing; it holds {_brief(list(values))}")
+        none = "; images without distortion have distortion_model: none" if key.startswith("distortion") else ""
+        raise CalibrationError(f"{where}: {key} is missing; it holds {_brief(list(values))}{none}")
     return values[key]
 
 

@@ -15,6 +15,8 @@ _BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.
 LENSES: dict[str, tuple[str, tuple[float, ...], float]] = {
     "pinhole": ("radial-tangential", (), 420 / 640),
     "radial-tangential": ("radial-tangential", (-0.28, 0.074, 0.0002, 0.0002), 0.62),
+    "plumb-bob": ("radial-tangential", (-0.3, 0.11, 0.0003, -0.0002, -0.018), 0.62),
+    "rational": ("radial-tangential", (0.42, 0.03, 0.0002, -0.0001, 0.001, 0.72, 0.14, 0.004), 0.62),
     "equidistant": ("equidistant", (-0.013, 0.02, -0.015, 0.004), 0.55),
 }
 

@@ -217,11 +217,17 @@ def test_missing_sensor_yaml(euroc: Path) -> None:
         ("cam0: {camera_model: pinhole, intrinsics: [a, b, c, d], resolution: [1, 1]}", "are not numbers"),
         ("cam0: {camera_model: pinhole, intrinsics: [1, 1, 1], resolution: [4, 4]}", "4 numbers are expected"),
         ("cam0: {camera_model: pinhole, resolution: [4, 4]}", "intrinsics is missing"),
-        ("cam0: {camera_model: pinhole, intrinsics: [9, 9, 99, 9], resolution: [20, 20]}", "principal point"),
-        ("cam0: {camera_model: pinhole, intrinsics: [-9, 9, 9, 9], resolution: [20, 20]}", "focal lengths"),
         (
-            "cam0: {camera_model: pinhole, intrinsics: [9, 9, 9, 9], resolution: [20, 20], T_cam_imu: [[2, 0, 0, 0], "
-            "[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
+            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [9, 9, 99, 9], resolution: [20, 20]}",
+            "principal point",
+        ),
+        (
+            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [-9, 9, 9, 9], resolution: [20, 20]}",
+            "focal lengths",
+        ),
+        (
+            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [9, 9, 9, 9], resolution: [20, 20], "
+            "T_cam_imu: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
             "no rotation and translation",
         ),
     ],
@@ -238,7 +244,8 @@ def test_calibration_file_missing_or_nonsense(euroc: Path, tmp_path: Path, conte
 def test_calibration_file_with_too_few_cameras(euroc: Path, tmp_path: Path) -> None:
     file = tmp_path / "rig.yaml"
     file.write_text(
-        f"cam0: {{camera_model: pinhole, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]}}"
+        "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [200, 200, 160, 120], "
+        f"resolution: [{WIDTH}, {HEIGHT}]}}"
     )
     with pytest.raises(CalibrationError, match="2 cameras are recorded, the calibration describes 1"):
         open_recording(euroc, OpenOptions(calibration_file=file))
@@ -246,7 +253,7 @@ def test_calibration_file_with_too_few_cameras(euroc: Path, tmp_path: Path) -> N
 
 def test_imu_without_mounting_is_not_used_and_said_so(euroc: Path, tmp_path: Path) -> None:
     file = tmp_path / "rig.yaml"
-    lens = f"camera_model: pinhole, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]"
+    lens = f"camera_model: pinhole, distortion_model: none, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]"
     rows = "[[1, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
     file.write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(euroc, OpenOptions(calibration_file=file))

@@ -173,7 +173,8 @@ def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
 def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Path) -> None:
     """A point at depth z seen from 50 mm to the right moves by f * 0.05 / z px in the colour image."""
     folder = write_seven_scenes(tmp_path / "r", SAMPLE)
-    lens = f"camera_model: pinhole, intrinsics: [300, 300, {WIDTH / 2}, {HEIGHT / 2}], resolution: [{WIDTH}, {HEIGHT}]"
+    size = f"resolution: [{WIDTH}, {HEIGHT}], intrinsics: [300, 300, {WIDTH / 2}, {HEIGHT / 2}]"
+    lens = f"camera_model: pinhole, distortion_model: none, {size}"
     rows = "[[1, 0, 0, -0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
     (tmp_path / "rig.yaml").write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(folder, OpenOptions(calibration_file=tmp_path / "rig.yaml"))

@@ -10,15 +10,8 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetmap.sensors.cameras import lens_of
 
-_LENSES = {
-    "": "radial-tangential",
-    "plumb_bob": "radial-tangential",
-    "radtan": "radial-tangential",
-    "equidistant": "equidistant",
-    "fisheye": "equidistant",
-    "kannala_brandt": "equidistant",
-}
 _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
@@ -62,17 +55,8 @@ def calibration_of_messages(
 def _lens(camera: InfoCamera, where: str) -> CameraCalibration:
     info = camera.info
     matrix = info.projection[:, :3] if camera.is_rectified else info.matrix
-    distortion = np.zeros(0) if camera.is_rectified or not info.distortion.any() else info.distortion
-    lens = info.lens
-    if lens == "rational_polynomial" and not distortion[5:].any():
-        lens, distortion = "plumb_bob", distortion[:5]
-    if lens not in _LENSES and len(distortion):
-        raise CalibrationError(
-            f"{where}: the lens model {info.lens!r} of {info.frame_id} is not supported, known are plumb_bob and "
-            "equidistant; calibrate with one of these, or record rectified images, or pass a calibration with "
-            "--calibration FILE"
-        )
-    model = _LENSES.get(lens, "radial-tangential") if len(distortion) else "radial-tangential"
+    name, coefficients = ("", np.zeros(0)) if camera.is_rectified else (info.lens, info.distortion)
+    model, distortion = lens_of(name, coefficients, f"{where}: CameraInfo of {info.frame_id}")
     intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     return CameraCalibration(model, info.width_px, info.height_px, intrinsics, distortion, np.eye(4))
 

@@ -1,6 +1,7 @@
 """A recording made of the messages in a container: topics chosen, stamps put in order, images left where they are."""
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +28,9 @@ from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 from fleetmap.sensors.source_settings import Topics
 
 V = TypeVar("V")
+_RECTIFIED = re.compile(
+    r"(?<![a-z])rect(?![a-z])|(?<![a-z])rectified"
+)  # image_rect, rect/image; not direct, image_unrect
 
 
 @dataclass
@@ -278,7 +282,7 @@ def _calibration(container: Container, roles: _Roles, has_right: bool, imu_frame
                 f"{container.path}: no CameraInfo beside {image_topic} says what its lens is; pass a calibration with "
                 "--calibration FILE"
             )
-        cameras.append(InfoCamera(infos[0], "rect" in image_topic))
+        cameras.append(InfoCamera(infos[0], bool(_RECTIFIED.search(image_topic.lower()))))
     streams = roles.get("tf_static", ())
     links = [link for stream in streams for found in stream.values(stream.codec.links) for link in found]
     return calibration_of_messages(cameras, links, imu_frame, str(container.path))

@@ -20,7 +20,6 @@ UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 _ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
 _IMU_DOUBLES = 37
 _FLOAT32, _POINT_BYTES = 7, 12
-_LENS_NAMES = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +100,13 @@ def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) 
     """sensor_msgs/CameraInfo of an unrectified camera: its projection is that of the camera itself."""
     fx, fy, cx, cy = camera.intrinsics_px
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    distortion = camera.distortion
-    if camera.model != "equidistant":  # plumb_bob has five coefficients in ROS
-        distortion = np.pad(distortion, (0, 5 - len(distortion)))
+    name, distortion = camera.model, camera.distortion
+    if name == "radial-tangential" and len(distortion) <= 5:  # plumb_bob has five coefficients in ROS
+        name, distortion = "plumb_bob", np.pad(distortion, (0, 5 - len(distortion)))
+    elif name == "radial-tangential":
+        name = "rational_polynomial"
     writer = CdrWriter().header(stamp_ns, frame_id).unsigned(camera.height_px).unsigned(camera.width_px)
-    writer.text(_LENS_NAMES[camera.model]).unsigned(len(distortion)).doubles(distortion)
+    writer.text(name).unsigned(len(distortion)).doubles(distortion)
     writer.doubles(matrix).doubles(np.eye(3)).doubles(np.hstack([matrix, np.zeros((3, 1))]))
     for _ in range(6):  # binning_x binning_y and the region of interest: all zero means the whole image
         writer.unsigned(0)

@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
+from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array
 from fleetmap.sensors.cameras import equidistant, radial_tangential
 
@@ -29,6 +32,47 @@ class CameraModel:
 
 
 CAMERA_MODELS = {
-    "radial-tangential": CameraModel(radial_tangential.pixel_from_ray, radial_tangential.ray_from_pixel, (0, 4, 5)),
+    "radial-tangential": CameraModel(radial_tangential.pixel_from_ray, radial_tangential.ray_from_pixel, (0, 4, 5, 8)),
     "equidistant": CameraModel(equidistant.pixel_from_ray, equidistant.ray_from_pixel, (4,)),
 }
+
+# Names by which ROS, Kalibr, EuRoC, OpenCV and OpenVINS call a lens; ROS leaves it empty where it means plumb_bob
+_NAMES = {
+    "plumb_bob": "radial-tangential",
+    "radtan": "radial-tangential",
+    "radial-tangential": "radial-tangential",
+    "rational_polynomial": "radial-tangential",
+    "": "radial-tangential",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+_NO_PINHOLES = ("omni", "mei", "sphere", "unified", "eucm")  # even where their coefficients are zero
+_NEXT_STEP = "calibrate with one of these, or record rectified images, or pass a calibration with --calibration FILE"
+
+
+def lens_of(name: str, coefficients: Array, where: str) -> tuple[str, Array]:
+    """The key of CAMERA_MODELS and the distortion of a lens as another program names it; `where` is for error messages.
+
+    Coefficients are in OpenCV's order. Zeros at their end are cut off, so that one lens has one form: ROS writes five or
+    eight where four are known. CalibrationError for lenses that are not supported, for other counts and for what is not finite.
+    """
+    name = name.lower()
+    if not np.isfinite(coefficients).all():
+        raise CalibrationError(
+            f"{where}: distortion coefficients {coefficients.tolist()} are not finite; calibrate again"
+        )
+    if name not in _NAMES and (coefficients.any() or any(word in name for word in _NO_PINHOLES)):
+        known = ", ".join(filter(None, _NAMES))
+        raise CalibrationError(
+            f"{where}: the lens model {name[:40]!r} is not supported, known are {known}; {_NEXT_STEP}"
+        )
+    counts = CAMERA_MODELS[_NAMES.get(name, "radial-tangential")].distortion_counts
+    for count in counts:
+        if len(coefficients) >= count and not coefficients[count:].any():
+            return _NAMES.get(name, "radial-tangential"), coefficients[:count]
+    more = "; thin prisms (9 to 12) and tilted sensors (13, 14) are not supported" if len(coefficients) > 8 else ""
+    raise CalibrationError(
+        f"{where}: {len(coefficients)} distortion coefficients {coefficients[:16].tolist()} for {name or 'plumb_bob'}, "
+        f"which takes {' or '.join(map(str, counts))}{more}; {_NEXT_STEP}"
+    )

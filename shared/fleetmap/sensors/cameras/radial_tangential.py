@@ -1,23 +1,26 @@
-"""Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3]; none at all for an empty distortion. Source: Brown 1966, OpenCV's order."""
+"""Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3 [k4 k5 k6]]; none at all for an empty distortion.
+
+The radial factor is (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6). Sources: Brown 1966; OpenCV's order and its
+rational model.
+"""
 
 from functools import lru_cache
 
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.sensors.cameras.radial_tangential_kernels import undistort
+from fleetmap.sensors.cameras.radial_tangential_kernels import Lens, undistort
 
 
-def _coefficients(distortion: Array) -> tuple[float, float, float, float, float]:
-    padded = np.zeros(5)
-    padded[: len(distortion)] = distortion
-    return float(padded[0]), float(padded[1]), float(padded[2]), float(padded[3]), float(padded[4])
+def _coefficients(distortion: Array) -> Lens:
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(np.asarray(distortion, np.float64), (0, 8 - len(distortion))).tolist()
+    return k1, k2, p1, p2, k3, k4, k5, k6
 
 
 def _distort(distortion: Array, x: Array, y: Array) -> tuple[Array, Array]:
-    k1, k2, p1, p2, k3 = _coefficients(distortion)
+    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(distortion)
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return (
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
@@ -25,10 +28,13 @@ def _distort(distortion: Array, x: Array, y: Array) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=16)
-def _radial_limit(k1: float, k2: float, _p1: float, _p2: float, k3: float) -> float:
-    """Largest r^2 up to which the distorted radius still grows; beyond it the polynomial folds back. The same in every frame."""
-    # d/dr of r (1 + k1 r^2 + k2 r^4 + k3 r^6), as a polynomial in r^2
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+def _radial_limit(lens: Lens) -> float:
+    """Largest r^2 up to which the distorted radius still grows; beyond it the image folds back. The same in every frame."""
+    k1, k2, _, _, k3, k4, k5, k6 = lens
+    above, below = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([k6, k5, k4, 1.0])
+    # d/dr of r above(r^2) / below(r^2), times below^2, as a polynomial in r^2
+    slope = above * below + np.poly1d([2.0, 0.0]) * (above.deriv() * below - above * below.deriv())
+    roots = np.concatenate([slope.roots, below.roots])
     real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
     return float(real.min()) if len(real) else np.inf
 
@@ -38,7 +44,7 @@ def pixel_from_ray(intrinsics_px: Array, distortion: Array, rays_cam: Array) -> 
     fx, fy, cx, cy = intrinsics_px
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = rays_cam[:, 0] / rays_cam[:, 2], rays_cam[:, 1] / rays_cam[:, 2]
-        seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(*_coefficients(distortion)))
+        seen = (rays_cam[:, 2] > 1e-9) & (x * x + y * y < _radial_limit(_coefficients(distortion)))
         distorted_x, distorted_y = _distort(distortion, x, y)
     pixels = np.stack([fx * distorted_x + cx, fy * distorted_y + cy], axis=1)
     pixels[~seen] = np.nan
@@ -52,7 +58,7 @@ def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Ar
     x, y = np.empty_like(goal_x), np.empty_like(goal_y)
     undistort(_coefficients(distortion), (goal_x, goal_y), (x, y))
     back_x, back_y = _distort(distortion, x, y)
-    limit = _radial_limit(*_coefficients(distortion))
+    limit = _radial_limit(_coefficients(distortion))
     missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < limit))
     rays = np.stack([x, y, np.ones_like(x)], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -19,6 +19,8 @@ from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.cameras import lens_of
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet, Trajectory, WheelSample
 from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
@@ -227,13 +229,21 @@ def mono(tmp_path: Path, info: bytes) -> Recording:
     )
 
 
+RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
+
+
 @pytest.mark.parametrize(
     ("lens", "distortion", "model", "kept"),
     [
         ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.05], "radial-tangential", 5),
+        ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.0], "radial-tangential", 4),
         ("plumb_bob", [0.0] * 5, "radial-tangential", 0),
         ("equidistant", [0.1, 0.2, 0.0, 0.01], "equidistant", 4),
+        ("equidistant", [0.0] * 4, "equidistant", 4),
         ("rational_polynomial", [0.1, 0.2, 0.0, 0.0, 0.05, 0.0, 0.0, 0.0], "radial-tangential", 5),
+        ("rational_polynomial", RATIONAL, "radial-tangential", 8),
+        ("rational_polynomial", [*RATIONAL, *[0.0] * 6], "radial-tangential", 8),
+        ("inverse_brown_conrady", [0.0] * 5, "radial-tangential", 0),
         ("", [], "radial-tangential", 0),
     ],
 )
@@ -242,11 +252,28 @@ def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, 
     camera = recording.calibration.cameras[0]
     assert (recording.sensor_set, camera.model) == (SensorSet.MONO, model)
     assert camera.distortion.tolist() == distortion[:kept]
+    Rectifier(recording.calibration).rectify(recording.read_frame(0))
+    if kept:  # as this project writes it
+        back = ros_messages.decode_camera_info(ros_messages.encode_camera_info(1, "cam0", camera))
+        assert lens_of(back.lens, back.distortion, "")[1].tolist() == distortion[:kept]
 
 
-def test_a_rational_lens_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"rational_polynomial.*not supported.*--calibration"):
-        mono(tmp_path, camera_info("rational_polynomial", [0.1] * 8))
+@pytest.mark.parametrize(
+    ("lens", "distortion", "says"),
+    [
+        ("rational_polynomial", [*RATIONAL, 0.01, 0.0, 0.0, 0.0], r"12 distortion coefficients.*thin prisms"),
+        ("rational_polynomial", [*RATIONAL, *[0.0] * 5, 0.01], r"14 distortion coefficients.*tilted sensors"),
+        ("plumb_bob", [0.1], r"1 distortion coefficients \[0.1\] for plumb_bob"),
+        ("equidistant", [], "0 distortion coefficients"),
+        ("plumb_bob", [np.nan] * 5, "not finite"),
+        ("inverse_brown_conrady", [0.1] * 5, "'inverse_brown_conrady' is not supported"),
+        ("omnidirectional", [0.0] * 4, "'omnidirectional' is not supported"),
+    ],
+)
+def test_other_lenses_are_refused_by_name(tmp_path: Path, lens: str, distortion: list[float], says: str) -> None:
+    with pytest.raises(CalibrationError, match=says) as caught:
+        mono(tmp_path, camera_info(lens, distortion))
+    assert "calibrat" in str(caught.value)
 
 
 def test_images_of_every_encoding(tmp_path: Path) -> None:
