@@ -2,6 +2,7 @@
 
 import resource
 import time
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -89,6 +90,7 @@ class BuildOptions:
     looked for in the draft.
     threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
     section of the file `config` over it. job: its number, for the draft. keys: the builder's folder, if not the server's.
+    look_at: told which recordings are worked on.
     """
 
     frames: str = "::"
@@ -110,6 +112,7 @@ class BuildOptions:
     config: Path | None = None
     settings: SurveySettings | None = None
     keys: Path | None = None
+    look_at: Callable[[Sequence[Path]], None] = lambda _: None
 
     @property
     def reading(self) -> RecordingOptions:
@@ -229,6 +232,7 @@ def _admitted(run: _Run) -> dict[Path, Admission]:
             needs_truth=options.frame_from_ground_truth,
             unusable=run.unusable,
             beginnings=beginnings,
+            look_at=options.look_at,
         )
 
 
@@ -267,11 +271,13 @@ def _survey(
         with open_side_thread(options.threads) as beside:
 
             def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+                options.look_at([path])
                 done = survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
                 beside(partial(joining.add, Session(done.survey, done.map_from_survey)))
                 return done
 
             surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
+            options.look_at(list(admitted))
             tools.progress("joining", 0, 1)
         joined = joining.finish()
     run.times.begin("vocabulary")

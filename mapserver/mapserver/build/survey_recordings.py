@@ -1,5 +1,6 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
@@ -38,6 +39,7 @@ from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import for_depths
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
+_log = logging.getLogger(__name__)
 _SHARED_STRETCHES = 3  # of which a calibration takes one
 
 
@@ -184,22 +186,40 @@ def admit_recordings(
     needs_truth: bool,
     unusable: dict[Path, str] | None = None,
     beginnings: SurveyBeginnings | None = None,
+    look_at: Callable[[Sequence[Path]], None] = lambda _: None,
 ) -> dict[Path, Admission]:
     """Checks all recordings, so that a hopeless one is refused before the work begins; `beginnings` begin the survey of a single one.
 
-    unusable: takes those that are refused, with the reason; without it, or where all are, that is an error.
+    unusable: takes those that are refused, with the reason; without it, or where all are, that is an error. look_at: told each path.
     """
     admitted: dict[Path, Admission] = {}
     for path in paths:
-        try:
+        look_at([path])
+        with _noting(path, unusable):
             admitted[path] = _admission(path, options, console, needs_truth, beginnings)
-        except RecordingError as error:
-            if unusable is None:
-                raise
-            unusable[path] = str(error)
     if not admitted:
         raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
+
+
+@contextmanager
+def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
+    """Notes in `unusable` why the block fails for a recording; raises where there is none, and what is no fault of the recording."""
+    try:
+        yield
+    except (RecordingError, SurveyError) as error:
+        if unusable is None:
+            raise
+        unusable[path] = str(error)
+    except (FleetmapError, OSError):
+        raise
+    except Exception as error:
+        if unusable is None:
+            raise
+        _log.exception("%s", path)
+        unusable[path] = (
+            f"{path}: {type(error).__name__}: {str(error)[:200]}; a fault of the program, report it with the log"
+        )
 
 
 def _admission(
@@ -289,14 +309,9 @@ def survey_all(
     """
     done: list[Surveyed] = []
     for path in paths:
-        try:
+        with _noting(path, unusable):
             done.append(survey_one(path, pinhole))
-        except (RecordingError, SurveyError) as error:
-            if unusable is None:
-                raise
-            unusable[path] = str(error)
-            continue
-        pinhole = pinhole or done[0].survey.state.camera
+            pinhole = pinhole or done[0].survey.state.camera
     if not done:
         raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")
     return done

@@ -6,6 +6,7 @@ gate by the next night; recordings that a version holds are only put away.
 """
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,7 +16,7 @@ from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from fleetmap.log_lines import printable
-from fleetmap.recordings import OpenOptions, Topics
+from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, Topics
 from mapserver import releases
 from mapserver.build.build import BuildOptions, BuildRequest, build_draft
 from mapserver.build.job_lock import INTERRUPTED, end_interrupted, held, only_one
@@ -28,6 +29,12 @@ from mapserver.trust.builder_folder import BuilderFolder
 from mapserver.trust.signing import sign_as_builder
 
 JOB = "nightly"
+_MOST_A_NIGHT = 1000  # recordings, and lines about what is left where it is
+_MOST_ENDED = 2
+_ENDED = (
+    "{nights} nights ended while this was read or built: killed, out of memory or out of time, or by a fault of the program; "
+    "try `mapserver doctor` on it, and move it back, alone, to try again"
+)
 _SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config", "keys")
 
 
@@ -52,7 +59,10 @@ class NightRequest:
 
 @dataclass
 class NightReport:
-    """The report of a night, with the keys that docs/reports.md explains. version: what is current in the end."""
+    """The report of a night, with the keys that docs/reports.md explains. version: what is current in the end.
+
+    looking_at: names of the recordings that are read or built now. ended: by name, how many nights ended while they looked at it.
+    """
 
     job: int
     resumes: list[int] = field(default_factory=list)
@@ -61,6 +71,8 @@ class NightReport:
     recordings: list[dict[str, Any]] = field(default_factory=list)
     waiting: list[dict[str, str]] = field(default_factory=list)
     builds: list[dict[str, Any]] = field(default_factory=list)
+    looking_at: list[str] = field(default_factory=list)
+    ended: dict[str, int] = field(default_factory=dict)
 
 
 def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
@@ -77,7 +89,11 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
         try:
             with held(request.store, report.job):
                 sentence = _Night(request, gate, console, maps, report).run()
+        except KeyboardInterrupt:  # somebody ended it, not what it looked at
+            maps.tell_progress(report.job, [], "looking_at")
+            raise
         except FleetmapError as error:
+            report.looking_at = []
             with suppress(StoreError):  # a full disk: the next night finds this one's job running, and ends it
                 report.version = _current(maps, site)
                 kept = "" if report.version is None else f"; version {report.version} stays current"
@@ -99,19 +115,23 @@ def _has_site(maps: MapStore, site: str) -> bool:
     return any(info.site == site for info in maps.sites())
 
 
+def _like(names: Sequence[object]) -> str:
+    return f", like {len(names) - 1} more" if len(names) > 1 else ""
+
+
 def _current(maps: MapStore, site: str) -> int | None:
     info = maps.current(site) if _has_site(maps, site) else None
     return None if info is None else info.version
 
 
 def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
-    """Ends the jobs of nights that were killed: the lock says that none of them runs."""
-    killed = [
-        job
-        for job in maps.jobs(site)
-        if job.kind == JOB and job.id != report.job and (job.state == "running" or INTERRUPTED in job.report)
-    ]
+    """Ends the jobs of nights that were killed: the lock says that none of them runs. Counts what they looked at."""
+    nights = [job for job in maps.jobs(site) if job.kind == JOB and job.id != report.job]
+    killed = [job for job in nights if job.state == "running" or INTERRUPTED in job.report]
+    report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
     for job in killed:
+        for name in job.report.get("looking_at", []):
+            report.ended[name] = report.ended.get(name, 0) + 1
         report.resumes += [job.id, *job.report.get("resumes", [])]
     maps.update_job(report.job, "running", "", asdict(report))
     for job in killed:
@@ -131,13 +151,21 @@ class _Night:
 
     def run(self) -> str:
         here = boxes.arrivals(self._request.inbox, self._request.settle_s, self._request.now_ns)
+        for path, reason in here.bad[:_MOST_A_NIGHT]:
+            self._put_away(path, boxes.BAD, None, reason)
+        recordings = self._identified(here.complete[:_MOST_A_NIGHT])
         for path, reason in here.waiting:
-            self._say(f"not yet: {path.name}: {reason}")
-            self._report.waiting.append({"name": printable(path.name), "reason": printable(reason)})
-        recordings = self._identified(here.complete)
-        left = self._left_draft()
-        if left is not None:
-            recordings = self._publish(left, recordings)
+            self._wait(path.name, f"not yet: {reason}")
+        left = [*here.complete[_MOST_A_NIGHT:], *(path for path, _ in here.bad[_MOST_A_NIGHT:])]
+        if left:
+            self._wait(left[0].name, f"not yet{_like(left)}: a night takes {_MOST_A_NIGHT} recordings")
+        if here.others:
+            known = ", ".join(FILE_SUFFIXES)
+            words = f"no recording{_like(here.others)}; a recording is a folder, or a file that ends in {known}"
+            self._wait(here.others[0], words)
+        draft = self._left_draft()
+        if draft is not None:
+            recordings = self._publish(draft, recordings)
         fresh = self._unknown(recordings)
         if fresh:
             self._build(fresh)
@@ -150,18 +178,26 @@ class _Night:
         """Those that can be read, each once."""
         found: dict[str, Recorded] = {}
         for path in paths:
-            self._say(f"reading {path.name}")
-            if not boxes.is_safe_name(path.name):
-                self._put_away(path, boxes.BAD, None, f"its name {path.name} is no usable one; name it anew")
+            name = path.name
+            self._say(f"reading {name}")
+            if not boxes.is_safe_name(name):
+                self._put_away(path, boxes.BAD, None, f"its name {name} is no usable one; name it anew")
                 continue
+            if self._report.ended.get(name, 0) >= _MOST_ENDED:
+                self._put_away(path, boxes.BAD, None, _ENDED.format(nights=self._report.ended[name]))
+                continue
+            self._look_at([path])
             recorded = boxes.identify(path, OpenOptions(self._request.calibration, self._request.topics))
-            if isinstance(recorded, str):
+            if recorded is None:
+                self._wait(name, "not yet: it changed while it was read")
+            elif isinstance(recorded, str):
                 self._put_away(path, boxes.BAD, None, recorded)
             elif recorded.sha256 in found:
                 same = found[recorded.sha256].path.name
                 self._put_away(path, boxes.DONE, recorded.sha256, f"the same as {same}")
             else:
                 found[recorded.sha256] = recorded
+        self._look_at([])
         return list(found.values())
 
     def _left_draft(self) -> VersionInfo | None:
@@ -195,6 +231,7 @@ class _Night:
             replay=tuple(self._replayed()),
             actor=self._actor(),
             job=self._report.job,
+            look_at=self._look_at,
             **{name: getattr(request, name) for name in _SHARED_WITH_BUILDS},
         )
         paths = tuple(recorded.path for recorded in recordings)
@@ -204,6 +241,7 @@ class _Night:
         except (RecordingError, SurveyError) as error:
             self._put_all_away(recordings, unusable, str(error))
             raise
+        self._look_at([])
         self._report.builds.append({"version": draft.version, **draft.report})
         self._say(draft.sentence)
         for sha256, reason in draft.left_out.items():
@@ -251,9 +289,25 @@ class _Night:
 
     def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
         self._say(f"{where}: {path.name}: {reason}")
-        boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)
+        try:
+            boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)
+        except StoreError as error:
+            self._wait(path.name, f"{error}; {where}: {reason}")
+            return
+        self._report.ended.pop(path.name, None)  # another try, or another recording of this name, begins anew
         told = {"name": printable(path.name), "reason": printable(reason)}
         self._report.recordings.append({**told, "sha256": sha256, "fate": where})
+
+    def _wait(self, name: str, reason: str) -> None:
+        """Says why something is left where it is."""
+        self._say(f"{name}: {reason}")
+        if len(self._report.waiting) < _MOST_A_NIGHT:
+            self._report.waiting.append({"name": printable(name), "reason": printable(reason)})
+
+    def _look_at(self, paths: Sequence[Path]) -> None:
+        """Notes what the night looks at, so that the next ones know what ended it."""
+        self._report.looking_at = [path.name for path in paths]
+        self._maps.tell_progress(self._report.job, self._report.looking_at, "looking_at")
 
     def _counts(self) -> str:
         fates = [recording["fate"] for recording in self._report.recordings]

@@ -271,12 +271,12 @@ class StoreQueries:
         rows = self._transactions.query("SELECT DISTINCT site FROM jobs ORDER BY site")
         return [row["site"] for row in rows]
 
-    def tell_progress(self, job: int, progress: dict[str, Any]) -> None:
-        """Keeps how far a running job is, in its report; nothing for one that has ended."""
+    def tell_progress(self, job: int, progress: object, key: str = "progress") -> None:
+        """Keeps how far a running job is, under a key of its report; nothing for one that has ended. A power cut may take it."""
         with self._transactions.write(durable=False) as connection:
             connection.execute(
-                "UPDATE jobs SET report = json_set(report, '$.progress', json(?)) WHERE id = ? AND state = 'running'",
-                (to_json(progress).decode(), job),
+                "UPDATE jobs SET report = json_set(report, '$.' || ?, json(?)) WHERE id = ? AND state = 'running'",
+                (key, to_json(progress).decode(), job),
             )
 
     def running_jobs(self) -> list[JobInfo]:

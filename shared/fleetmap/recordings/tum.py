@@ -3,6 +3,7 @@
 Stamps are written with nine decimals and read as decimals, never through a float, so that nanoseconds survive.
 """
 
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -15,6 +16,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import Stamps, Trajectory
 
+MAX_TABLE_BYTES = 1 << 30  # 13 hours of an IMU at 200 Hz
 _NS = 1_000_000_000
 _MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold
 
@@ -85,9 +87,21 @@ def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
         last_ns = stamp_ns
 
 
+def check_table(path: Path) -> None:
+    """Raises RecordingError for what is no regular file, or too large for a table; OSError."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise RecordingError(f"{path} is no regular file; copy the recording again")
+    if status.st_size > MAX_TABLE_BYTES:
+        raise RecordingError(
+            f"{path} has {status.st_size} bytes; tables of at most {MAX_TABLE_BYTES >> 20} MiB are read, cut the recording"
+        )
+
+
 def read_text(path: Path, expected: str) -> str:
     """The text in the file at `path`; RecordingError where it cannot be read or is no text."""
     try:
+        check_table(path)
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error

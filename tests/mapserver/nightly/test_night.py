@@ -1,15 +1,22 @@
 """The nightly job, with real recordings, a real store and a build that takes no time: what it does when it is interrupted."""
 
+import contextlib
+import errno
 import fcntl
 import io
 import json
 import os
 import re
+import resource
 import signal
+import socket
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,13 +33,14 @@ from fleetmap.errors import (
     UsageError,
 )
 from fleetmap.mapformat import RecordingEntry
-from fleetmap.recordings import open_recording
+from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
 from mapserver import cli, releases
 from mapserver.build.build import BuildRequest, Draft
-from mapserver.build.survey_recordings import RecordingOptions, admit_recordings
+from mapserver.build.survey_recordings import RecordingOptions, admit_recordings, survey_all
 from mapserver.config import survey_settings
 from mapserver.nightly import NightRequest, last_report, night, run_night
+from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import arrivals
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, MapStore
@@ -223,6 +231,192 @@ def test_a_name_that_cannot_be_used_goes_to_bad_and_the_night_goes_on(hall: Path
         (hall / f"{name.decode('utf-8', 'surrogateescape')}.reason.txt").write_text("why")
         msgspec.json.encode({"name": path.name})
         assert "\n" not in path.name
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound, contextlib.chdir(path.parent):
+        bound.bind(path.name)
+
+
+def _in_recording(make: Callable[[Path], object], name: str = "mav0/cam0/data/more") -> Callable[[Path], object]:
+    """A recording with something else in it."""
+
+    def made(path: Path) -> None:
+        record(path.parent, path.name, 9)
+        (path / name).unlink(missing_ok=True)
+        make(path / name)
+
+    return made
+
+
+def _sparse(size_bytes: int, begin: bytes = b"") -> Callable[[Path], object]:
+    def made(path: Path) -> None:
+        path.write_bytes(begin)
+        os.truncate(path, size_bytes)
+
+    return made
+
+
+def _deep(path: Path) -> None:
+    with contextlib.chdir(path.parent):
+        for _ in range(120):
+            Path("d" * 40).mkdir()
+            os.chdir("d" * 40)
+
+
+def _long_line(path: Path) -> None:
+    path.write_bytes(b"1" * (64 << 20))
+
+
+BAD_ENTRIES = {
+    "a link that leads to itself": (lambda path: path.symlink_to(path.name), "symbolic link"),
+    "a link to nothing": (lambda path: path.symlink_to("nowhere"), "symbolic link"),
+    "a link out of the inbox": (lambda path: path.symlink_to("/etc"), "symbolic link"),
+    "a FIFO": (os.mkfifo, "FIFO"),
+    "a socket": (_socket, "socket"),
+    "a loop in a folder": (_in_recording(lambda path: path.symlink_to(path.name)), "more is a symbolic link"),
+    "a FIFO in a folder": (_in_recording(os.mkfifo), "more is a FIFO"),
+    "a FIFO as a table": (_in_recording(os.mkfifo, "mav0/imu0/data.csv"), "data.csv is a FIFO"),
+    "folders without end": (_in_recording(_deep), "levels of folders"),
+    "a table of terabytes": (_in_recording(_sparse(1 << 41), "mav0/imu0/data.csv"), "1024 MiB"),
+    "a table of one line": (_in_recording(_long_line, "mav0/imu0/data.csv"), "no row"),
+    "a calibration of terabytes": (_in_recording(_sparse(1 << 41), "mav0/cam0/sensor.yaml"), "1048576 bytes"),
+    "an MCAP file of holes": (_sparse(1 << 41, b"\x89MCAP0\r\n"), "MCAP"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_ENTRIES)
+def test_one_bad_entry_goes_to_bad_with_its_reason_and_the_night_goes_on(hall: Path, kind: str) -> None:
+    make, reason = BAD_ENTRIES[kind]
+    make(hall / "inbox/a.mcap")
+    assert "2 done, 0 held, 1 bad" in spend(hall)
+    assert names(hall / "inbox/bad") == ["a.mcap", "a.mcap.reason.txt"]
+    assert reason in (hall / "inbox/bad/a.mcap.reason.txt").read_text()
+    assert states(hall) == [("current", ["monday", "tuesday"])]
+
+
+def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left where it is, is named: no recordings, what cannot be moved, what changes while it is read, and what is too much."""
+    for name in ("notes.txt", "photo.png", "x.mcap", "y.mcap", "z.mcap"):
+        (hall / "inbox" / name).write_bytes(b"no MCAP")
+    changing = record(hall / "inbox", "changing", 5)
+    read = open_recording
+
+    def while_it_is_copied(path: Path, *more: object) -> object:
+        if path == changing and not (path / "mav0/late").exists():
+            (path / "mav0/late").write_bytes(b"late")
+        return read(path, *more)
+
+    monkeypatch.setattr(boxes, "open_recording", while_it_is_copied)
+    monkeypatch.setattr(night, "_MOST_A_NIGHT", 4)
+    replace = os.replace
+
+    def only_others(source: Path, target: Path) -> None:
+        if Path(source).name == "x.mcap":
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", only_others)
+    assert "2 done, 0 held, 0 bad" in spend(hall)
+    report = last_report(hall / "store", "hall")
+    assert report is not None
+    told = {waiting["name"]: waiting["reason"] for waiting in report["waiting"]}
+    assert "changed while it was read" in told["changing"]
+    assert "Operation not permitted" in told["x.mcap"]
+    assert "bad: " in told["x.mcap"]
+    assert "like 1 more: a night takes 4" in told["y.mcap"]
+    assert "no recording, like 1 more" in told["notes.txt"]
+    assert names(hall / "inbox/bad") == []
+    (hall / "inbox/x.mcap").unlink()
+    assert spend(hall) == "site hall: version 2 published, 1 done, 0 held, 2 bad"
+
+
+def test_files_that_may_not_be_read_end_no_night() -> None:
+    """Of an account that is not root, which may read everything."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (record(folder / "inbox", "other", 5) / "mav0").chmod(0)
+        record(folder / "inbox", "own", 6)
+        if os.getuid() == 0:
+            for path in (folder, *folder.rglob("*")):
+                os.chown(path, 65534, 65534)
+        child = os.fork()
+        if child == 0:
+            try:
+                if os.getuid() == 0:
+                    os.setuid(65534)
+                os._exit(0 if "1 done, 0 held, 1 bad" in spend(folder) else 1)
+            finally:
+                os._exit(2)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert "Permission denied" in (folder / "inbox/bad/other.reason.txt").read_text()
+
+
+@pytest.mark.parametrize("where", ["read", "built", "broken"])
+def test_what_ended_two_nights_is_set_aside_by_the_third(
+    hall: Path, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed while one recording is read or built, as by the kernel; a fault of the program counts as that."""
+    fatal = record(hall / "inbox", "fatal", 5)
+    read = open_recording
+
+    def killed(path: Path) -> None:
+        if path == fatal and where == "broken":
+            raise ZeroDivisionError
+        if path == fatal:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def reads(path: Path, *more: object) -> object:
+        killed(path)
+        return read(path, *more)
+
+    def builds(request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str]) -> tuple[Draft, None]:
+        for path in request.recordings:
+            request.options.look_at([path])
+            killed(path)
+        return built(request, settings, unusable)
+
+    monkeypatch.setattr(*((boxes, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
+    for _ in range(2):
+        status, _ = in_child(hall, Disk("/nowhere"))
+        assert status == (4 if where == "broken" else -signal.SIGKILL)
+        assert names(hall / "inbox") == ["fatal", "monday", "tuesday"]
+    assert "2 done, 0 held, 1 bad" in spend(hall)
+    assert "2 nights ended while this was read or built" in (hall / "inbox/bad/fatal.reason.txt").read_text()
+    assert states(hall) == [("current", ["monday", "tuesday"])]
+    (hall / "inbox/bad/fatal").rename(fatal)
+    monkeypatch.undo()
+    monkeypatch.setattr(night, "build_draft", built)
+    assert "version 2 published" in spend(hall), "it is tried again"
+
+
+def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
+    unusable: dict[Path, str] = {}
+
+    def survey_one(path: Path, _: object) -> Any:
+        if path.name == "fatal":
+            raise ZeroDivisionError("division by zero")
+        return SimpleNamespace(survey=SimpleNamespace(state=SimpleNamespace(camera=None)))
+
+    assert len(survey_all([Path("fatal"), Path("sound")], survey_one, None, unusable)) == 1
+    assert "ZeroDivisionError: division by zero" in unusable[Path("fatal")]
+    with pytest.raises(ZeroDivisionError):
+        survey_all([Path("fatal")], survey_one, None)
+
+
+def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monday = hall / "inbox/monday"
+
+    def takes(what: Callable[[], object]) -> str:
+        monkeypatch.setattr(boxes, "open_recording", lambda *_: what())
+        found = boxes.identify(monday, OpenOptions())
+        assert isinstance(found, str)
+        return found
+
+    assert "MiB of memory" in takes(lambda: bytearray(1 << 46))
+    assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
+    monkeypatch.setattr(boxes, "_READ_S", 0.05)
+    assert "was not read within 0 s" in takes(signal.pause)
 
 
 def test_nothing_joined_is_a_failed_night(hall: Path) -> None:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
-from fleetmap.recordings.images import StoredImage
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage
 from fleetmap.recordings.ordering import ReadLog
 
 _BLOCK_BYTES = 1 << 20
+_MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 ImageFiles = ImageSeries[Path]
 
 
@@ -55,7 +56,7 @@ class FileFrames(SeriesFrames[Path]):
         right: ImageFiles | None = None,
         depth: ImageFiles | None = None,
     ) -> None:
-        super().__init__(_load, left, right, depth)
+        super().__init__(read_image, left, right, depth)
         self.root, self.read_files = root, read_files
 
     def part(self, indices: NDArray[np.int64]) -> "FileFrames":
@@ -92,8 +93,13 @@ def _entries(folder: Path) -> list["os.DirEntry[str]"]:
     return list(os.scandir(folder)) if folder.is_dir() else []
 
 
-def _load(path: Path, _: int) -> StoredImage:
+def read_image(path: Path, _: int = 0) -> StoredImage:
+    """The image in a file, not decoded; RecordingError where it cannot be read or has more bytes than any image."""
     try:
+        if (size := path.stat().st_size) > _MAX_IMAGE_BYTES:
+            raise RecordingError(
+                f"{path} has {size} bytes; images of at most {_MAX_IMAGE_BYTES >> 20} MiB are read, remove it"
+            )
         return StoredImage("file", path.read_bytes(), str(path))
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the recording again") from error

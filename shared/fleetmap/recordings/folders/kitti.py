@@ -7,12 +7,13 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, read_image
 from fleetmap.recordings.folders.table_files import natural_key
 from fleetmap.recordings.image_series import pair_images
-from fleetmap.recordings.images import StoredImage, decode_grey
+from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
 from fleetmap.sensors.samples import Stamps, Trajectory
 
@@ -84,7 +85,7 @@ def _calibration(file: Path, first_image: Path, left_row: int, right_row: int) -
     if not file.is_file():
         raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
     rows = _projections(file)
-    height, width = decode_grey(StoredImage("file", first_image.read_bytes(), str(first_image))).shape
+    height, width = decode_grey(read_image(first_image)).shape
     cameras = []
     for row in (left_row, right_row):
         if row not in rows:
@@ -104,6 +105,7 @@ def _calibration(file: Path, first_image: Path, left_row: int, right_row: int) -
 def _projections(file: Path) -> dict[int, Array]:
     """The 3x4 matrices by number, of lines with or without `P0:` before twelve numbers."""
     rows: dict[int, Array] = {}
+    check_table(file)
     for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
         label, colon, numbers = line.partition(":") if ":" in line else ("", "", line)
         try:
@@ -132,6 +134,7 @@ def _ground_truth(path: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
 
 
 def _table(file: Path, widths: tuple[int, ...]) -> Array:
+    check_table(file)
     try:
         table = np.loadtxt(file, ndmin=2)
     except ValueError as error:

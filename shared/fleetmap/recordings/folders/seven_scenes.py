@@ -20,11 +20,12 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.depth_registration_kernels import nearest_surface
-from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images
+from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, read_image
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame, decode_grey
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Trajectory
 
@@ -170,8 +171,8 @@ def _number(file: Path) -> int:
 
 
 def _default_calibration(colour: Path, depth: Path) -> RigCalibration:
-    colour_shape = decode_grey(StoredImage("file", colour.read_bytes(), str(colour))).shape
-    depth_shape = decode_depth(StoredImage("file", depth.read_bytes(), str(depth))).shape
+    colour_shape = decode_grey(read_image(colour)).shape
+    depth_shape = decode_depth(read_image(depth)).shape
     shapes = ((colour_shape, _COLOUR_FOCAL_PX), (depth_shape, _DEPTH_FOCAL_PX))
     colour_camera, depth_camera = (_centred(shape, focal) for shape, focal in shapes)
     colour_from_depth = se3(np.eye(3), np.array([-_DEPTH_LEFT_OF_COLOUR_M, 0.0, 0.0]))
@@ -203,6 +204,7 @@ def _ground_truth(colour: ImageFiles, depth_from_body: Array, log: ReadLog) -> T
 
 def _rigid(file: Path) -> Array | None:
     """(4, 4) of a file; None where the tracking of the data set had failed or the file is damaged."""
+    check_table(file)
     try:
         matrix = np.array(file.read_text(errors="replace").split(), np.float64).reshape(4, 4)
     except ValueError:

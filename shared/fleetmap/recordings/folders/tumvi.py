@@ -11,6 +11,7 @@ from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, exis
 from fleetmap.recordings.folders.table_files import natural_key, read_ground_truth, read_imu
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.tum import check_table
 
 _CAMERAS = ("cam0", "cam1")
 
@@ -50,6 +51,7 @@ def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
     times = folder / "times.txt"
     if times.is_file():
         log.files.append(times)
+        check_table(times)
         rows = [line.split() for line in times.read_text(errors="replace").splitlines() if not line.startswith("#")]
         stamp_of = {row[0]: _stamp_ns(row[1], times) for row in rows if len(row) >= 2}
     else:
