@@ -10,8 +10,9 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import EstimateMessage, Placement, encode_message, robot_key
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from locclient.daemon.output_section import OutputSection
+from locclient.daemon.output_section import OutputSection, completed_for_ros2
 from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import PublishedPose
@@ -21,13 +22,14 @@ _MAX_HYPOTHESES = 16
 
 @dataclass(frozen=True, slots=True)
 class PublisherInputs:
-    """What publishers are made of. intake: where commands of the robot's own programs go."""
+    """What publishers are made of. intake: where commands of the robot's own programs go. wheel_topic: of the robot's driver."""
 
     bus: Bus
     site: str
     robot: str
     calibration: RigCalibration
     intake: Intake
+    wheel_topic: str = Topics().wheel
 
 
 class Publisher(Protocol):
@@ -58,7 +60,6 @@ class MessagePackPublisher:
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """See Publisher."""
-        covariance = estimate.cov_rot_trans if published.map_from_odom is not None else None
         body_from_base = se3_inverse(base_from_body)
         hypotheses = estimate.hypotheses[:_MAX_HYPOTHESES]
         message = EstimateMessage(
@@ -69,7 +70,9 @@ class MessagePackPublisher:
             map_version=estimate.map_version,
             odom_from_base=Placement.of(published.odom_from_base),
             map_from_odom=None if published.map_from_odom is None else Placement.of(published.map_from_odom),
-            cov_rot_trans=None if covariance is None else tuple(float(v) for v in covariance.ravel()),
+            cov_rot_trans=None
+            if published.cov_rot_trans is None
+            else tuple(float(v) for v in published.cov_rot_trans.ravel()),
             hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in hypotheses),
         )
         self._bus.publish(self._key, encode_message(message), may_drop=True)
@@ -90,7 +93,8 @@ class MessagePackPublisher:
 
 
 def _ros2(inputs: PublisherInputs, section: OutputSection) -> Publisher:
-    return Ros2Localizer(inputs.bus, inputs.robot, section, inputs.calibration, inputs.intake)
+    completed = completed_for_ros2(section, inputs.wheel_topic)
+    return Ros2Localizer(inputs.bus, inputs.robot, completed, inputs.calibration, inputs.intake)
 
 
 PUBLISHERS: dict[str, Callable[[PublisherInputs, OutputSection], Publisher]] = {

@@ -20,7 +20,13 @@ from fleetmap.occupancy_grid import GridImageError, MissingGridError, OccupancyG
 from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.ros2.cdr import CdrWriter
 from fleetmap.recordings.ros2.graph import LATCHED, Qos, key_layout
-from fleetmap.recordings.ros2.messages import FrameLink, encode_frame_links, encode_prior, encode_text
+from fleetmap.recordings.ros2.messages import (
+    FrameLink,
+    decode_frame_links,
+    encode_frame_links,
+    encode_prior,
+    encode_text,
+)
 from fleetmap.recordings.ros2.navigation_messages import (
     EMPTY,
     BondStatus,
@@ -38,6 +44,7 @@ from fleetmap.recordings.ros2.navigation_messages import (
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.intake import Intake
+from locclient.daemon.driver_odometry import DriverOdometry
 from locclient.daemon.lifecycle import (
     TRANSITIONS,
     LifecycleState,
@@ -50,12 +57,15 @@ from locclient.daemon.lifecycle import (
 )
 from locclient.daemon.output_section import OF_VERSION, OutputSection
 from locclient.localization.estimate import Estimate
+from locclient.localization.pose_covariance import transport_cov
 from locclient.robot.continuous_odom import PublishedPose
 
 _BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # nav2's own
 _STUCK_S = 3.0  # without a word from the thread that localizes, after which the bond is not renewed
 _OK, _WARN, _ERROR = 0, 1, 2
 _LEVELS = {Status.TRACKING: _OK, Status.LOST: _ERROR}
+_OWN_TF = 256  # messages, by which the own ones are known when they come back
+_OTHER_S = 5.0  # another program is named for so long after its last transform
 # nav2_msgs/srv/LoadMap
 _LOADED, _NO_MAP, _BAD_IMAGE, _BAD_ENTRIES = 0, 1, 2, 3
 # Of the motion between two frames: radians, metres, share of the distance; and where the odometry does not hold.
@@ -72,7 +82,7 @@ class Ros2Localizer:
     def __init__(
         self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
     ) -> None:
-        """Raises UsageError for names that are none, and FleetmapError for a grid that cannot be read."""
+        """section: from `completed_for_ros2`. Raises UsageError for names that are none, FleetmapError for a grid that cannot be read."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
         is_file = section.map not in {OF_VERSION, ""}
         self._grid = read_grid(Path(section.map)) if is_file else None
@@ -84,6 +94,11 @@ class Ros2Localizer:
         self._alive_s = time.monotonic()
         self._bond: BondStatus | None = None
         self._building_from_map: Array | None = None
+        self._sent_tf: deque[bytes] = deque(maxlen=_OWN_TF)
+        self._other_s, self._other = -_OTHER_S, ""
+        self._has_faulty_tf = False
+        offset_s = calibration.cameras[0].imu_minus_cam_s
+        self._driver = DriverOdometry(section.odom_frame, section.base_frame, offset_s, self._send_map_link)
         self._ended = threading.Event()
         self._node = node = Ros2Node(bus, key_layout(section.keys, section.domain), section.node, section.namespace)
         try:
@@ -100,7 +115,7 @@ class Ros2Localizer:
         section = self._section
         stamped = "geometry_msgs/PoseWithCovarianceStamped"
         self._send_placement = node.publisher(section.pose_topic, stamped, LATCHED)
-        self._send_tf = node.publisher(section.tf_topic, "tf2_msgs/TFMessage", Qos(100))
+        self._put_tf = node.publisher(section.tf_topic, "tf2_msgs/TFMessage", Qos(100))
         self._send_tf_static = node.publisher(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", LATCHED)
         self._send_odom = node.publisher(section.odom_topic, "nav_msgs/Odometry")
         self._send_status = node.publisher(section.status_topic, "std_msgs/String")
@@ -110,6 +125,11 @@ class Ros2Localizer:
         self._send_event = node.publisher("~/transition_event", "lifecycle_msgs/TransitionEvent")
         node.subscribe("bond", "bond/Status", self._hear_bond)
         node.subscribe(section.initial_pose_topic, stamped, self._take_initial_pose)
+        node.subscribe(section.tf_topic, "tf2_msgs/TFMessage", self._hear_tf, Qos(100))
+        if not section.publish_odom:
+            node.subscribe(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", self._driver.handle_tf_static, LATCHED)
+            if node.resolved(section.driver_odom_topic) != node.resolved(section.tf_topic):
+                node.subscribe(section.driver_odom_topic, "nav_msgs/Odometry", self._driver.handle_odometry)
         node.serve("~/get_state", "lifecycle_msgs/srv/GetState", lambda _: encode_state(self._state))
         node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
         node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())
@@ -133,21 +153,35 @@ class Ros2Localizer:
         section, stamp_ns = self._section, estimate.stamp_ns
         if section.building_frame:
             self._tell_building(published.building_from_map)
-        if published.map_from_odom is not None:
-            ahead_ns = stamp_ns + int(section.transform_tolerance_s * 1e9)
-            link = FrameLink(section.map_frame, section.odom_frame, published.map_from_odom)
-            self._send_tf(encode_frame_links(ahead_ns, [link]))
-            if estimate.cov_rot_trans is not None:
-                map_from_base = published.map_from_odom @ published.odom_from_base
-                prior = PositionPrior(stamp_ns, map_from_base, np.asarray(estimate.cov_rot_trans))
+        map_from_odom, map_from_base = published.map_from_odom, published.map_from_base
+        if map_from_odom is not None and map_from_base is not None:
+            if section.publish_odom:
+                self._send_map_link(stamp_ns, map_from_odom)
+            else:
+                self._driver.handle_frame(stamp_ns, map_from_base)
+            if published.cov_rot_trans is not None:
+                prior = PositionPrior(stamp_ns, map_from_base, published.cov_rot_trans)
                 self._send_placement(encode_prior(prior, section.map_frame))
+        odometry_frame = section.odom_frame
         if section.publish_odom:
-            link = FrameLink(section.odom_frame, section.base_frame, published.odom_from_base)
-            self._send_tf(encode_frame_links(stamp_ns, [link]))
+            self._send_tf(stamp_ns, FrameLink(section.odom_frame, section.base_frame, published.odom_from_base))
+        else:  # the driver's frame is another one than that of our odometry
+            odometry_frame = f"{section.sensor_frames or OutputSection().sensor_frames}odom"
         if before is not None and estimate.odometry.scale_known and stamp_ns > before[0].stamp_ns:
             motion = motion_between(before, (estimate, published), base_from_body)
-            self._send_odom(encode_motion(stamp_ns, section.odom_frame, section.base_frame, motion))
+            self._send_odom(encode_motion(stamp_ns, odometry_frame, section.base_frame, motion))
         self._send_status(encode_text(estimate.status.value))
+
+    def _send_map_link(self, stamp_ns: int, map_from_odom: Array) -> None:
+        if self._state is not LifecycleState.ACTIVE:  # since the frame, whose pose of the driver came later
+            return
+        ahead_ns = stamp_ns + int(self._section.transform_tolerance_s * 1e9)
+        self._send_tf(ahead_ns, FrameLink(self._section.map_frame, self._section.odom_frame, map_from_odom))
+
+    def _send_tf(self, stamp_ns: int, link: FrameLink) -> None:
+        message = encode_frame_links(stamp_ns, [link])
+        self._sent_tf.append(message)
+        self._put_tf(message)
 
     def _tell_building(self, building_from_map: Array | None) -> None:
         """The last one that was known stays in ROS's tree of frames: what is static there is never taken back."""
@@ -177,11 +211,26 @@ class Ros2Localizer:
             }
             if estimate.cov_rot_trans is not None:
                 values["radius_95_m"] = f"{radius_95_m(estimate.cov_rot_trans):.3f}"
+        if fault := self._tf_fault():
+            level, words = _ERROR, f"{words}; {fault}"
         if is_silent:
             level, words = _ERROR, "no frames come"
         if self._refused:
             values["refused_initial_pose"] = self._refused[0]
         return Diagnosis(level, f"{self._section.node}: localization", words, self._robot, values)
+
+    def _tf_fault(self) -> str:
+        """Why planners have no use of /tf; empty where they do. Logged when it begins and ends."""
+        fault = ""
+        if time.monotonic() - self._other_s < _OTHER_S:
+            fault = f"another program publishes {self._other} too: stop it, or see publish_odom in docs/ros2.md"
+        elif not self._section.publish_odom and self._last is not None:
+            missing = self._driver.fault(self._last[0].stamp_ns)
+            fault = missing and f"{self._section.map_frame} -> {self._section.odom_frame} is not sent: {missing}"
+        if bool(fault) != self._has_faulty_tf:
+            self._has_faulty_tf = bool(fault)
+            _log.warning("%s", fault or "/tf is whole again")
+        return fault
 
     @property
     def grid_height_m(self) -> float | None:
@@ -208,6 +257,19 @@ class Ros2Localizer:
         self._node.close()
 
     # --- called by threads of the bus ---------------------------------------------------------------------------------
+
+    def _hear_tf(self, message: bytes) -> None:
+        """Transforms of other programs; those sent here come back, too."""
+        section = self._section
+        if message in self._sent_tf:
+            return
+        links = decode_frame_links(message)
+        for link in links:
+            is_ours = link.child == section.odom_frame or (link.child == section.base_frame and section.publish_odom)
+            if is_ours and self._state is LifecycleState.ACTIVE:
+                self._other_s, self._other = time.monotonic(), f"{link.parent} -> {link.child}"
+        if not section.publish_odom:
+            self._driver.handle_tf(links)
 
     def _next_transitions(self) -> list[Transition]:
         return [transition for transition in TRANSITIONS if transition.start is self._state]
@@ -314,15 +376,17 @@ def motion_between(
     # The odometry's own frame may be turned against the published one.
     published_from_odometry = (now.odom_from_base @ base_from_body)[:3, :3] @ odometry.odom_from_body[:3, :3].T
     both = np.kron(np.eye(2), published_from_odometry)
-    return Motion(now.odom_from_base, both @ odometry.cov_rot_trans @ both.T, twist, twist_cov)
+    lever_m = now.odom_from_base[:3, :3] @ base_from_body[:3, 3]
+    covariance = transport_cov(both @ odometry.cov_rot_trans @ both.T, -lever_m)
+    return Motion(now.odom_from_base, covariance, twist, twist_cov)
 
 
 def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[FrameLink]:
-    """base -> body, and body -> each camera, under names that no URDF has: PREFIXbody, PREFIXcam0 and so on."""
+    """base -> body, and body -> each camera, under names that no URDF has: PREFIXbody, PREFIXcam0_optical and so on."""
     body = f"{section.sensor_frames}body"
     links = [FrameLink(section.base_frame, body, calibration.base_from_body)]
     for number, camera in enumerate(calibration.cameras):
-        links.append(FrameLink(body, f"{section.sensor_frames}cam{number}", camera.body_from_cam))
+        links.append(FrameLink(body, f"{section.sensor_frames}cam{number}_optical", camera.body_from_cam))
     return links
 
 

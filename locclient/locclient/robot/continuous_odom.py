@@ -5,18 +5,26 @@ from dataclasses import dataclass
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import ContinuousFrame
 from locclient.localization.estimate import Estimate
+from locclient.localization.pose_covariance import transport_cov
 
 
 @dataclass(frozen=True, slots=True)
 class PublishedPose:
     """One estimate in the published frames; map_from_odom is None while there is no single pose.
 
-    building_from_map: of the map that the robot uses, None where that does not say it.
+    building_from_map: of the map that the robot uses, None where that does not say it. cov_rot_trans (6, 6): of map_from_base, map axes
+    about the base, where the estimate has one.
     """
 
     odom_from_base: Array
     map_from_odom: Array | None
     building_from_map: Array | None = None
+    cov_rot_trans: Array | None = None
+
+    @property
+    def map_from_base(self) -> Array | None:
+        """(4, 4), None while there is no single pose."""
+        return None if self.map_from_odom is None else self.map_from_odom @ self.odom_from_base
 
 
 class ContinuousOdom:
@@ -41,4 +49,8 @@ class ContinuousOdom:
         if estimate.map_from_body is None:
             return PublishedPose(odom_from_base, None)
         self._is_localized = True
-        return PublishedPose(odom_from_base, estimate.map_from_body @ se3_inverse(odom_from_body))
+        map_from_odom, cov_rot_trans = estimate.map_from_body @ se3_inverse(odom_from_body), estimate.cov_rot_trans
+        if cov_rot_trans is not None:
+            lever_m = estimate.map_from_body[:3, :3] @ self._body_from_base[:3, 3]
+            cov_rot_trans = transport_cov(cov_rot_trans, lever_m)
+        return PublishedPose(odom_from_base, map_from_odom, cov_rot_trans=cov_rot_trans)

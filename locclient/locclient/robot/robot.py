@@ -82,12 +82,10 @@ class Outcome:
 
     def pose_message(self) -> PoseMessage | None:
         """The pose for the server; None while there is no single one with a covariance."""
-        estimate, map_from_odom = self.estimate, self.published.map_from_odom
-        if map_from_odom is None or estimate.cov_rot_trans is None:
+        estimate, map_from_base, cov = self.estimate, self.published.map_from_base, self.published.cov_rot_trans
+        if map_from_base is None or cov is None:
             return None
-        map_from_base = map_from_odom @ self.published.odom_from_base
-        where = (estimate.stamp_ns, map_from_base, estimate.cov_rot_trans)
-        return PoseMessage.of(*where, estimate.status, estimate.map_version)
+        return PoseMessage.of(estimate.stamp_ns, map_from_base, cov, estimate.status, estimate.map_version)
 
 
 @dataclass

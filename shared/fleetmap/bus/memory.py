@@ -107,8 +107,8 @@ class MemoryBus(Bus):
         """See Bus."""
         return f"{id(self):x}"
 
-    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
-        """See Bus."""
+    def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
+        """See Bus; nothing here is kept for later."""
         return self._declare(self._hub.subscribers, (key_expr, listen, self._certificate))
 
     def declare_alive(self, key: str) -> Handle:

@@ -89,8 +89,8 @@ class Bus(ABC):
         """Names this participant on its network."""
 
     @abstractmethod
-    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
-        """Calls `listen` for everything that is published under keys that match."""
+    def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
+        """Calls `listen` for everything that is published under keys that match; is_latched: first for what latched publishers keep."""
 
     @abstractmethod
     def declare_alive(self, key: str) -> Handle:

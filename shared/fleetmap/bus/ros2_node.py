@@ -55,9 +55,9 @@ class Ros2Node:
         self._show(endpoint)
         return send
 
-    def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], None]) -> None:
+    def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], None], qos: Qos = Qos()) -> None:  # noqa: B008 - a value
         """Calls `listen` with every message, on a thread of the bus; one that it refuses (FleetmapError) or cannot read is logged."""
-        endpoint = self._endpoint(SUBSCRIPTION, topic, type_name, Qos())
+        endpoint = self._endpoint(SUBSCRIPTION, topic, type_name, qos)
 
         def take(_: str, payload: bytes) -> None:
             try:
@@ -65,7 +65,8 @@ class Ros2Node:
             except (FleetmapError, ValueError) as error:
                 _log.warning("%s: %s", endpoint.name, error)
 
-        self._declared.callback(self._bus.subscribe(self._layout.key(endpoint.name, type_name), take).close)
+        key = self._layout.key(endpoint.name, type_name)
+        self._declared.callback(self._bus.subscribe(key, take, is_latched=qos.is_transient_local).close)
         self._show(endpoint)
 
     def serve(self, service: str, type_name: str, answer: Callable[[bytes], bytes]) -> None:

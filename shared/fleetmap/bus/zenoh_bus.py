@@ -220,7 +220,7 @@ class ZenohBus(Bus):
         """See Bus."""
         return str(self._guarded(lambda session: session.zid()))
 
-    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
+    def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
         """See Bus."""
 
         def take(sample: Any) -> None:
@@ -231,6 +231,11 @@ class ZenohBus(Bus):
 
         if not self._is_server:
             plain = lambda sample: deliver(listen, str(sample.key_expr), sample.payload.to_bytes())  # noqa: E731
+            if is_latched:
+                history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+                return self._declare(
+                    lambda session: zenoh.ext.declare_advanced_subscriber(session, key_expr, plain, history=history)
+                )
             return self._declare(lambda session: session.declare_subscriber(key_expr, plain))
         queue = FairQueue(f"hears {key_expr}")
         direct = zenoh.handlers.Callback(take, lambda: None, indirect=False)

@@ -50,7 +50,7 @@ def test_messagepack_holds_both_transforms() -> None:
     map_from_base = first.map_from_odom.target_from_source @ first.odom_from_base.target_from_source
     np.testing.assert_allclose(map_from_base, tracked.map_from_body @ se3_inverse(BASE_FROM_BODY), atol=1e-12)
     assert first.cov_rot_trans is not None
-    assert first.cov_rot_trans[35] == pytest.approx(0.01)
+    assert first.cov_rot_trans[35] == pytest.approx(0.01 + 0.2**2 * 1e-4), "of the base, 0.2 m aside"
     assert (first.cause, second.cause) == ("", "dark")
     assert (second.map_from_odom, second.cov_rot_trans, len(second.hypotheses)) == (None, None, 2)
 
@@ -63,7 +63,8 @@ def test_ros_topics_hold_the_same() -> None:
     assert len(stamped) == 1
     prior = decode_prior(stamped[0])
     np.testing.assert_allclose(prior.map_from_base, expected, atol=1e-12)
-    np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [1e-4] * 3 + [0.01] * 3)
+    levers_m2 = np.array([0.2**2 + 0.5**2, 0.5**2, 0.2**2])  # of the base about the body, which is turned by 90 degrees
+    np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [*[1e-4] * 3, *(0.01 + 1e-4 * levers_m2)])
     links = [link for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")] for link in decode_frame_links(payload)]
     assert [(link.parent, link.child) for link in links] == [("map", "odom"), *[("odom", "base_link")] * 2]
     np.testing.assert_allclose(links[0].parent_from_child @ links[1].parent_from_child, expected, atol=1e-12)

@@ -52,7 +52,7 @@ def test_nav2_on_dds_reaches_the_localizer() -> None:
                 if reply.ok and "@ros2_lv/" in str(reply.ok.key_expr)
             ]
 
-        assert eventually(lambda: len(tokens()) == 20)
+        assert eventually(lambda: len(tokens()) == 21)
         announced = tokens()
         assert "SS/fleetmap_localizer§change_state/lifecycle_msgs§srv§ChangeState" in announced
         assert [

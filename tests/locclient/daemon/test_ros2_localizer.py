@@ -106,9 +106,9 @@ def test_the_graph_shows_one_node_with_all_that_nav2_asks_for(robot: Robot) -> N
     tokens: list[list[str]] = []
 
     def is_complete() -> bool:
-        """The node, nine publishers, two subscriptions, ten services."""
+        """The node, nine publishers, three subscriptions, ten services."""
         tokens[:] = [parts for parts in program.graph() if parts[8] == NODE]
-        return len(tokens) == 22
+        return len(tokens) == 23
 
     assert eventually(is_complete)
     (node,) = [parts for parts in tokens if parts[5] == "NN"]
@@ -206,8 +206,8 @@ def test_nothing_is_told_before_activation_and_late_subscribers_get_the_last_pos
     found = [(one.header.frame_id, one.child_frame_id) for one in frames[0].transforms]
     assert found == [
         ("base_link", "fleetmap_body"),
-        ("fleetmap_body", "fleetmap_cam0"),
-        ("fleetmap_body", "fleetmap_cam1"),
+        ("fleetmap_body", "fleetmap_cam0_optical"),
+        ("fleetmap_body", "fleetmap_cam1_optical"),
     ]
     volatile = late.listen("/tf", "tf2_msgs/msg/TFMessage")
     assert not eventually(lambda: bool(volatile), 0.5)

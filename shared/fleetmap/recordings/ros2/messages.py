@@ -38,11 +38,12 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class FrameLink:
-    """One transform of a /tf_static message: parent_from_child (4, 4)."""
+    """One transform of a /tf or /tf_static message: parent_from_child (4, 4), and its stamp where it was read."""
 
     parent: str
     child: str
     parent_from_child: Array
+    stamp_ns: int = 0
 
 
 def header_of(data: bytes) -> tuple[int, str]:
@@ -171,6 +172,16 @@ def encode_odometry(sample: WheelSample, frame_id: str, child_frame_id: str) -> 
     return writer.doubles(variances).message()
 
 
+def decode_odometry_pose(data: bytes) -> FrameLink:
+    """The pose of nav_msgs/Odometry: from its frame to its child frame. ValueError for one that its covariance calls unknown."""
+    reader = CdrReader(data)
+    stamp_ns, parent, child = reader.stamp_ns(), reader.text().lstrip("/"), reader.text().lstrip("/")
+    parent_from_child, variances = _target_from_source(reader.doubles(7)), np.diag(reader.doubles(36).reshape(6, 6))
+    if not np.isfinite(variances).all():
+        raise ValueError(f"the variances of its pose are {variances.tolist()}; it holds no pose")
+    return FrameLink(parent, child, parent_from_child, stamp_ns)
+
+
 def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
     reader = CdrReader(data)
@@ -204,9 +215,8 @@ def decode_frame_links(data: bytes) -> list[FrameLink]:
     reader = CdrReader(data)
     links = []
     for _ in range(reader.unsigned()):
-        _, parent = reader.stamp_ns(), reader.text()
-        child = reader.text()
-        links.append(FrameLink(parent.lstrip("/"), child.lstrip("/"), _target_from_source(reader.doubles(7))))
+        stamp_ns, parent, child = reader.stamp_ns(), reader.text().lstrip("/"), reader.text().lstrip("/")
+        links.append(FrameLink(parent, child, _target_from_source(reader.doubles(7)), stamp_ns))
     return links
 
 

@@ -1,0 +1,198 @@
+"""The transform map -> odom where the robot's own driver publishes odom -> base: from the driver's poses, at the stamps of frames.
+
+The driver's frame `odom` is not that of our odometry: it began elsewhere, drifts in its own way, and may start anew at any time.
+"""
+
+import threading
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.recordings.ros2.messages import FrameLink, decode_frame_links, decode_odometry_pose
+
+_KEPT_NS = 10_000_000_000  # as tf2 keeps them
+_KEPT_POSES = 20_000
+_GAP_NS = 1_000_000_000
+_STRAYS = 5
+_WAITING = 64
+_LINKS_TO_BASE = 16
+# No ground robot moves by more between two poses: metres and radians at once, and by the second. What does is the driver's new origin.
+_STEP_M, _STEP_RAD, _SPEED_MPS, _TURN_RADPS = 0.1, 0.2, 10.0, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """No pose for a stamp. may_come: with messages to come."""
+
+    reason: str
+    may_come: bool
+
+
+class PoseHistory:
+    """Poses (4, 4) of the last seconds by stamp; they may come out of order."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._odom_from_base: list[Array] = []
+        self._strays = 0
+
+    def add(self, stamp_ns: int, odom_from_base: Array) -> None:
+        """Takes a pose. One that is much older than the newest is left out, unless several are: then the clock was set back."""
+        stamps, known = self._stamps_ns, self._odom_from_base
+        if stamps and stamp_ns < stamps[-1] - _KEPT_NS:
+            self._strays += 1
+            if self._strays < _STRAYS:
+                return
+            stamps.clear()
+            known.clear()
+        self._strays = 0
+        place = bisect_left(stamps, stamp_ns)
+        if place < len(stamps) and stamps[place] == stamp_ns:
+            return  # tf2 keeps the first one, too
+        stamps.insert(place, stamp_ns)
+        known.insert(place, odom_from_base)
+        old = max(bisect_left(stamps, stamps[-1] - _KEPT_NS), len(stamps) - _KEPT_POSES)
+        del stamps[:old], known[:old]
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest pose."""
+        return self._stamps_ns[-1] if self._stamps_ns else None
+
+    def at(self, stamp_ns: int) -> Array | Missing:
+        """The pose at a stamp, interpolated as tf2 does it: position and rotation apart from each other."""
+        stamps, known = self._stamps_ns, self._odom_from_base
+        if not stamps:
+            return Missing("none has come", may_come=True)
+        if stamp_ns > stamps[-1]:
+            late_s = (stamp_ns - stamps[-1]) * 1e-9
+            return Missing(f"the newest one is stamped {late_s:.3f} s before the frame", may_come=True)
+        after = bisect_left(stamps, stamp_ns)
+        if stamps[after] == stamp_ns:
+            return known[after]
+        if after == 0:
+            early_s = (stamps[0] - stamp_ns) * 1e-9
+            return Missing(f"the oldest one is stamped {early_s:.3f} s after the frame", may_come=False)
+        (a, b), gap_ns = known[after - 1 : after + 1], stamps[after] - stamps[after - 1]
+        if gap_ns > _GAP_NS:
+            return Missing(f"none was stamped within {gap_ns * 1e-9:.1f} s around the frame", may_come=False)
+        gap_s, step_m, turn = (
+            gap_ns * 1e-9,
+            float(np.linalg.norm(b[:3, 3] - a[:3, 3])),
+            so3_log(a[:3, :3].T @ b[:3, :3]),
+        )
+        if step_m > _STEP_M + _SPEED_MPS * gap_s or np.linalg.norm(turn) > _STEP_RAD + _TURN_RADPS * gap_s:
+            jump = f"it jumps by {step_m:.2f} m and {np.degrees(np.linalg.norm(turn)):.0f} degrees within {gap_s:.3f} s"
+            return Missing(f"{jump}: was it reset, or do two programs publish it?", may_come=False)
+        share = (stamp_ns - stamps[after - 1]) / gap_ns
+        return se3(a[:3, :3] @ so3_exp(share * turn), (1 - share) * a[:3, 3] + share * b[:3, 3])
+
+
+class DriverOdometry:
+    """Sends map_from_odom for every localized frame, once the driver's pose at its stamp is known. From any thread.
+
+    The pose is that of /tf where odom -> base is there, because it is what others compose with; else that of the driver's Odometry.
+    Where the driver moves another frame, such as base_footprint, /tf_static leads from it to the base.
+    """
+
+    def __init__(
+        self, odom_frame: str, base_frame: str, sensor_minus_frame_s: float, send: Callable[[int, Array], None]
+    ) -> None:
+        """sensor_minus_frame_s: the driver's stamp minus the frame's at the same moment. send: gets the frame's stamp and the transform."""
+        self._odom, self._base, self._send = odom_frame, base_frame, send
+        self._offset_ns = round(sensor_minus_frame_s * 1e9)
+        self._lock = threading.Lock()
+        self._tf, self._odometry = PoseHistory(), PoseHistory()
+        self._parents: dict[str, FrameLink] = {}  # by child, of /tf_static
+        self._waiting: deque[tuple[int, Array]] = deque(maxlen=_WAITING)
+        self._since_ns: int | None = None  # of the first frame that has no transform yet
+        self._refused = self._missing = ""
+
+    def handle_odometry(self, message: bytes) -> None:
+        """nav_msgs/Odometry of the driver."""
+        with self._lock:
+            try:
+                link = decode_odometry_pose(message)
+            except ValueError as error:
+                self._refused = f"an Odometry message is refused: {error}"
+                return
+            self._take(link, self._odometry)
+
+    def handle_tf(self, links: list[FrameLink]) -> None:
+        """Transforms of /tf."""
+        with self._lock:
+            for link in links:
+                if link.parent == self._odom:
+                    self._take(link, self._tf)
+
+    def handle_tf_static(self, message: bytes) -> None:
+        """tf2_msgs/TFMessage of /tf_static."""
+        with self._lock:
+            self._parents |= {link.child: link for link in decode_frame_links(message)}
+
+    def handle_frame(self, stamp_ns: int, map_from_base: Array) -> None:
+        """A localized frame."""
+        with self._lock:
+            self._since_ns = stamp_ns if self._since_ns is None or stamp_ns < self._since_ns else self._since_ns
+            self._waiting.append((stamp_ns, map_from_base))
+            self._send_known()
+
+    def fault(self, stamp_ns: int) -> str:
+        """Why nothing has been sent for more than a second up to this frame; empty otherwise."""
+        with self._lock:
+            if self._since_ns is None or stamp_ns - self._since_ns < _GAP_NS:
+                return ""
+            now = self._at(stamp_ns + self._offset_ns)
+            reason = now.reason if isinstance(now, Missing) else self._missing
+            what = f"the driver's pose of {self._base} in {self._odom} is not known: {reason}"
+            return f"{what}; {self._refused}" if self._refused else what
+
+    def _take(self, link: FrameLink, history: PoseHistory) -> None:
+        child = link.child or self._base
+        child_from_base = self._child_from_base(child)
+        if link.parent != self._odom or child_from_base is None:
+            where = f"{child!r} in {link.parent!r}"
+            if history is self._odometry:
+                self._refused = (
+                    f"its Odometry is of {where}: set [output] odom_frame and base_frame, or driver_odom_topic"
+                )
+            elif history.newest_ns is None:
+                self._refused = f"/tf has {where}, and /tf_static no way from there to the base"
+            return
+        self._refused = ""
+        history.add(link.stamp_ns, link.parent_from_child @ child_from_base)
+        self._send_known()
+
+    def _child_from_base(self, child: str) -> Array | None:
+        frame, frame_from_base = self._base, np.eye(4)
+        for _ in range(_LINKS_TO_BASE):
+            if frame == child:
+                return frame_from_base
+            link = self._parents.get(frame)
+            if link is None:
+                return None
+            frame, frame_from_base = link.parent, link.parent_from_child @ frame_from_base
+        return None
+
+    def _send_known(self) -> None:
+        """Sends what waits, in order. What can no longer get a pose is left out."""
+        while self._waiting:
+            stamp_ns, map_from_base = self._waiting[0]
+            odom_from_base = self._at(stamp_ns + self._offset_ns)
+            if isinstance(odom_from_base, Missing):
+                self._missing = odom_from_base.reason
+                if odom_from_base.may_come:
+                    return
+            else:
+                self._send(stamp_ns, map_from_base @ se3_inverse(odom_from_base))
+                self._since_ns = None
+            self._waiting.popleft()
+
+    def _at(self, stamp_ns: int) -> Array | Missing:
+        tf_ns, odometry_ns = self._tf.newest_ns, self._odometry.newest_ns
+        has_tf = tf_ns is not None and (odometry_ns is None or tf_ns > odometry_ns - _GAP_NS)
+        return (self._tf if has_tf else self._odometry).at(stamp_ns)
