@@ -132,7 +132,7 @@ class DriverOdometry:
     def handle_tf_static(self, message: bytes) -> None:
         """tf2_msgs/TFMessage of /tf_static."""
         with self._lock:
-            self._parents |= {link.child: link for link in decode_frame_links(message)}
+            self._parents |= {link.child: link for link in decode_frame_links(message) if link.is_usable}
 
     def handle_frame(self, stamp_ns: int, map_from_base: Array) -> None:
         """A localized frame."""

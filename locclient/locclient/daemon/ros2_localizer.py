@@ -263,7 +263,7 @@ class Ros2Localizer:
         section = self._section
         if message in self._sent_tf:
             return
-        links = decode_frame_links(message)
+        links = [link for link in decode_frame_links(message) if link.is_usable]
         for link in links:
             is_ours = link.child == section.odom_frame or (link.child == section.base_frame and section.publish_odom)
             if is_ours and self._state is LifecycleState.ACTIVE:

@@ -7,11 +7,19 @@ import numpy as np
 from fleetmap.sensors.samples import DataIssue, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
+# Ends of issues of recordings that have all of their data
 _NOT_LOST = (
     "stamps uncertain",
     "Bayer pattern",
     "depth of another system",
-)  # issues of recordings that have all of their data
+    "not used",
+    "not chosen",
+    "not read",
+    "not registered",
+    "not sound",
+    "stamps of zero",
+    "stamps repeated",
+)
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 RECORD_IMU = "record an IMU"
 _ALL_FRAMES = "record every frame of the camera"
@@ -67,8 +75,8 @@ def stamp_order(issues: Sequence[DataIssue]) -> Finding:
 
 def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
     """One warning for everything else that could not be read, or is not what it should be."""
-    odd = [Finding(i.what, Verdict.WARN, None, "", i.detail) for i in issues if i.what in _NOT_LOST]
-    lost = [i for i in issues if "stamps not increasing" not in i.what and i.what not in _NOT_LOST]
+    odd = [Finding(i.what, Verdict.WARN, None, "", i.detail) for i in issues if i.what.endswith(_NOT_LOST)]
+    lost = [i for i in issues if "stamps not increasing" not in i.what and not i.what.endswith(_NOT_LOST)]
     words = [f"{issue.what}: {issue.detail}; copy the recording again if it has more" for issue in lost]
     return [*odd, *(Finding("lost data", Verdict.WARN, None, "nothing lost", sentence) for sentence in words)]
 

@@ -17,6 +17,7 @@ from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tu
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, named_topics
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.source_settings import Topics
 
 __all__ = [
@@ -88,6 +89,8 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
         raise RecordingError(
             f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or a file such as .mcap"
         )
+    if path.is_file() and (fault := what_file_instead(path)):
+        raise RecordingError(f"{path} is {fault}")
     if archive.recognises(path):
         return archive.open_zip(path, _format_of, partial(_open, options=options))
     return _open(path, options)

@@ -27,6 +27,7 @@ import yaml
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
@@ -265,12 +266,18 @@ def _brief(value: object) -> str:
 
 
 def _read(path: Path) -> str:
+    if fault := what_file_instead(path):
+        raise CalibrationError(f"calibration file {path} is {fault}")
     try:
         with path.open("rb") as file:
             data = file.read(MAX_CALIBRATION_BYTES + 1)
-        return data.decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"calibration file {path} cannot be read ({error}); check the path") from error
+        return data.decode("utf-8-sig")
+    except OSError as error:
+        raise CalibrationError(f"calibration file {path} cannot be read ({error.strerror}); check the path") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(
+            f"calibration file {path} cannot be read: byte {error.start} is no text; a Kalibr camchain (YAML) is expected"
+        ) from error
 
 
 def _parse_yaml(text: str, where: str) -> Values:

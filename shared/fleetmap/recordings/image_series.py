@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
-from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_only, pair_stamps
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_only, nearest, pair_stamps
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
@@ -41,8 +41,19 @@ def pair_images(
     alone = len(first) + len(second) - 2 * len(firsts)
     if alone:
         detail = f"{alone} of {len(first)} and {len(second)}; {len(firsts)} pairs remain"
-        log.note("images without their partner", detail)
+        log.note("images without their partner", detail + _apart(first.stamps_ns, second.stamps_ns, tolerance_ns))
     return first.take(firsts), second.take(seconds)
+
+
+def _apart(first_ns: Stamps, second_ns: Stamps, tolerance_ns: int) -> str:
+    """By how much the stamps of two cameras differ, where that is more than the tolerance and what to do; else nothing."""
+    if not len(first_ns) or not len(second_ns):
+        return ""
+    apart_ms = float(np.median(second_ns[nearest(second_ns, first_ns)] - first_ns)) * 1e-6
+    if abs(apart_ms) <= tolerance_ns * 1e-6:
+        return ""
+    advice = "trigger both together, or stamp both by one clock; the stamps of one could be shifted by as much if that is constant"
+    return f"; the second is {apart_ms:+.3f} ms from the first in the median, {tolerance_ns * 1e-6:g} ms are allowed: {advice}"
 
 
 class SeriesFrames(Generic[T]):

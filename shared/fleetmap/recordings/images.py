@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
+from fleetmap.recordings.strange_files import what_instead
 from fleetmap.sensors.samples import CameraFrame, Image
 
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})(?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})[\s#]")
@@ -258,6 +259,12 @@ def file_kind(data: bytes) -> str:
     return "png" if data.startswith(_PNG_START) else "other"
 
 
+def is_cut(head: bytes, tail: bytes) -> bool:
+    """Whether a JPEG or PNG file, by its first and last bytes, lacks its end. OpenCV fills what is missing with grey and says nothing."""
+    end = {"jpeg": _JPEG_END, "png": _PNG_END}.get(file_kind(head))
+    return end is not None and end not in tail.rstrip(b"\0")[-64:]
+
+
 def store_frame(frame: CameraFrame) -> StoredFrame:
     """A decoded frame as rows of pixels."""
     right = None if frame.right is None else grey_image(frame.right)
@@ -265,18 +272,41 @@ def store_frame(frame: CameraFrame) -> StoredFrame:
     return StoredFrame(frame.stamp_ns, grey_image(frame.left), right, depth)
 
 
+def check_image(stored: StoredImage) -> tuple[int, int]:
+    """Width and height in pixels; RecordingError where the bytes cannot be a whole image. Nothing is decoded for it."""
+    if stored.encoding == INVERSE_DEPTH:
+        _inverse_depth_scale(stored)
+        return _check_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))
+    if stored.encoding == "file":
+        return _check_file(stored)
+    _check_rows(stored)
+    return stored.width_px, stored.height_px
+
+
 def _decode(stored: StoredImage) -> AnyArray:
     if stored.encoding == "file":
         return _decode_file(stored)
     if stored.encoding == INVERSE_DEPTH:
         return _decode_inverse_depth(stored)
+    step = _check_rows(stored)
+    dtype, channels = RAW_ENCODINGS[stored.encoding]
+    wire_type = np.dtype(dtype).newbyteorder(">" if stored.big_endian else "<")
+    row_bytes = stored.width_px * channels * wire_type.itemsize
+    padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
+    rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
+    # writable, as all images: one kind for kernels
+    pixels: AnyArray = rows.copy().view(wire_type).astype(dtype, copy=False)
+    return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
+
+
+def _check_rows(stored: StoredImage) -> int:
+    """The bytes from a row to the next; RecordingError where the data is no image of the encoding and size."""
     if stored.encoding not in RAW_ENCODINGS:
         raise RecordingError(
             f"{stored.where}: image encoding {stored.encoding!r}; known are {', '.join(RAW_ENCODINGS)}, jpeg, png"
         )
     dtype, channels = RAW_ENCODINGS[stored.encoding]
-    wire_type = np.dtype(dtype).newbyteorder(">" if stored.big_endian else "<")
-    row_bytes = stored.width_px * channels * wire_type.itemsize
+    row_bytes = stored.width_px * channels * np.dtype(dtype).itemsize
     step = stored.step_bytes or row_bytes
     colour_rows, luma_rows = _COLOUR_ROWS.get(stored.encoding, (0, 1))
     needed = step * (stored.height_px - 1) + row_bytes + step * (stored.height_px * colour_rows // luma_rows)
@@ -286,25 +316,12 @@ def _decode(stored: StoredImage) -> AnyArray:
             f"rows of {step} bytes; the message is damaged, or its encoding is another"
         )
     _check_size(stored.width_px, stored.height_px, stored.where)
-    if stored.height_px == 1:
-        step = row_bytes  # nothing says how long the only row is
-    padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
-    rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
-    # writable, as all images: one kind for kernels
-    pixels: AnyArray = rows.copy().view(wire_type).astype(dtype, copy=False)
-    return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
+    return step if stored.height_px > 1 else row_bytes  # nothing says how long the only row is
 
 
 def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
     """(H, W) metres, NaN where unknown. Source: compressed_depth_image_transport, whose 16 bits q mean a / (q - b) m, 0 unknown."""
-    if len(stored.data) < _DEPTH_HEAD.size:
-        raise RecordingError(f"{stored.where}: a depth image of {len(stored.data)} bytes; remove it from the recording")
-    _, a, b = _DEPTH_HEAD.unpack_from(stored.data)
-    if not (np.isfinite([a, b]).all() and a > 0):
-        raise RecordingError(
-            f"{stored.where}: {stored.form!r} needs two numbers that say what its values mean, there are {a:g} and {b:g}; "
-            "record raw depth images, or 16UC1"
-        )
+    a, b = _inverse_depth_scale(stored)
     quantized = _decode_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))
     if quantized.dtype != np.uint16 or quantized.ndim != 2:
         raise RecordingError(
@@ -316,29 +333,55 @@ def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
     return np.where(quantized == 0, np.float32(np.nan), depth_m)
 
 
+def _inverse_depth_scale(stored: StoredImage) -> tuple[float, float]:
+    """a and b of `_decode_inverse_depth`; RecordingError where the head does not hold them."""
+    if len(stored.data) < _DEPTH_HEAD.size:
+        raise RecordingError(f"{stored.where}: a depth image of {len(stored.data)} bytes; remove it from the recording")
+    _, a, b = _DEPTH_HEAD.unpack_from(stored.data)
+    if not (np.isfinite([a, b]).all() and a > 0):
+        raise RecordingError(
+            f"{stored.where}: {stored.form!r} needs two numbers that say what its values mean, there are {a:g} and {b:g}; "
+            "record raw depth images, or 16UC1"
+        )
+    return a, b
+
+
 def _decode_file(stored: StoredImage) -> AnyArray:
+    _check_file(stored)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise _not_an_image(stored)
+    return np.asarray(pixels)
+
+
+def _check_file(stored: StoredImage) -> tuple[int, int]:
+    """Width and height in pixels that the file's header states; RecordingError where it is cut or no image that is read."""
     data = stored.data
     if not data:
         raise RecordingError(f"{stored.where}: the image has no bytes; remove it from the recording")
-    unread = _unread(data, stored.form)
+    unread = what_instead(data) or _unread(data, stored.form)
     if unread:
         raise RecordingError(f"{stored.where}: {unread}")
-    # OpenCV fills the missing part of a cut image with grey and says nothing
-    kind, tail = file_kind(data), data.rstrip(b"\0")[-64:]
-    if (kind == "jpeg" and _JPEG_END not in tail) or (kind == "png" and _PNG_END not in tail):
+    if is_cut(data, data):
         raise RecordingError(
-            f"{stored.where}: the {kind} image is cut off after {len(data)} bytes; remove it from the recording"
+            f"{stored.where}: the {file_kind(data)} image is cut off after {len(data)} bytes; remove it from the recording"
         )
     size = image_size(data)
-    if size is not None:
-        _check_size(*size, stored.where)
-    pixels = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
-        raise RecordingError(
-            f"{stored.where}: {len(data)} bytes that cannot be read as an image (JPEG, PNG, TIFF, BMP, PNM)"
-            f"{f', their format is {stored.form[:80]!r}' if stored.form else ''}; remove it from the recording"
-        )
-    return np.asarray(pixels)
+    if size is None:
+        raise _not_an_image(stored)
+    _check_size(*size, stored.where)
+    return size
+
+
+def _not_an_image(stored: StoredImage) -> RecordingError:
+    form = f", their format is {stored.form[:80]!r}" if stored.form else ""
+    known = "an image (JPEG, PNG, TIFF, BMP, PNM)"
+    return RecordingError(
+        f"{stored.where}: {len(stored.data)} bytes that cannot be read as {known}{form}; remove it from the recording"
+    )
 
 
 def _unread(data: bytes, form: str) -> str:

@@ -1,6 +1,7 @@
 """Stamps put in order and paired, samples checked; everything that is left out is noted, never hidden."""
 
 import bisect
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,26 +34,58 @@ class ReadLog:
         self.issues.append(DataIssue(what, detail))
 
 
+def with_log_times(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) -> Stamps:
+    """The stamps (N,), those that nobody set (0) by their log times (N,), less what the others take to be logged; noted in `log`."""
+    unset = (stamps_ns == 0) & (log_times_ns != 0)
+    if not unset.any():
+        return stamps_ns
+    delay_ns = 0 if unset.all() else int(np.median((log_times_ns - stamps_ns)[~unset]))
+    log.note(f"{what}: stamps of zero", f"{int(unset.sum())} of {len(unset)}; the times of logging stand in for them")
+    return np.where(unset, log_times_ns - delay_ns, stamps_ns)
+
+
+def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) mask of the images with the size (width, height) of most, or of an unknown one; the others are noted in `log`."""
+    counts = Counter(size for size in sizes_px if size is not None)
+    if len(counts) <= 1:
+        return np.ones(len(sizes_px), np.bool_)
+    (width, height), most = counts.most_common(1)[0]
+    others = ", ".join(f"{count} of {w}x{h}" for (w, h), count in counts.most_common()[1:5])
+    log.note(f"{what}: images of another size", f"{others} left out, {most} have {width}x{height} px")
+    return np.array([size in (None, (width, height)) for size in sizes_px], np.bool_)
+
+
 def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
     """(N,) mask of a longest strictly increasing subsequence; the other stamps are noted in `log`.
 
     Stamps are never sorted: values that arrive out of order carry stamps that cannot be trusted. One stamp far in the
     future costs itself, not all that follow. RecordingError where more than half would be left out.
     """
-    backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
-    if len(backwards) == 0:
+    steps = np.diff(stamps_ns)
+    odd = np.flatnonzero(steps <= 0)
+    if len(odd) == 0:
         return np.ones(len(stamps_ns), np.bool_)
     kept = _longest_increasing(stamps_ns)
-    dropped, first = int((~kept).sum()), int(backwards[0])
-    log.note(
-        f"{what}: stamps not increasing",
-        f"{dropped} of {len(kept)} left out; the first is {stamps_ns[first + 1]} after {stamps_ns[first]}",
-    )
-    if dropped > len(kept) // 2:
-        raise RecordingError(
-            f"{what}: stamps go backwards, {dropped} of {len(kept)} do not fit; the sensor's clock is broken, "
-            "record again"
+    dropped, first = int((~kept).sum()), int(odd[0])
+    share, is_repeated = f"{dropped} of {len(kept)}", not (steps < 0).any()
+    if is_repeated:
+        log.note(
+            f"{what}: stamps repeated",
+            f"{share} are that of the one before and left out; the first is {stamps_ns[first]}",
         )
+    else:
+        log.note(
+            f"{what}: stamps not increasing",
+            f"{share} left out; the first is {stamps_ns[first + 1]} after {stamps_ns[first]}",
+        )
+    if dropped > len(kept) // 2:
+        fault = (
+            f"{share} stamps repeat the one before, the first is {stamps_ns[first]}; the driver stamps several alike, or rounds: "
+            "let it stamp each one when it is measured"
+            if is_repeated
+            else f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
+        )
+        raise RecordingError(f"{what}: {fault}")
     return kept
 
 
@@ -117,7 +150,7 @@ def pair_stamps(
     """
     if len(left_ns) == 0 or len(right_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    right_of_left, left_of_right = _nearest(right_ns, left_ns), _nearest(left_ns, right_ns)
+    right_of_left, left_of_right = nearest(right_ns, left_ns), nearest(left_ns, right_ns)
     lefts = np.arange(len(left_ns))
     is_mutual = left_of_right[right_of_left] == lefts
     is_close = np.abs(right_ns[right_of_left] - left_ns) <= tolerance_ns
@@ -125,7 +158,8 @@ def pair_stamps(
     return chosen, right_of_left[chosen]
 
 
-def _nearest(sorted_ns: Stamps, wanted_ns: Stamps) -> NDArray[np.int64]:
+def nearest(sorted_ns: Stamps, wanted_ns: Stamps) -> NDArray[np.int64]:
+    """(N,) index of the stamp in sorted_ns (M,), M > 0, that is nearest to each of wanted_ns (N,)."""
     after = np.clip(np.searchsorted(sorted_ns, wanted_ns), 0, len(sorted_ns) - 1)
     before = np.maximum(after - 1, 0)
     is_before = wanted_ns - sorted_ns[before] < sorted_ns[after] - wanted_ns

@@ -14,6 +14,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_TABLE_BYTES = 1 << 30  # 13 hours of an IMU at 200 Hz
@@ -100,13 +101,15 @@ def check_table(path: Path) -> None:
 
 def read_text(path: Path, expected: str) -> str:
     """The text in the file at `path`; RecordingError where it cannot be read or is no text."""
+    if fault := what_file_instead(path):
+        raise RecordingError(f"{path} is {fault}")
     try:
         check_table(path)
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path} is not a text file ({error.reason}); {expected}") from error
+        raise RecordingError(f"{path} is not a text file (byte {error.start} is no UTF-8); {expected}") from error
 
 
 def format_stamp(stamp_ns: int) -> str:

@@ -22,12 +22,12 @@ def write_foreign(path: Path, messages: list[Message], **options: Any) -> Path:
     """ROS 2 messages (topic, type, stamp, bytes) by mcap's own writer."""
     writer = Writer(str(path), **{"chunk_size": 20_000, "compression": CompressionType.NONE, **options})
     writer.start(profile="ros2", library="test")
-    channels: dict[str, int] = {}
+    channels: dict[tuple[str, str], int] = {}
     for topic, name, stamp, data in messages:
-        if topic not in channels:
+        if (topic, name) not in channels:
             schema = writer.register_schema(name.replace("/", "/msg/"), "ros2msg", ros2msg(name).encode())
-            channels[topic] = writer.register_channel(topic, "cdr", schema)
-        writer.add_message(channels[topic], stamp, data, stamp)
+            channels[topic, name] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channels[topic, name], stamp, data, stamp)
     writer.finish()
     return path
 

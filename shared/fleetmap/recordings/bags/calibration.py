@@ -74,9 +74,10 @@ def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], 
     fx = right.projection[0, 0]
     baseline_m = -right.projection[0, 3] / fx if fx else 0.0
     if baseline_m <= 0:
+        issues = "".join(f", {link.issue}" for link in links if link.issue)
         raise CalibrationError(
             f"{where}: nothing says where the right camera sits (no transform from {left.frame_id} to "
-            f"{right.frame_id}, no baseline in its projection {right.projection[0].tolist()}); pass a calibration "
+            f"{right.frame_id}, no baseline in its projection {right.projection[0].tolist()}{issues}); pass a calibration "
             "with --calibration FILE"
         )
     rect_from_rect = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
@@ -92,7 +93,7 @@ def _target_from_source(links: Sequence[FrameLink], target: str, source: str) ->
     waiting = list(target_from)
     while waiting:
         frame = waiting.pop(0)
-        for link in links:
+        for link in (each for each in links if each.is_usable):
             if link.parent == frame and link.child not in target_from:
                 target_from[link.child] = target_from[frame] @ link.parent_from_child
                 waiting.append(link.child)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
+from fleetmap.geometry import Array
 from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
+from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink, frame_link
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
 Message = Any  # made at run time from the schema in the file
@@ -140,7 +140,4 @@ def _xyz(vector: Message) -> tuple[float, float, float]:
 def _link(message: Message) -> FrameLink:
     turn = message.rotation
     quat_wxyz = np.array([turn.w, turn.x, turn.y, turn.z])
-    if not 0.99 < np.linalg.norm(quat_wxyz) < 1.01:
-        raise ValueError(f"the rotation {quat_wxyz.tolist()} is not of unit length")
-    parent_from_child = se3(rotation_from_quat_wxyz(quat_wxyz), np.array(_xyz(message.translation)))
-    return FrameLink(message.parent_frame_id, message.child_frame_id, parent_from_child)
+    return frame_link(message.parent_frame_id, message.child_frame_id, np.array(_xyz(message.translation)), quat_wxyz)

@@ -16,6 +16,7 @@ from fleetmap.recordings.bags.container import MAX_MESSAGE_BYTES, Channel, KeptB
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.folders.table_files import natural_key
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.samples import DataIssue
 
 _MAGIC, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -125,7 +126,8 @@ def _opened(file: Path) -> sqlite3.Connection:
     """A connection that writes nothing, not even beside the file; RecordingError for what is no recording."""
     with file.open("rb") as opened:
         if opened.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(f"{file} is no SQLite database; copy the recording again")
+            fault = what_file_instead(file) or "no SQLite database; copy the recording again"
+            raise RecordingError(f"{file} is {fault}")
     # Used by one thread at a time, but not always by that which opened it
     database = sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -15,45 +15,70 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.bags.calibration import InfoCamera, calibration_of_messages
 from fleetmap.recordings.bags.codecs import CODECS, Codec
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT, Channel, Container, Place
-from fleetmap.recordings.bags.topics import IMAGE_TYPES, KNOWN_TYPES, choose_topics, type_name, video_issues
+from fleetmap.recordings.bags.topics import (
+    IMAGE_TYPES,
+    KNOWN_TYPES,
+    choose_topics,
+    info_topics,
+    type_name,
+    video_issues,
+)
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import hash_file
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
-from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, clean_imu, trajectory_of_rows, values_forward
+from fleetmap.recordings.images import StoredImage, check_image
+from fleetmap.recordings.ordering import (
+    DEPTH_TOLERANCE_NS,
+    ReadLog,
+    clean_imu,
+    trajectory_of_rows,
+    usual_size,
+    values_forward,
+    with_log_times,
+)
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from fleetmap.sensors.source_settings import Topics
 
+_SAME_LENS = 0.02  # of the focal length
 V = TypeVar("V")
 _RECTIFIED = re.compile(
     r"(?<![a-z])rect(?![a-z])|(?<![a-z])rectified"
 )  # image_rect, rect/image; not direct, image_unrect
+Sample = TypeVar("Sample", WheelSample, PositionPrior)
 
 
 @dataclass
 class _Stream:
-    """The messages of one channel: images by their place, everything else by its bytes."""
+    """The messages of one channel with their log times: images by their place and size, everything else by its bytes.
+
+    bad_images: how many are left out; why_bad: the reason of the first.
+    """
 
     channel: Channel
     codec: Codec
+    log_times_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
+    sizes_px: list[tuple[int, int]] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
+    has_lens: bool = False
     damaged: int = 0
+    bad_images: int = 0
+    why_bad: str = ""
 
     def __len__(self) -> int:
-        return len(self.places) + len(self.messages)
+        return len(self.places) + self.bad_images + len(self.messages)
 
-    def values(self, decode: Callable[[Channel, bytes], V]) -> list[V]:
-        """All messages that can be decoded; the others are counted."""
+    def values(self, decode: Callable[[Channel, bytes], V]) -> list[tuple[int, V]]:
+        """Log times and values of all messages that can be decoded; the others are counted."""
         found = []
-        for data in self.messages:
+        for log_time_ns, data in zip(self.log_times_ns, self.messages, strict=True):
             try:
-                found.append(decode(self.channel, data))
-            except ValueError:
+                found.append((log_time_ns, decode(self.channel, data)))
+            except (ValueError, AttributeError):  # a field that a schema in the file lacks
                 self.damaged += 1
         return found
 
@@ -122,7 +147,7 @@ class MessageFrames(SeriesFrames[tuple[_Stream, Place]]):
             if self._container is None:
                 self._container = self._opener()
             return stream.codec.image(stream.channel, self._container.read(place), where)
-        except ValueError as error:
+        except (ValueError, AttributeError) as error:
             raise RecordingError(
                 f"{where}: {error}; the message is damaged, leave the frame out with --frames"
             ) from error
@@ -158,9 +183,11 @@ def _parts(
         (left, right), depth = pair_images(left, right, log), None
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
-    calibration = given.calibration if given else _calibration(container, roles, right is not None, imu_frame)
-    wheel = [v for stream in roles.get("wheel", ()) for v in stream.values(stream.codec.wheel)]
-    priors = [v for stream in roles.get("prior", ()) for v in stream.values(stream.codec.prior)]
+    calibration = given.calibration if given else _calibration(container, roles, right is not None, imu_frame, log)
+    if depth is not None:
+        _note_unregistered(streams.values(), roles, calibration.cameras[0], log)
+    wheel = _samples([v for s in roles.get("wheel", ()) for v in s.values(s.codec.wheel)], "wheel odometry", log)
+    priors = _samples([v for s in roles.get("prior", ()) for v in s.values(s.codec.prior)], "position priors", log)
     ground_truth = _ground_truth(roles.get("ground_truth", ()), log)
     for stream in streams.values():
         if stream.damaged:
@@ -178,8 +205,8 @@ def _parts(
         has_right=right is not None,
         has_depth=depth is not None,
         imu=imu,
-        wheel=values_forward(wheel, [sample.stamp_ns for sample in wheel], "wheel odometry", log),
-        priors=values_forward(priors, [prior.stamp_ns for prior in priors], "position priors", log),
+        wheel=wheel,
+        priors=priors,
         ground_truth=ground_truth,
     )
     return parts, log
@@ -199,21 +226,46 @@ def _collect(container: Container, topics: Topics) -> tuple[dict[int, _Stream], 
             encoding = channel.message_encoding
             codec = codecs.setdefault(encoding, CODECS[encoding]())
             stream = streams[channel.id] = _Stream(channel, codec)
-        if type_name(channel) not in IMAGE_TYPES:
-            # Lenses repeat with every image, one is enough
-            if not (stream.messages and type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")):
-                container.keep(len(data))
-                stream.messages.append(bytes(data))
+        if type_name(channel) in IMAGE_TYPES:
+            if _takes_image(stream, data, f"{container.path}: {channel.topic}"):
+                container.keep(0)
+                stream.log_times_ns.append(log_time_ns)
+                stream.places.append(place)
             continue
-        try:
-            stamp_ns = stream.codec.stamp_ns(channel, data) or log_time_ns
-        except ValueError:
-            stream.damaged += 1
-            continue
-        container.keep(0)
-        stream.stamps_ns.append(stamp_ns)
-        stream.places.append(place)
+        if type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"):
+            # Lenses repeat with every image: the first that says something is enough
+            if stream.has_lens:
+                continue
+            stream.has_lens = _is_lens(stream, bytes(data))
+            stream.messages, stream.log_times_ns = [], []
+        container.keep(len(data))
+        stream.log_times_ns.append(log_time_ns)
+        stream.messages.append(bytes(data))
     return streams, list(unused.values())
+
+
+def _takes_image(stream: _Stream, data: memoryview, topic: str) -> bool:
+    """Whether a message is a whole image, whose stamp and size the stream then has; else it keeps the reason."""
+    try:
+        stamp_ns = stream.codec.stamp_ns(stream.channel, data)
+        size_px = check_image(stream.codec.image(stream.channel, bytes(data), f"{topic} at {stamp_ns}"))
+    except (ValueError, AttributeError, RecordingError) as error:
+        stream.bad_images += 1
+        stream.why_bad = stream.why_bad or (
+            str(error) if isinstance(error, RecordingError) else f"{topic}: {error}; the message is damaged"
+        )
+        return False
+    stream.stamps_ns.append(stamp_ns)
+    stream.sizes_px.append(size_px)
+    return True
+
+
+def _is_lens(stream: _Stream, data: bytes) -> bool:
+    """Whether a CameraInfo says what the lens is: uncalibrated drivers send zeros, others at their start."""
+    try:
+        return bool(stream.codec.camera_info(stream.channel, data).matrix[0, 0] > 0)
+    except (ValueError, AttributeError):
+        return False
 
 
 def _may_be_needed(channel: Channel, topics: Topics) -> bool:
@@ -236,39 +288,80 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
 
 
 def _images(streams: Sequence[_Stream], what: str, log: ReadLog) -> _Images:
+    bad, why = sum(stream.bad_images for stream in streams), next((s.why_bad for s in streams if s.why_bad), "")
     stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
+    log_times_ns = np.array([stamp for stream in streams for stamp in stream.log_times_ns], np.int64)
+    if bad and not len(stamps_ns):
+        raise RecordingError(f"{why} (none of {bad} {what} can be read)")
+    if bad:
+        log.note(f"{what} left out", f"{bad} of {bad + len(stamps_ns)}; the first: {why}")
     sources = tuple(
         (bare, place)
         for stream in streams
         for bare in [_Stream(stream.channel, stream.codec)]
         for place in stream.places
     )
-    return _Images(stamps_ns, sources).forward(what, log)
+    images = _Images(with_log_times(stamps_ns, log_times_ns, what, log), sources)
+    usual = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
+    return images.take(np.flatnonzero(usual)).forward(what, log)
+
+
+def _samples(samples: Sequence[tuple[int, Sample]], what: str, log: ReadLog) -> tuple[Sample, ...]:
+    """The samples, with their log times, whose stamps increase."""
+    stamps_ns = np.array([sample.stamp_ns for _, sample in samples], np.int64)
+    stamps_ns = with_log_times(stamps_ns, np.array([at for at, _ in samples], np.int64), what, log)
+    stamped = [replace(sample, stamp_ns=int(s)) for (_, sample), s in zip(samples, stamps_ns, strict=True)]
+    return values_forward(stamped, stamps_ns.tolist(), what, log)
 
 
 def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | None]:
     parts: list[tuple[Stamps, NDArray[np.float64], NDArray[np.float64], str]] = []
+    log_times_ns: list[int] = []
     for stream in streams:
         codec = stream.codec
         try:
             parts.append(codec.imu(stream.channel, stream.messages))
+            log_times_ns += stream.log_times_ns
         except ValueError:
-            parts += stream.values(lambda channel, data, codec=codec: codec.imu(channel, [data]))  # type: ignore[misc]
+            singly = stream.values(lambda channel, data, codec=codec: codec.imu(channel, [data]))  # type: ignore[misc]
+            parts += [part for _, part in singly]
+            log_times_ns += [at for at, _ in singly]
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    return clean_imu(stamps_ns.astype(np.int64), gyro, accel, log), parts[0][3]
+    stamps_ns = with_log_times(stamps_ns.astype(np.int64), np.array(log_times_ns, np.int64), "imu", log)
+    return clean_imu(stamps_ns, gyro, accel, log), parts[0][3]
 
 
 def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None:
     rows = [value for stream in streams for value in stream.values(stream.codec.pose)]
     if not rows:
         return None
-    stamps_ns = np.array([stamp for stamp, _ in rows], np.int64)
-    return trajectory_of_rows(stamps_ns, np.stack([row for _, row in rows]), log)
+    stamps_ns, log_times_ns = (
+        np.array(column, np.int64) for column in zip(*((s, at) for at, (s, _) in rows), strict=True)
+    )
+    stamps_ns = with_log_times(stamps_ns, log_times_ns, "ground truth", log)
+    return trajectory_of_rows(stamps_ns, np.stack([row for _, (_, row) in rows]), log)
 
 
-def _calibration(container: Container, roles: _Roles, has_right: bool, imu_frame: str | None) -> RigCalibration:
+def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: CameraCalibration, log: ReadLog) -> None:
+    """Notes a depth topic with a CameraInfo of its own that is not the left camera's: its pixels are others."""
+    left, depth = (roles[role][0].channel.topic for role in ("left", "depth"))
+    beside = [stream for stream in streams if stream.channel.topic in info_topics(depth)]
+    fx, _, cx, cy = camera.intrinsics_px
+    for info in [info for stream in beside for _, info in stream.values(stream.codec.camera_info)][:1]:
+        own = np.array([info.matrix[0, 0], info.matrix[0, 2], info.matrix[1, 2]])
+        if info.matrix.any() and np.abs(own - [fx, cx, cy]).max() > _SAME_LENS * fx:
+            log.note(
+                "depth not registered",
+                f"{depth} has a lens of its own (fx cx cy {np.round(own, 1).tolist()}), not that of {left} ({fx:.1f}, {cx:.1f}, "
+                f"{cy:.1f}): record depth that is aligned to {left}, or name it with --topic depth=/NAME",
+            )
+
+
+def _calibration(
+    container: Container, roles: _Roles, has_right: bool, imu_frame: str | None, log: ReadLog
+) -> RigCalibration:
     attached = container.attachments.get(CALIBRATION_ATTACHMENT)
     if attached is not None:
         where = f"{container.path}: attachment {CALIBRATION_ATTACHMENT}"
@@ -276,13 +369,20 @@ def _calibration(container: Container, roles: _Roles, has_right: bool, imu_frame
     cameras = []
     for role in ("left", "right") if has_right else ("left",):
         streams, image_topic = roles.get(f"{role}_info", ()), roles[role][0].channel.topic
-        infos = [info for stream in streams for info in stream.values(stream.codec.camera_info)]
+        infos = [info for stream in streams for _, info in stream.values(stream.codec.camera_info)]
         if not infos:
             raise CalibrationError(
                 f"{container.path}: no CameraInfo beside {image_topic} says what its lens is; pass a calibration with "
                 "--calibration FILE"
             )
+        if not infos[0].matrix.any():
+            raise CalibrationError(
+                f"{container.path}: every CameraInfo beside {image_topic} holds zeros, as drivers without a calibration send it; "
+                "calibrate the camera, or pass a calibration with --calibration FILE"
+            )
         cameras.append(InfoCamera(infos[0], bool(_RECTIFIED.search(image_topic.lower()))))
     streams = roles.get("tf_static", ())
-    links = [link for stream in streams for found in stream.values(stream.codec.links) for link in found]
+    links = [link for stream in streams for _, found in stream.values(stream.codec.links) for link in found]
+    for issue in dict.fromkeys(link_issue for link in links if (link_issue := link.issue)):
+        log.note("transform not sound", issue)
     return calibration_of_messages(cameras, links, imu_frame, str(container.path))

@@ -29,6 +29,8 @@ _VIDEO_TYPES = (
 )
 KNOWN_TYPES = frozenset(name for names in _TYPES.values() for name in names)
 _ALONE = ("imu", "wheel", "prior", "ground_truth")
+_PACKED = ("/compressed", "/compressedDepth")
+_IMAGE_NAMES = ("image_raw", "image", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw")
 _LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", "cam1", "infra2"), ("depth",)
 
 
@@ -36,7 +38,7 @@ def transports(topic: str, role: str) -> tuple[str, ...]:
     """The topics on which ROS's image_transport may send the images of `topic`; the topic alone for other roles."""
     if role not in ("left", "right", "depth") or not topic:
         return (topic,)
-    return (topic, f"{topic}/compressed", *([f"{topic}/compressedDepth"] if role == "depth" else []))
+    return (topic, *(topic + packed for packed in _PACKED[: 2 if role == "depth" else 1]))
 
 
 def type_name(channel: Channel) -> str:
@@ -65,8 +67,8 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
     chosen: dict[str, str] = {}
     for role, types in _TYPES.items():
         name = getattr(wanted, role)
-        found = next((t for t in transports(name, role) if _type_of(by_topic, t) in types), None)
-        candidates = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in types)
+        found = next((t for t in transports(name, role) if _has_type(by_topic, t, types)), None)
+        candidates = sorted(topic for topic in by_topic if _has_type(by_topic, topic, types))
         if found is not None:
             chosen[role] = found
         elif name and name != getattr(Topics(), role):
@@ -79,45 +81,86 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
             log.note(f"{role} not chosen", f"{', '.join(candidates)} could be it; name one with --topic {role}=/NAME")
     _choose_images(by_topic, chosen, where, log)
     _choose_infos(by_topic, chosen)
-    return {role: [channel.id for channel in by_topic[topic]] for role, topic in chosen.items()}
+    for role, topic in chosen.items():
+        others = [channel for channel in by_topic[topic] if type_name(channel) not in _TYPES[role]]
+        if others:
+            names = ", ".join(type_name(channel) for channel in others)
+            log.note(
+                "messages of another type", f"{topic}: {names} left out; {' or '.join(_TYPES[role])} is read as {role}"
+            )
+    return {
+        role: [channel.id for channel in by_topic[topic] if type_name(channel) in _TYPES[role]]
+        for role, topic in chosen.items()
+    }
 
 
-def _type_of(by_topic: Mapping[str, list[Channel]], topic: str) -> str:
-    """The type of a topic's messages, empty where there is no such topic."""
-    return type_name(by_topic[topic][0]) if topic in by_topic else ""
+def _has_type(by_topic: Mapping[str, list[Channel]], topic: str, types: tuple[str, ...]) -> bool:
+    return any(type_name(channel) in types for channel in by_topic.get(topic, ()))
 
 
 def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str, log: ReadLog) -> None:
-    if "left" in chosen:
-        return
-    images = sorted(topic for topic in by_topic if _type_of(by_topic, topic) in IMAGE_TYPES)
-    depth = [topic for topic in images if _has(topic, _DEPTH_HINTS)]
-    lefts = [topic for topic in images if topic not in depth and _has(topic, _LEFT_HINTS)]
-    rights = [topic for topic in images if topic not in depth and _has(topic, _RIGHT_HINTS)]
-    others = [topic for topic in images if topic not in (*depth, *lefts, *rights)]
-    if len(lefts) == 1:
-        chosen["left"] = lefts[0]
-        if len(rights) == 1:
-            chosen.setdefault("right", rights[0])
-    elif not lefts and len(others) == 1:
-        chosen["left"] = others[0]
-    else:
-        issues = "".join(f". {issue.what}: {issue.detail}" for issue in log.issues)
-        raise RecordingError(
-            f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {_listed(by_topic)}{issues}"
-        )
-    if len(depth) == 1 and "right" not in chosen:
-        chosen.setdefault("depth", depth[0])
+    images = sorted(topic for topic in by_topic if _has_type(by_topic, topic, IMAGE_TYPES))
+    depths = [topic for topic in images if _has(topic, _DEPTH_HINTS)]
+    lefts = [topic for topic in images if topic not in depths and _has(topic, _LEFT_HINTS)]
+    rights = [topic for topic in images if topic not in depths and _has(topic, _RIGHT_HINTS)]
+    others = [topic for topic in images if topic not in (*depths, *lefts, *rights)]
+    if "left" not in chosen:
+        left, right = _of_one_camera(lefts), _of_one_camera(rights)
+        only = _of_one_camera(others)
+        if left:
+            chosen["left"] = left
+            if right:
+                chosen.setdefault("right", right)
+        elif not lefts and only:
+            chosen["left"] = only
+        else:
+            issues = "".join(f". {issue.what}: {issue.detail}" for issue in log.issues)
+            raise RecordingError(
+                f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {_listed(by_topic)}{issues}"
+            )
+        depth = _of_one_camera(depths)
+        if depth and "right" not in chosen:
+            chosen.setdefault("depth", depth)
+    used = [chosen[role] for role in ("left", "right", "depth") if role in chosen]
+    unused = [topic for topic in images if topic not in used]
+    if unused:
+        detail = f"{', '.join(unused)}; {', '.join(used)} {'are' if len(used) > 1 else 'is'} used"
+        log.note("images not used", f"{detail}. Choose with --topic left=/NAME, right=/NAME or depth=/NAME")
+
+
+def _of_one_camera(topics: list[str]) -> str | None:
+    """The topic to read of one camera's: unpacked before packed, as it was taken before rectified; None for several cameras' or none."""
+    cameras = {_camera(topic) for topic in topics}
+    return (
+        min(topics, key=lambda topic: (topic.endswith(_PACKED), "rect" in topic, topic)) if len(cameras) == 1 else None
+    )
+
+
+def _camera(topic: str) -> str:
+    """What the names of all topics with the images of one camera begin with."""
+    for suffix in _PACKED:
+        topic = topic.removesuffix(suffix)
+    parent, _, last = topic.rpartition("/")
+    return parent if last in _IMAGE_NAMES else topic
 
 
 def _choose_infos(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]) -> None:
     for role in ("left", "right"):
         if role not in chosen or f"{role}_info" in chosen:
             continue
-        parent = chosen[role].removesuffix("/compressed").rpartition("/")[0]
-        for name in ("camera_info", "calibration"):
-            if _type_of(by_topic, f"{parent}/{name}") in _TYPES["left_info"]:
-                chosen[f"{role}_info"] = f"{parent}/{name}"
+        info = next(
+            (name for name in info_topics(chosen[role]) if _has_type(by_topic, name, _TYPES["left_info"])), None
+        )
+        if info is not None:
+            chosen[f"{role}_info"] = info
+
+
+def info_topics(image_topic: str) -> tuple[str, ...]:
+    """Where ROS and Foxglove have the lens of the camera with this topic of images."""
+    for suffix in _PACKED:
+        image_topic = image_topic.removesuffix(suffix)
+    parent = image_topic.rpartition("/")[0]
+    return f"{parent}/calibration", f"{parent}/camera_info"
 
 
 def _has(topic: str, hints: tuple[str, ...]) -> bool:
@@ -125,4 +168,5 @@ def _has(topic: str, hints: tuple[str, ...]) -> bool:
 
 
 def _listed(by_topic: Mapping[str, list[Channel]]) -> str:
-    return ", ".join(f"{topic} ({_type_of(by_topic, topic)})" for topic in sorted(by_topic)) or "no topic at all"
+    names = (f"{topic} ({', '.join(type_name(channel) for channel in by_topic[topic])})" for topic in sorted(by_topic))
+    return ", ".join(names) or "no topic at all"

@@ -10,34 +10,62 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
-from fleetmap.recordings.images import MAX_PIXELS, StoredImage
-from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage, image_size, is_cut
+from fleetmap.recordings.ordering import ReadLog, usual_size
+from fleetmap.recordings.strange_files import what_instead
 
-_BLOCK_BYTES = 1 << 20
+_BLOCK_BYTES, _HEAD_BYTES, _TAIL_BYTES = 1 << 20, 4096, 8192
 _MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 ImageFiles = ImageSeries[Path]
 
 
 def existing_images(series: ImageFiles, what: str, log: ReadLog) -> ImageFiles:
-    """The images with increasing stamps that exist and hold bytes; the others are noted in `log`.
+    """The images with increasing stamps that exist, are whole and of the size of most; the others are noted in `log`.
 
     RecordingError where none is left.
     """
     series = series.forward(what, log)
     entries = (entry for folder in {path.parent for path in series.sources} for entry in _entries(folder))
     sizes = {entry.path: entry.stat().st_size for entry in entries}
-    missing = [path for path in series.sources if str(path) not in sizes]
-    empty = [path for path in series.sources if sizes.get(str(path)) == 0]
-    for kind, paths in (("missing", missing), ("without a byte", empty)):
-        if paths:
-            log.note(f"{what}: images {kind}", f"{len(paths)} of {len(series)}, the first is {paths[0].name}")
-    kept = np.array([i for i, path in enumerate(series.sources) if sizes.get(str(path), 0) > 0], np.int64)
-    if len(kept) == 0:
+    left_out: dict[str, list[str]] = {}
+    kept, sizes_px = [], []
+    for index, path in enumerate(series.sources):
+        try:
+            if str(path) not in sizes:
+                raise RecordingError("missing")
+            size_px = _whole_image_size(path, sizes[str(path)])
+        except RecordingError as error:
+            left_out.setdefault(str(error), []).append(path.name)
+            continue
+        kept.append(index)
+        sizes_px.append(size_px)
+    for fault, names in left_out.items():
+        log.note(f"{what}: images {fault}", f"{len(names)} of {len(series)}, the first is {names[0]}")
+    if not kept:
+        faults = "; ".join(f"{len(names)} {fault}, the first is {names[0]}" for fault, names in left_out.items())
         raise RecordingError(
-            f"{what}: none of the {len(series)} images is there and readable ({len(empty)} are empty files); "
-            "copy the recording again"
+            f"{what}: none of the {len(series)} images is there and readable ({faults}); copy the recording again"
         )
-    return series.take(kept)
+    usual = usual_size(sizes_px, what, log)
+    return series.take(np.array(kept, np.int64)[usual])
+
+
+def _whole_image_size(path: Path, file_bytes: int) -> tuple[int, int] | None:
+    """Width and height by the file's head, None where that does not say; RecordingError with the fault of one that is not whole."""
+    if not file_bytes:
+        raise RecordingError("without a byte")
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            file.seek(max(0, file_bytes - _TAIL_BYTES))
+            tail = file.read(_TAIL_BYTES)
+    except OSError as error:
+        raise RecordingError(f"that cannot be read ({error.strerror})") from error
+    if fault := what_instead(head):
+        raise RecordingError(f"that are {fault}")
+    if is_cut(head, tail):
+        raise RecordingError("cut off")
+    return image_size(head)
 
 
 def paired_cameras(cameras: Sequence[ImageFiles], log: ReadLog) -> tuple[ImageFiles, ImageFiles | None]:

@@ -10,6 +10,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
@@ -74,9 +75,11 @@ def natural_key(name: str) -> tuple[object, ...]:
 
 
 def _read_text(path: Path) -> str:
+    if fault := what_file_instead(path):
+        raise RecordingError(f"{path} is {fault}")
     try:
         check_table(path)
-        return path.read_text(encoding="utf-8", errors="replace")
+        return path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); the recording is incomplete") from error
 

@@ -17,6 +17,7 @@ import zstandard
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import MAX_MESSAGE_BYTES, Channel, KeptBytes, Message, Schema
+from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.samples import DataIssue
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -86,7 +87,8 @@ class McapScan(KeptBytes):
         """Channel, log time in ns, place and bytes of every message that is whole, in file order."""
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
-            raise RecordingError(f"{self.path} does not begin as an MCAP file does; is it a recording?")
+            fault = what_file_instead(self.path) or "no MCAP file: it does not begin as one; copy the recording again"
+            raise RecordingError(f"{self.path} is {fault}")
         at = len(MAGIC)
         while not self._has_ended:
             next_at = yield from self._record(at)

@@ -17,7 +17,10 @@ class CdrReader:
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 4 or data[0] != 0 or data[1] > 1:
-            raise ValueError(f"a CDR message starts with 00 00 or 00 01, this one with {data[:2].hex() or 'nothing'}")
+            starts = data[:2].hex(" ") or "nothing"
+            raise ValueError(
+                f"a CDR message has 4 bytes or more and starts with 00 00 or 00 01, this one has {len(data)}: {starts}"
+            )
         self._data = data
         self._at = 4
         self.endian = "<" if data[1] else ">"

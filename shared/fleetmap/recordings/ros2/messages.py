@@ -5,7 +5,7 @@ quaternions x y z w and covariances translation first, as ROS does; here they ar
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 _ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
 _IMU_DOUBLES = 37
+_SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand, and no rotation any more
 _FLOAT32, _POINT_BYTES = 7, 12
 
 
@@ -38,12 +39,21 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class FrameLink:
-    """One transform of a /tf or /tf_static message: parent_from_child (4, 4), and its stamp where it was read."""
+    """One transform of a /tf or /tf_static message: parent_from_child (4, 4), and its stamp where it was read.
+
+    issue: what is wrong with its numbers; parent_from_child is NaN where they are no transform.
+    """
 
     parent: str
     child: str
     parent_from_child: Array
     stamp_ns: int = 0
+    issue: str = ""
+
+    @property
+    def is_usable(self) -> bool:
+        """True unless parent_from_child is NaN."""
+        return bool(np.isfinite(self.parent_from_child).all())
 
 
 def header_of(data: bytes) -> tuple[int, str]:
@@ -215,9 +225,25 @@ def decode_frame_links(data: bytes) -> list[FrameLink]:
     reader = CdrReader(data)
     links = []
     for _ in range(reader.unsigned()):
-        stamp_ns, parent, child = reader.stamp_ns(), reader.text().lstrip("/"), reader.text().lstrip("/")
-        links.append(FrameLink(parent, child, _target_from_source(reader.doubles(7)), stamp_ns))
+        stamp_ns, parent, child = reader.stamp_ns(), reader.text(), reader.text()
+        values = reader.doubles(7)
+        links.append(replace(frame_link(parent, child, values[:3], values[[6, 3, 4, 5]]), stamp_ns=stamp_ns))
     return links
+
+
+def frame_link(parent: str, child: str, translation: Array, quat_wxyz: Array) -> FrameLink:
+    """The transform of a quaternion that may be a little off unit length; one that is no rotation costs this transform alone."""
+    parent, child, norm = parent.lstrip("/"), child.lstrip("/"), float(np.linalg.norm(quat_wxyz))
+    is_usable = bool(np.isfinite(translation).all() and abs(norm - 1) < _MOST_OFF_UNIT)  # False for NaN
+    issue = ""
+    if not is_usable or abs(norm - 1) > _SLIGHTLY_OFF_UNIT:
+        done = (
+            "it is normalised" if is_usable else "it is left out; publish it with a unit quaternion and finite numbers"
+        )
+        issue = f"{parent} -> {child}: position {translation.tolist()}, quaternion w x y z {quat_wxyz.tolist()}; {done}"
+    if not is_usable:
+        return FrameLink(parent, child, np.full((4, 4), np.nan), issue=issue)
+    return FrameLink(parent, child, se3(rotation_from_quat_wxyz(quat_wxyz), translation), issue=issue)
 
 
 def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:

@@ -1,0 +1,258 @@
+"""One bad value costs one value, and a choice that cannot be made is a note with the names: messages written by rosbags."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings import OpenOptions, Recording, named_topics, open_recording
+from fleetmap.recordings.images import StoredImage, grey_image
+from fleetmap.recordings.ros2 import messages as ros_messages
+from fleetmap.sensors.samples import WheelSample
+from support.recordings.bag_samples import write_rosbag1, write_rosbag2
+from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
+from support.recordings.recording_samples import WIDTH, calibration
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMPS_NS = SAMPLE.stamps_ns.tolist()
+
+
+def drive() -> list[Message]:
+    """Stereo, IMU, transforms and wheels, in the order of writing."""
+    wheels = [WheelSample(s + 1000, np.array([0.5, 0.0, 0.0]), 0.1, 0.1, 0.1) for s in STAMPS_NS]
+    encoded = [
+        ("/odom", "nav_msgs/Odometry", w.stamp_ns, ros_messages.encode_odometry(w, "odom", "base_link")) for w in wheels
+    ]
+    return [*foreign_messages(), *encoded]
+
+
+def edited(topic: str, rows: slice, change: Callable[[Any], None]) -> list[Message]:
+    """The drive, its messages of a topic changed in those rows and written by rosbags."""
+    messages = drive()
+    numbers = [number for number, message in enumerate(messages) if message[0] == topic][rows]
+    for number in numbers:
+        name, kind, stamp_ns, data = messages[number]
+        message = STORE.deserialize_cdr(data, kind.replace("/", "/msg/"))
+        change(message)
+        messages[number] = (name, kind, stamp_ns, bytes(STORE.serialize_cdr(message, kind.replace("/", "/msg/"))))
+    return messages
+
+
+def cut(topic: str, row: int, kept_bytes: int) -> list[Message]:
+    messages = drive()
+    number = [number for number, message in enumerate(messages) if message[0] == topic][row]
+    name, kind, stamp_ns, data = messages[number]
+    messages[number] = (name, kind, stamp_ns, data[:kept_bytes])
+    return messages
+
+
+def no_stamp(message: Any) -> None:
+    message.header.stamp.sec = message.header.stamp.nanosec = 0
+
+
+def quaternion(scale: float) -> Callable[[Any], None]:
+    def change(message: Any) -> None:
+        turn = message.transforms[2].transform.rotation
+        turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, 0.0, scale
+
+    return change
+
+
+def no_lens(message: Any) -> None:
+    message.k, message.p = np.zeros(9), np.zeros(12)
+
+
+def nan_rate(message: Any) -> None:
+    message.angular_velocity.y = float("nan")
+
+
+def nan_speed(message: Any) -> None:
+    message.twist.twist.linear.x = float("nan")
+
+
+def smaller(message: Any) -> None:
+    message.width, message.step = message.width // 2, message.step // 2
+    message.data = message.data[: message.height * message.step]
+
+
+FRAMES, SAMPLES = len(STAMPS_NS), len(IMU)
+FIRST, ALL = slice(0, 1), slice(None)
+LEFT, TF = "/cam0/image_raw", "/tf_static"
+STRANGE = [
+    (topic, kind, 1, data)
+    for topic, kind, data in ((LEFT, *foreign_messages()[-2][1::2]), ("/imu0", *foreign_messages()[0][1::2]))
+]
+
+
+@pytest.mark.parametrize(
+    ("messages", "frames", "samples", "wheels", "says"),
+    [
+        (edited("/imu0", slice(5, 6), no_stamp), FRAMES, SAMPLES, FRAMES, "imu: stamps of zero.* 1 of"),
+        (edited("/imu0", slice(0, 20), no_stamp), FRAMES, SAMPLES, FRAMES, "imu: stamps of zero.* 20 of .*logging"),
+        (edited("/imu0", ALL, no_stamp), FRAMES, SAMPLES, FRAMES, "imu: stamps of zero"),
+        (edited("/odom", ALL, no_stamp), FRAMES, SAMPLES, FRAMES, "wheel odometry: stamps of zero"),
+        (edited(LEFT, FIRST, no_stamp), FRAMES, SAMPLES, FRAMES, "left images: stamps of zero"),
+        (edited(TF, ALL, quaternion(0.99)), FRAMES, SAMPLES, FRAMES, "cam0_optical -> cam1_optical.*0.99.*normalised"),
+        (edited("/cam0/camera_info", FIRST, no_lens), FRAMES, SAMPLES, FRAMES, ""),
+        (edited("/imu0", FIRST, nan_rate), FRAMES, SAMPLES - 1, FRAMES, "imu: impossible values 1 of"),
+        (edited("/odom", FIRST, nan_speed), FRAMES, SAMPLES, FRAMES - 1, "/odom: damaged messages 1 left out"),
+        (edited(LEFT, slice(1, 2), smaller), FRAMES - 1, SAMPLES, FRAMES, rf"1 of {WIDTH // 2}x\d+ left out"),
+        (edited(LEFT, FIRST, smaller), FRAMES - 1, SAMPLES, FRAMES, "left images: images of another size"),
+        (cut(LEFT, 0, 900), FRAMES - 1, SAMPLES, FRAMES, "left images left out 1 of 4; the first: .*ends before"),
+        (cut("/imu0", 3, 60), FRAMES, SAMPLES - 1, FRAMES, "/imu0: damaged messages 1 left out"),
+        (cut("/odom", 1, 3), FRAMES, SAMPLES, FRAMES - 1, "/odom: damaged messages 1 left out"),
+        (
+            STRANGE + drive(),
+            FRAMES,
+            SAMPLES,
+            FRAMES,
+            "messages of another type /cam0/image_raw: sensor_msgs/Imu left out",
+        ),
+    ],
+)
+def test_one_bad_value_costs_one_value(
+    tmp_path: Path, messages: list[Message], frames: int, samples: int, wheels: int, says: str
+) -> None:
+    paths = [write_foreign(tmp_path / "a.mcap", messages)]
+    if "another type" not in says:  # rosbags' writers have one type a topic
+        paths.append(write_rosbag2(tmp_path / "bag", messages))
+    if not any(
+        word in says for word in ("ends before", "damaged", "another type")
+    ):  # nor do they make ROS 1 of a broken message
+        paths.append(write_rosbag1(tmp_path / "a.bag", messages))
+    for path in paths:
+        with open_recording(path) as recording:
+            assert (len(recording), len(recording.imu), len(recording.wheel)) == (frames, samples, wheels), path
+            for index in range(len(recording)):
+                recording.read_frame(index)
+            assert says_so(recording, says), [*recording.issues]
+            assert np.abs(recording.imu.stamps_ns - IMU.stamps_ns[-len(recording.imu) :]).max() < 20_000_000
+
+
+def says_so(recording: Recording, says: str) -> bool:
+    lines = [f"{issue.what} {issue.detail}" for issue in recording.issues]
+    return any(re.search(says, line) for line in lines) if says else not lines
+
+
+@pytest.mark.parametrize(
+    ("messages", "says"),
+    [
+        (
+            edited("/cam0/camera_info", ALL, no_lens),
+            r"every CameraInfo beside /cam0/image_raw holds zeros.*--calibration",
+        ),
+        (edited(TF, ALL, quaternion(0.0)), r"no transform from cam0_optical.*cam0_optical -> cam1_optical.*left out"),
+        (
+            [m for m in drive() if m[0] != LEFT] + [cut(LEFT, 0, 900)[0]],
+            r"ends before .* \(none of 1 left images can be read\)",
+        ),
+    ],
+)
+def test_a_value_that_nothing_stands_in_for_is_named(tmp_path: Path, messages: list[Message], says: str) -> None:
+    with pytest.raises((CalibrationError, RecordingError), match=says):
+        open_recording(write_foreign(tmp_path / "a.mcap", messages))
+
+
+def camera(*topics: str, focal_scale: float = 1.0) -> list[Message]:
+    """One camera on each of the topics, its lens beside them; depths where the name says depth, PNG where it says compressed."""
+    found: list[Message] = []
+    png = cv2.imencode(".png", SAMPLE.left[0])[1].tobytes()
+    depth = cv2.imencode(".png", np.full(SAMPLE.left[0].shape, 2000, np.uint16))[1].tobytes()
+    for topic in topics:
+        packed = depth if "depth" in topic else png if "compressed" in topic else None
+        info = f"{topic.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        lens = calibration().cameras[0]
+        lens = replace(lens, intrinsics_px=lens.intrinsics_px * [focal_scale, focal_scale, 1, 1])
+        for row, stamp_ns in enumerate(STAMPS_NS):
+            image = grey_image(SAMPLE.left[row]) if packed is None else StoredImage("file", packed)
+            encode = (
+                ros_messages.encode_image
+                if packed is None
+                else partial(ros_messages.encode_compressed_image, form="png")
+            )
+            kind = "sensor_msgs/Image" if packed is None else "sensor_msgs/CompressedImage"
+            found.append((topic, kind, stamp_ns, encode(stamp_ns, "cam0_optical", image)))
+            found.append(
+                (
+                    info,
+                    "sensor_msgs/CameraInfo",
+                    stamp_ns,
+                    ros_messages.encode_camera_info(stamp_ns, "cam0_optical", lens),
+                )
+            )
+    return found
+
+
+def renamed(topic: str, name: str) -> list[Message]:
+    return [(name, *message[1:]) for message in drive() if message[0] == topic]
+
+
+COLOR, DEPTH, ALIGNED = "/d/color/image_raw", "/d/depth/image_rect_raw", "/d/aligned_depth_to_color/image_raw"
+INFRA = ("/d/infra1/image_rect_raw", "/d/infra2/image_rect_raw")
+
+
+@pytest.mark.parametrize(
+    ("messages", "used", "says"),
+    [
+        (
+            camera(COLOR, DEPTH, ALIGNED),
+            "mono",
+            f"images not used .*{ALIGNED}, {DEPTH}; {COLOR} is used.*--topic.*depth=/NAME",
+        ),
+        (camera(COLOR, ALIGNED), "rgbd", ""),
+        (
+            camera(COLOR) + camera(DEPTH, focal_scale=0.8),
+            "rgbd",
+            f"depth not registered {DEPTH} .* not that of {COLOR} .*depth=/NAME",
+        ),
+        (camera(COLOR, f"{COLOR}/compressed"), "mono", f"{COLOR}/compressed; {COLOR} is used"),
+        (camera("/d/left/image_raw", "/d/left/image_rect"), "mono", "/d/left/image_rect; /d/left/image_raw is used"),
+        (camera("/cam0/image_raw", "/cam0/image_raw/compressed"), "mono", "/cam0/image_raw/compressed; .* is used"),
+        (
+            [m for m in drive() if "imu" not in m[0]] + renamed("/imu0", "/a/imu") + renamed("/imu0", "/b/imu"),
+            "stereo",
+            "imu not chosen /a/imu, /b/imu could be it; name one with --topic imu=/NAME",
+        ),
+        (
+            [m for m in drive() if "odom" not in m[0]] + renamed("/odom", "/a/odom") + renamed("/odom", "/b/odom"),
+            "stereo-inertial",
+            "wheel not chosen /a/odom, /b/odom could be it",
+        ),
+        (foreign_messages() + camera(COLOR), "stereo-inertial", f"{COLOR}; /cam0/image_raw, /cam1/image_raw are used"),
+    ],
+)
+def test_a_choice_is_noted_with_the_names(tmp_path: Path, messages: list[Message], used: str, says: str) -> None:
+    with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
+        assert recording.sensor_set.value == used
+        assert says_so(recording, says), recording.issues
+
+
+def test_two_pairs_of_cameras_are_not_told_apart(tmp_path: Path) -> None:
+    pairs = [f"/{name}/{side}/image_raw" for name in ("front", "rear") for side in ("left", "right")]
+    path = write_foreign(tmp_path / "a.mcap", camera(*pairs))
+    with pytest.raises(
+        RecordingError, match=r"--topic left=/NAME. There is .*/front/left/image_raw .*/rear/left/image_raw"
+    ):
+        open_recording(path)
+    with open_recording(path, OpenOptions(topics=named_topics([f"left={pairs[0]}"]))) as recording:
+        assert says_so(recording, f"images not used {pairs[1]}.*right=/NAME")
+
+
+def test_a_pair_beside_a_colour_camera_is_noted(tmp_path: Path) -> None:
+    """As a RealSense records: the infrared pair is used, colour and depth are named."""
+    messages = camera(*INFRA, COLOR)
+    messages += [m for m in drive() if m[0] == TF]
+    with pytest.raises(CalibrationError, match="nothing says where the right camera sits"):
+        open_recording(write_foreign(tmp_path / "a.mcap", messages))
+    with open_recording(
+        write_foreign(tmp_path / "a.mcap", messages), OpenOptions(topics=named_topics([f"left={COLOR}"]))
+    ) as recording:
+        assert says_so(recording, f"images not used {INFRA[0]}, {INFRA[1]}; {COLOR} is used")
