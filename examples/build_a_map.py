@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from mapserver import GateSettings, build_map, open_map
+from mapserver import Actor, build_map, open_map
 
 
 def main(recording: str, store: str, site: str, picture: str | None = None, rig: str = "") -> None:
@@ -22,7 +22,7 @@ def main(recording: str, store: str, site: str, picture: str | None = None, rig:
         draft.save_picture(picture)
     # The gate judges the draft; one that it refuses raises GateRefusedError with the reasons. A drive that is short or straight
     # cannot judge its rig's calibration: whoever knows that to be right says so.
-    draft.publish(gate=GateSettings(allow_unjudged_calibration=rig == "known-rig"))
+    draft.publish(trust_calibration=rig == "known-rig", actor=Actor("example", "the rig is known"))
     # The published version as robots get it.
     published = open_map(store, site)
     print(f"version {published.version}: {len(published.points_map)} landmarks in {len(published.tiles)} tiles")

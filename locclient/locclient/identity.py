@@ -170,7 +170,10 @@ class RobotIdentity:
 
 @dataclass(frozen=True, kw_only=True)
 class MapAddress:
-    """Where a robot's map comes from: `server` an endpoint, or `store` a folder. identity: where the server knows robots."""
+    """Where a robot's map comes from: `server` an endpoint, or `store` a folder. identity: where the server knows robots.
+
+    version: one of the store's, drafts too; None for the current one.
+    """
 
     site: str
     robot: str
@@ -178,6 +181,7 @@ class MapAddress:
     store: str | None = None
     root: str | None = None
     identity: RobotIdentity | None = None
+    version: int | None = None
 
     @property
     def tls(self) -> TlsFiles | None:

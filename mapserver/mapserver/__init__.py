@@ -19,6 +19,7 @@ from fleetmap.errors import FleetmapError
 
 if TYPE_CHECKING:
     from mapserver.library import (
+        Actor,
         BuildOptions,
         BuiltMap,
         GateSettings,
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
         open_store,
     )
 
-__all__ = ["BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map", "open_store"]
-__all__ += ["__version__"]
+__all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
+__all__ += ["__version__", "open_store"]
 
 try:
     __version__ = metadata.version("fleetmap")

@@ -36,8 +36,8 @@ from mapserver.store import NOBODY, Actor, MapStore
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_map import SurveyMap
 
-__all__ = ["BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map", "open_store"]
-__all__ += ["settings_for"]
+__all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
+__all__ += ["open_store", "settings_for"]
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,22 @@ class BuiltMap:
         """Draws the map from above as a PNG."""
         write_file(Path(path), picture_png(self.site, self.draft, self.built))
 
-    def publish(self, *, gate: GateSettings | None = None, force: bool = False, actor: Actor = NOBODY) -> None:
+    def publish(
+        self,
+        *,
+        gate: GateSettings | None = None,
+        trust_calibration: bool = False,
+        force: bool = False,
+        actor: Actor = NOBODY,
+    ) -> None:
         """Makes it the site's current version; GateRefusedError where it is not good enough by `gate`, unless forced.
 
-        A site's first version is refused where its recordings are too short or too straight to judge the calibration;
-        `GateSettings(allow_unjudged_calibration=True)` says that the rig is known.
+        A site's first version is refused where its recordings are too short or too straight to judge the calibration. With
+        trust_calibration the actor, who needs a name and a reason, says that it is right; the manifest keeps that.
         """
         with MapStore.open(self.store) as maps:
+            if trust_calibration:
+                releases.trust_calibration(maps, maps.version(self.site, self.version), actor)
             releases.publish(maps, self.site, self.version, force=force, actor=actor, gate=gate or GateSettings())
 
 

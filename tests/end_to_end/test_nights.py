@@ -1,6 +1,7 @@
 """Two nights of a rendered room from the command line: the second one builds on the first, and is judged by it."""
 
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -9,13 +10,15 @@ import pytest
 from mapserver import cli
 from mapserver.store import MapStore
 from support.recordings.recording_samples import write_euroc
-from support.storage.known_rig import known_rig
 from support.worlds.box_room import out_and_back, ride_sample
 
 
 @pytest.mark.slow
 def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first."""
+    """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first.
+
+    The second inherits the trust of the first one's calibration.
+    """
     inbox, report = tmp_path / "inbox", tmp_path / "night.json"
     rides = (out_and_back(4.0), out_and_back(3.6, reach_m=2.2, start_m=(-1.1, 0.5, 0.1)))
     for number, ride in enumerate(rides, 1):
@@ -30,17 +33,22 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             str(tmp_path / "store"),
             "--settle-s",
             "0",
-            *known_rig(tmp_path),
         ]
         monkeypatch.setattr(sys, "argv", ["mapserver", *words, "--report", str(report)])
         with pytest.raises(SystemExit) as end:
             cli.main()
         said = json.loads(report.read_text())
+        if number == 1:  # too short to judge its calibration: a person decides, as the refusal says
+            assert (end.value.code, [r["fate"] for r in said["recordings"]]) == (4, ["held"])
+            command = said["recordings"][0]["reason"].rpartition("mapserver ")[2].replace("WHY", "a known rig")
+            monkeypatch.setattr(sys, "argv", ["mapserver", *shlex.split(command)])
+            cli.main()
+            continue
         assert not end.value.code, said
         assert (said["published"], [r["fate"] for r in said["recordings"]]) == ([number], ["done"])
     with MapStore.open(tmp_path / "store") as maps:
         first, second = (maps.evidence("lab", version) for version in (1, 2))
-        verdict = maps.verdicts("lab", 2)[-1]
+        verdict, trusted = maps.verdicts("lab", 2)[-1], [maps.trusted(info) for info in maps.versions("lab")]
     assert first is not None
     assert first.held_out is not None
     assert (first.held_out.before, first.replayed, first.last_version) == (None, None, None)
@@ -54,3 +62,5 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small, *calibration = verdict.report["not_judged"]
     assert small == "aliasing_probes"  # the room is too small for another place
     assert all(" of calibration " in words for words in calibration)  # and the rides for the rig
+    assert [choice.reason for choice in trusted[0]] == ["a known rig"]
+    assert trusted[1] == trusted[0]

@@ -18,7 +18,7 @@ from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore
 from support.recordings.realdata import real_data
-from support.storage.known_rig import known_rig
+from support.storage.known_rig import KNOWN_RIG
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -37,7 +37,7 @@ def built(recording: Path, out: Path, *options: object) -> Report:
     to_store = ["--site", "s", "--store", out / "store"]
     files = ["--report", out / "b.json", "--trajectory-out", out / "b.tum"]
     run(mapserver_app, "build", recording, *to_store, "--frame-from-ground-truth", *files, *options)
-    run(mapserver_app, "publish", *to_store, *known_rig(out))
+    run(mapserver_app, "publish", *to_store, *KNOWN_RIG)
     report: Report = json.loads((out / "b.json").read_text())
     return report
 

@@ -27,7 +27,7 @@ from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
-from support.storage.known_rig import known_rig
+from support.storage.known_rig import KNOWN_RIG
 from support.worlds import box_room
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -94,7 +94,7 @@ class Nights:
         files = ["--report", self.folder / f"r{night}.json", "--trajectory-out", self.folder / f"t{night}.tum"]
         options = [option] if option else []
         said = run("build", self.folder / f"night{night}", "--site", "lab", "--store", self.store, *files, *options)
-        run("publish", "--site", "lab", "--store", self.store, *known_rig(self.folder))
+        run("publish", "--site", "lab", "--store", self.store, *KNOWN_RIG)
         return said
 
     def session(self, night: int) -> dict[str, Any]:

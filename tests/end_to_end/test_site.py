@@ -22,7 +22,7 @@ from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore
 from support.recordings.recording_samples import START_NS, Sample, write_euroc
-from support.storage.known_rig import known_rig
+from support.storage.known_rig import KNOWN_RIG
 from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES, FRAME_S = 50, 0.1
@@ -88,7 +88,7 @@ class Site:
         files = ["--report", folder / "build.json", "--trajectory-out", folder / "build.tum"]
         truth = "--frame-from-ground-truth"
         run(mapserver_app, "build", folder / "survey", "--site", "lab", "--store", self.store, truth, *files)
-        run(mapserver_app, "publish", "--site", "lab", "--store", self.store, *known_rig(folder))
+        run(mapserver_app, "publish", "--site", "lab", "--store", self.store, *KNOWN_RIG)
         self.build_report = json.loads((folder / "build.json").read_text())
 
     def replay(self, out: Path, *options: object, store: Path | None = None) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def test_a_tight_prior_starts_at_once_and_a_wrong_one_never(site: Site, tmp_path
 def test_without_the_truths_frame_no_error_is_claimed(site: Site, tmp_path: Path) -> None:
     common = ["--site", "own", "--store", tmp_path / "store"]
     run(mapserver_app, "build", site.folder / "survey", *common, "--frames", "8:34")
-    run(mapserver_app, "publish", *common, *known_rig(tmp_path))
+    run(mapserver_app, "publish", *common, *KNOWN_RIG)
     run(locclient_app, "replay", site.robot, *common, "--report", tmp_path / "r.json", "--frames", ":12")
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["error_m"] is report["error_deg"] is report["silent_failures"] is None

@@ -13,7 +13,7 @@ from zipfile import ZipFile
 import pytest
 
 from fleetsim import Order, record_order
-from mapserver import BuildOptions, GateSettings, build_map
+from mapserver import Actor, BuildOptions, build_map
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
@@ -72,7 +72,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     record_order(Order("clip", frames=60), folder / "clip.mcap", "mcap")
     draft = build_map(folder / "clip.mcap", folder / "store", "lab", BuildOptions(frame_from_ground_truth=True))
-    draft.publish(gate=GateSettings(allow_unjudged_calibration=True))
+    draft.publish(trust_calibration=True, actor=Actor("ada", "the rig is known"))
     return folder
 
 

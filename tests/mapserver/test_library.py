@@ -9,7 +9,7 @@ import pytest
 
 import mapserver
 from fleetmap.errors import GateRefusedError, StateError, UsageError
-from mapserver import BuildOptions, GateSettings, build_map, open_map, open_store
+from mapserver import Actor, BuildOptions, build_map, open_map, open_store
 from support.recordings.recording_samples import write_euroc
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -33,7 +33,7 @@ def test_a_map_in_five_lines(recording: Path, tmp_path: Path) -> None:
         open_map(tmp_path / "maps", "hall")
     with pytest.raises(GateRefusedError, match="nothing judged"):  # six metres there and back
         draft.publish()
-    draft.publish(gate=GateSettings(allow_unjudged_calibration=True))
+    draft.publish(trust_calibration=True, actor=Actor("ada", "the rig is known"))
     with open_store(str(tmp_path / "maps")) as maps:
         current = maps.current("hall")
         assert current is not None

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -100,11 +100,19 @@ def replay(
     map_options: MapOptions,
     playback: PlaybackOptions,
     files: ResultFiles,
+    version: Annotated[
+        int | None,
+        typer.Option(min=1, help="Version of the map in --store, drafts too; default: the current one."),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Fetch the site's map, localize every frame of a recording in it, and report the result."""
     settings = settings_of(context)
-    address = map_options.address()
+    address = replace(map_options.address(), version=version)
+    if version is not None and address.store is None:
+        raise UsageError(
+            f"--version {version} needs --store DIR: a server gives the version that its robots should run"
+        )
     files.check()
     _run(recording, (address, map_options), playback, files, settings)
 
@@ -178,7 +186,6 @@ def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: b
         return
     import signal
     import threading
-    from dataclasses import replace
 
     import numpy as np
 

@@ -59,7 +59,7 @@ def connected(
     """A connection to a map's address, by a cache of at most so many bytes; closed afterwards."""
     site, robot = address.site, address.robot
     if address.store is not None:
-        yield MapConnection(LocalMapSource(Path(address.store), site), None, site, robot)
+        yield MapConnection(LocalMapSource(Path(address.store), site, address.version), None, site, robot)
         return
     folder = cache_folder(cache_setting)
     cache = TileCache(folder, max_bytes=cache_bytes)

@@ -1,12 +1,15 @@
 """Sources of published maps, and those without a network: the tile cache alone, or a store's folder."""
 
+import os
+import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, disk_errors
+from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UsageError, disk_errors
 from fleetmap.mapformat import (
     Manifest,
     Tile,
@@ -91,21 +94,26 @@ class CachedMap(MapSource):
 
 
 class LocalMapSource(MapSource):
-    """Reads from a store's folder, without its database; for a robot without a server."""
+    """Reads from a store's folder, for a robot without a server; without its database where the current version is wanted.
 
-    def __init__(self, folder: Path, site: str) -> None:
+    version: another one than the current, drafts too.
+    """
+
+    def __init__(self, folder: Path, site: str, version: int | None = None) -> None:
         """Raises StoreError where `folder` is no store, UsageError for a name that no site can have."""
         super().__init__(site)
         if not (folder / "sites").is_dir():
             raise StoreError(f"{folder} is no map store; check --store, or make one with `mapserver build`")
-        self._folder = folder
+        self._folder, self._version = folder, version
 
     def ready(self) -> ReadyVersion:
-        """The site's current version."""
+        """The version that is asked for, else the site's current one."""
         return ReadyVersion(self.wanted())
 
     def wanted(self) -> WantedVersion:
-        """The site's current version; raises StoreError where that cannot be read."""
+        """As `ready`; UsageError for a version that is not there, StoreError where the store cannot be read."""
+        if self._version is not None:
+            return self._asked(self._version)
         path = self._folder / current_path(self._site)
         try:
             sha256 = check_sha256(path.read_text("ascii").strip())
@@ -115,6 +123,21 @@ class LocalMapSource(MapSource):
             raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
         version = decode_manifest(self.blob(sha256)).version
         return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
+
+    def _asked(self, number: int) -> WantedVersion:
+        path, query = self._folder / "store.sqlite3", "SELECT version, manifest_sha256 FROM versions WHERE site = ?"
+        # Where nobody can write beside the database, and no process left a log of changes, SQLite reads the file alone.
+        log = path.with_name(f"{path.name}-wal")
+        how = "mode=ro" if os.access(self._folder, os.W_OK) or log.exists() else "mode=ro&immutable=1"
+        try:
+            with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)) as database:
+                known = dict(database.execute(query, (self._site,)).fetchall())
+        except sqlite3.Error as error:
+            raise StoreError(f"{path} cannot be read ({error}); check the store with `mapserver verify`") from error
+        if number not in known:
+            names = ", ".join(str(version) for version in sorted(known)) or "none"
+            raise UsageError(f"site {self._site} has no version {number} in {self._folder}; it has: {names}")
+        return WantedVersion(site=self._site, version=number, manifest_sha256=known[number])
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""

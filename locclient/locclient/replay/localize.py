@@ -2,11 +2,12 @@
 
 import re
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 
+from fleetmap.errors import UsageError
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.replay_source import ReplaySource
@@ -26,7 +27,7 @@ class LocalizeOptions(ReplayOptions):
 
     frames: which of the recording's, as a Python slice. reverse: backwards, with new stamps and without IMU. calibration, topics: for
     opening a recording by its path. robot: the name that the server sees, `replay` unless it has an identity. root, identity,
-    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache.
+    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: of a store's folder, drafts too.
     """
 
     frames: str = ":"
@@ -39,6 +40,7 @@ class LocalizeOptions(ReplayOptions):
     insecure: bool = False
     cache: Path | None = None
     cache_bytes: int = DEFAULT_MAX_BYTES
+    version: int | None = None
 
 
 _DEFAULTS = LocalizeOptions()
@@ -77,7 +79,11 @@ def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS)
 
 def _address(maps: str | Path, site: str, options: LocalizeOptions) -> MapAddress:
     is_server = isinstance(maps, str) and _ENDPOINT.match(maps) is not None
-    return GivenAddress(
+    if is_server and options.version is not None:
+        raise UsageError(
+            f"version {options.version} needs a store's folder: a server gives the one that its robots should run"
+        )
+    address = GivenAddress(
         site=site,
         robot=options.robot,
         server=str(maps) if is_server else None,
@@ -86,3 +92,4 @@ def _address(maps: str | Path, site: str, options: LocalizeOptions) -> MapAddres
         identity=None if options.identity is None else str(options.identity),
         insecure=options.insecure,
     ).resolve("replay")
+    return replace(address, version=options.version)

@@ -48,11 +48,12 @@ from mapserver.api.views import (
     SiteList,
     VersionList,
     VersionView,
+    version_view,
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
 from mapserver.serving.robot_placing import RobotPlacing
-from mapserver.store import JobInfo, MapStore, VersionInfo
+from mapserver.store import JobInfo, MapStore
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 USUAL_SETTINGS = ApiSettings()
@@ -141,7 +142,7 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         """Versions of a site, oldest first, drafts too."""
         found = store.versions(site, after=cursor or 0, limit=limit + 1)
         shown, following = page(found, limit, lambda info: str(info.version))
-        return VersionList([VersionView.model_validate(info) for info in shown], following)
+        return VersionList([version_view(store, info) for info in shown], following)
 
     @app.get("/v1/sites/{site}/events")
     def events(
@@ -192,13 +193,13 @@ def _install_map_routes(app: FastAPI, store: MapStore) -> None:
         sha256 = store.version(site, version).manifest_sha256
         return bytes_response(request, store.blob(sha256), sha256, "application/json", immutable=True)
 
-    @app.get("/v1/sites/{site}/current", response_model=VersionView)
-    def current(site: Site) -> VersionInfo:
+    @app.get("/v1/sites/{site}/current")
+    def current(site: Site) -> VersionView:
         """The current version of a site."""
         info = store.current(site)
         if info is None:
             raise HTTPException(404, f"site {site} has no published version; publish one with `mapserver publish`")
-        return info
+        return version_view(store, info)
 
     @app.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
     @app.get("/v1/tiles/{sha256}", response_class=Response)

@@ -11,7 +11,7 @@ from mapserver import releases
 from mapserver.api.guard import GuardSettings, actor_of
 from mapserver.api.parameters import Site, Version
 from mapserver.api.problems import Waiting
-from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView
+from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView, version_view
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
@@ -39,38 +39,41 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         """What the gate said about a version, and the report of its build."""
         info = store.version(site, version)
         report = store.manifest(site, version).report
-        return QualityView(site, version, info.state, store.verdicts(site, version), report)
+        return QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
 
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
     def diff(site: Site, before: Version, after: Version) -> Difference:
         """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
         return releases.difference(store, site, before, after)
 
-    @app.post("/v1/sites/{site}/versions/{version}/publish", response_model=VersionView)
-    def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionInfo:
+    @app.post("/v1/sites/{site}/versions/{version}/publish")
+    def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionView:
         """Takes a draft through the gate and makes it current; 202 with a job where the signer has not answered within 10 s."""
         actor = actor_of(request, act.actor, act.reason)
-        if act.force and settings.signer:
-            raise StateError("by force on the builder's account alone: `mapserver publish --force --keys`")
+        if (act.force or act.trust_calibration) and settings.signer:
+            option = "--force" if act.force else "--trust-calibration"
+            raise StateError(f"that is decided on the builder's account alone: `mapserver publish {option} --keys`")
+        if act.trust_calibration:
+            releases.trust_calibration(store, store.version(site, version), actor)
         if not _answered(desk.ask("publish", site, actor, version)):
             releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
-        return store.version(site, version)
+        return version_view(store, store.version(site, version))
 
-    @app.post("/v1/sites/{site}/versions/{version}/promote", response_model=VersionView)
-    def promote(request: Request, site: Site, version: Version, act: Act) -> VersionInfo:
+    @app.post("/v1/sites/{site}/versions/{version}/promote")
+    def promote(request: Request, site: Site, version: Version, act: Act) -> VersionView:
         """Makes a version that was published before the current one; 202 with a job as `publish`."""
         actor = actor_of(request, act.actor, act.reason)
         if not _answered(desk.ask("promote", site, actor, version)):
             releases.promote(store, site, version, actor=actor)
-        return store.version(site, version)
+        return version_view(store, store.version(site, version))
 
-    @app.post("/v1/sites/{site}/rollback", response_model=VersionView)
-    def rollback(request: Request, site: Site, act: Act) -> VersionInfo:
+    @app.post("/v1/sites/{site}/rollback")
+    def rollback(request: Request, site: Site, act: Act) -> VersionView:
         """Makes the version current that was so before; the current one retires. 202 with a job as `publish`."""
         actor = actor_of(request, act.actor, act.reason)
         if not _answered(desk.ask("roll back", site, actor)):
             releases.roll_back(store, site, actor=actor)
-        return cast(VersionInfo, store.current(site))
+        return version_view(store, cast(VersionInfo, store.current(site)))
 
     @app.get("/v1/sites/{site}/canary")
     def canary(site: Site) -> CanaryView:

@@ -9,12 +9,26 @@ from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_test import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.quality.figures import TrustedCalibration
 from mapserver.serving.robot_placing import MOST_SIGMA_M
-from mapserver.store import CanaryRow, Event, FailureRow, JobInfo, PictureRow, SiteInfo, VerdictRow
+from mapserver.store import (
+    CanaryRow,
+    Event,
+    FailureRow,
+    JobInfo,
+    MapStore,
+    PictureRow,
+    SiteInfo,
+    VerdictRow,
+    VersionInfo,
+)
 
 
 class VersionView(BaseModel):
-    """A version; map_bytes is what a robot downloads for the whole site, vocabulary apart."""
+    """A version; map_bytes is what a robot downloads for the whole site, vocabulary apart.
+
+    trusted_calibrations: those that a person trusts, by name and reason, although no recording judged them.
+    """
 
     model_config = ConfigDict(from_attributes=True)
     site: str
@@ -28,6 +42,12 @@ class VersionView(BaseModel):
     map_bytes: int
     vocabulary_sha256: str
     vocabulary_bytes: int
+    trusted_calibrations: list[TrustedCalibration] = []
+
+
+def version_view(store: MapStore, info: VersionInfo) -> VersionView:
+    """A version as the API tells it."""
+    return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +92,13 @@ class JobList:
 
 @dataclass(frozen=True, slots=True)
 class QualityView:
-    """What is known about a version's quality: what the gate said, oldest first, and the build's report."""
+    """What is known about a version's quality: what the gate said, oldest first, calibrations that a person trusts, the build's report."""
 
     site: str
     version: int
     state: str
     verdicts: list[VerdictRow]
+    trusted_calibrations: list[TrustedCalibration]
     report: dict[str, Any]
 
 
@@ -157,15 +178,19 @@ class Act(BaseModel):
 
 
 class PublishAct(Act):
-    """Who publishes, and why; with `force` also what the gate refuses, except beyond hard limits."""
+    """Who publishes, and why; with `force` also what the gate refuses, except beyond hard limits.
+
+    With `trust_calibration` the person says that the calibration is right, although no recording judged it.
+    """
 
     model_config = _body(actor="ada", reason="hall 2 was emptied", force=True)
     force: bool = False
+    trust_calibration: bool = False
 
     @model_validator(mode="after")
-    def _force_has_a_reason(self) -> Self:
-        if self.force and not self.reason:
-            raise ValueError("publishing by force needs a reason")
+    def _choice_has_a_reason(self) -> Self:
+        if (self.force or self.trust_calibration) and not self.reason:
+            raise ValueError(f"publishing {'by force' if self.force else 'with trust_calibration'} needs a reason")
         return self
 
 

@@ -62,7 +62,7 @@ from mapserver.build.worker import (
     open_side_thread,
     single_threaded_libraries,
 )
-from mapserver.quality.figures import Evidence, merged
+from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.surfels.surfel_map import Surfels, known_surfels
@@ -329,7 +329,8 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         configuration=_configuration(run, parent),
         libraries=library_versions(),
         # A robot downloads the manifest: what it says about the build is short.
-        report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS},
+        report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
+        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None))},
     )
     job = run.request.options.job
     content = DraftContent(
@@ -369,7 +370,9 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
     options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
-    given = {} if options.trajectory is None else {"trajectory_format": options.trajectory.format}
+    given: dict[str, Any] = {} if options.trajectory is None else {"trajectory_format": options.trajectory.format}
+    if parent is not None and (trusted := parent.manifest.configuration.get(TRUSTED_KEY)):
+        given[TRUSTED_KEY] = trusted
     topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
     always = {
         "frames": options.frames,

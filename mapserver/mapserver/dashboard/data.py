@@ -21,6 +21,7 @@ from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
 from mapserver.floor_plan.survey_requests import SurveyRequest
+from mapserver.quality.figures import TrustedCalibration
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.expected_views import failure_camera
@@ -37,11 +38,12 @@ _JOBS_SHOWN = 100
 
 @dataclass(frozen=True, slots=True)
 class VersionQuality:
-    """A version with its manifest, the build's report in it, and the gate's verdicts, oldest first."""
+    """A version with its manifest, the build's report in it, the gate's verdicts, oldest first, and calibrations that a person trusts."""
 
     info: VersionInfo
     manifest: Manifest
     verdicts: list[VerdictRow]
+    trusted: list[TrustedCalibration]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +117,8 @@ class MapData:
 
     def quality(self, site: str, version: int) -> VersionQuality:
         """A version with all that was said about it."""
-        store = self._store
-        return VersionQuality(
-            store.version(site, version), store.manifest(site, version), store.verdicts(site, version)
-        )
+        store, info = self._store, self._store.version(site, version)
+        return VersionQuality(info, store.manifest(site, version), store.verdicts(site, version), store.trusted(info))
 
     def plan(self, site: str, version: int) -> Plan:
         """The plan of a version; the last ones are kept, since versions do not change."""

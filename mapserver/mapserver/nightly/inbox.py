@@ -269,10 +269,10 @@ def _free(folder: Path, name: str) -> Path:
 
 
 def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
-    """The recordings of these hashes that are still in the inbox's folder of done ones, in the same order."""
+    """The recordings of these hashes that are still in the inbox, in the same order: done, or held and then published by a person."""
     found: dict[str, Path] = {}
-    with suppress(FileNotFoundError):
-        for path in sorted((inbox / DONE).iterdir()):
-            if is_openable(path):
+    for where in (DONE, HELD):
+        with suppress(FileNotFoundError):
+            for path in filter(is_openable, sorted((inbox / where).iterdir())):
                 found.setdefault(path.name[:_HASH_SIGNS], path)
     return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]

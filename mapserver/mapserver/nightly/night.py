@@ -288,6 +288,7 @@ class _Night:
         return [recorded for recorded in recordings if recorded.sha256 not in taken]
 
     def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
+        reason = " ".join(reason.split())  # a refusal has several lines
         self._say(f"{where}: {path.name}: {reason}")
         try:
             boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)

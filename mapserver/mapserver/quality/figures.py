@@ -1,8 +1,18 @@
 """Figures of the evidence about a draft's tiles; docs/reports.md says what they mean. Light: the store reads them."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import msgspec
+
+from fleetmap.errors import MapFormatError
+from fleetmap.mapformat import Manifest
+
+TRUSTED_KEY = "trusted_calibrations"
+"""The key of a manifest's configuration that holds the calibrations that a person trusts."""
+
+EVIDENCE_KEY = "evidence"
+"""The key of a manifest's report that holds what the gate judges by, so that it goes wherever the version goes."""
 
 
 class ProbeFigures(msgspec.Struct, frozen=True):
@@ -91,6 +101,29 @@ class RigEvidence(msgspec.Struct, frozen=True):
         return {subject: missing for subject, missing in self.not_judged.items() if subject not in self.judged}
 
 
+@dataclass(frozen=True, slots=True)
+class TrustedCalibration:
+    """A person's word that the calibration `rig` (its fingerprint) is right; subjects: those that no recording had judged by then."""
+
+    rig: str
+    subjects: list[str]
+    actor: str
+    reason: str
+
+    @property
+    def sentence(self) -> str:
+        """It in words."""
+        return f"calibration {self.rig} is trusted by {self.actor} ({self.reason}): nothing judged its {', '.join(self.subjects)}"
+
+
+def trusted_calibrations(manifest: Manifest) -> list[TrustedCalibration]:
+    """The calibrations of a version that a person trusts; MapFormatError for a damaged entry."""
+    try:
+        return msgspec.convert(manifest.configuration.get(TRUSTED_KEY, []), list[TrustedCalibration])
+    except msgspec.ValidationError as error:
+        raise _damaged(manifest, f"configuration.{TRUSTED_KEY}", error) from error
+
+
 def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
     """One for each calibration, in their order: what one recording judged is judged, what one doubts is doubted."""
     found: dict[str, RigEvidence] = {}
@@ -113,3 +146,16 @@ class Evidence(msgspec.Struct, frozen=True):
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None
     calibrations: list[RigEvidence] | None = None
+
+
+def carried_evidence(manifest: Manifest) -> Evidence | None:
+    """The evidence in a manifest, without directions and starts; None for one made without. MapFormatError for a damaged entry."""
+    found = manifest.report.get(EVIDENCE_KEY)
+    try:
+        return None if found is None else msgspec.convert(found, Evidence)
+    except msgspec.ValidationError as error:
+        raise _damaged(manifest, f"report.{EVIDENCE_KEY}", error) from error
+
+
+def _damaged(manifest: Manifest, key: str, error: msgspec.ValidationError) -> MapFormatError:
+    return MapFormatError(f"manifest of {manifest.site} version {manifest.version}: {key}: {error}; it is damaged")

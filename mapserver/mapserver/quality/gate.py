@@ -1,6 +1,5 @@
 """Gate before publishing: reasons against a draft, by itself and beside the version that robots use now. Pure."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any, NamedTuple
@@ -10,7 +9,7 @@ import msgspec
 from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Compared, Evidence, RigEvidence
+from mapserver.quality.figures import Aliasing, Compared, Evidence, trusted_calibrations
 
 _JOINED = "joined"  # the verdict of survey.merge.join_test on a recording that belongs to the site
 Share = Annotated[float, msgspec.Meta(ge=0)]
@@ -32,19 +31,20 @@ class GateSettings(Section, frozen=True):
     min_inliers_share: Share = 0.8
     max_aliased_share: Share = 0.1
     max_breaks: int = 1
-    allow_unjudged_calibration: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class GateVerdict:
     """The gate's answer. reasons: against publishing, none if accepted; hard ones stand even against --force.
 
+    unjudged: the reasons that a person's trust in the calibration takes away.
     report: the figures that were looked at, and under `not_judged` those for which evidence is missing.
     """
 
     reasons: tuple[str, ...]
     hard_reasons: tuple[str, ...]
     report: dict[str, Any]
+    unjudged: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -62,11 +62,11 @@ def judge(
     """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
 
     What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing; but for the calibration of a
-    site's first version, whose metres all later ones keep.
+    site's first version, whose metres all later ones keep: nobody trusts that before a recording has judged it, or a person says so.
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
-    found = _Findings([], [] if "joins" in draft.report else ["joining"])
+    found = _Findings([], [] if "joins" in draft.report else ["joining"], [])
     for name, compared in (
         ("held_out_frames", examined.held_out),
         ("yesterdays_recordings", examined.replayed),
@@ -74,8 +74,7 @@ def judge(
     ):
         _compare(name, compared, settings, found)
     _judge_aliasing(examined.aliasing, examined.aliasing_before, settings, found)
-    is_held = current is None and not settings.allow_unjudged_calibration
-    _judge_calibrations(examined.calibrations, found, is_held=is_held)
+    _judge_calibrations(draft, examined, found, is_first=current is None)
     if examined.motion is None:
         found.not_judged.append("motion")
     elif examined.motion.breaks > settings.max_breaks:
@@ -90,15 +89,16 @@ def judge(
         report |= {"compared_with": current.version, **shares}
         found.reasons.extend(_size_reasons(shares, current.version, settings))
     report |= {"evidence": to_plain(examined), "not_judged": found.not_judged}
-    return GateVerdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report)
+    return GateVerdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report, tuple(found.unjudged))
 
 
 @dataclass(frozen=True, slots=True)
 class _Findings:
-    """Reasons against a draft so far, and what could not be judged."""
+    """Reasons against a draft so far, what could not be judged, and which of the reasons are about that."""
 
     reasons: list[str]
     not_judged: list[str]
+    unjudged: list[str]
 
 
 class _Bound(StrEnum):
@@ -170,22 +170,24 @@ def _judge_aliasing(
         )
 
 
-def _judge_calibrations(calibrations: Sequence[RigEvidence] | None, found: _Findings, *, is_held: bool) -> None:
-    """Doubts are for a person. So is what nobody judged where `is_held`: of a site's first map, with which later ones are compared."""
-    if calibrations is None:
+def _judge_calibrations(draft: Manifest, examined: Evidence, found: _Findings, *, is_first: bool) -> None:
+    """Doubts are for a person. So is what nothing judged of a site's first map, with which later ones are compared."""
+    if examined.calibrations is None:
         found.not_judged.append("calibration")
         return
-    for rig in calibrations:
+    trusted = {choice.rig: choice for choice in trusted_calibrations(draft)}
+    for rig in examined.calibrations:
         found.reasons.extend([f"calibration {rig.rig}: {subject}: {words}" for subject, words in rig.doubted.items()])
+        choice = trusted.get(rig.rig)
         for subject, missing in rig.unknown().items():
             words = f"{subject} of calibration {rig.rig}: {missing}"
-            if is_held:
-                found.reasons.append(
-                    f"nothing judged the {words}; survey so, together with this recording or before it, or publish with --force, or "
-                    "set allow_unjudged_calibration, where you know it to be right"
-                )
+            if choice is not None:
+                found.not_judged.append(f"{words} ({choice.actor} trusts it: {choice.reason})")
+            elif is_first:
+                found.unjudged.append(f"nothing judged the {words}")
             else:
                 found.not_judged.append(words)
+    found.reasons.extend(found.unjudged)
 
 
 def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> list[str]:

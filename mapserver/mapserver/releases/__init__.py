@@ -1,7 +1,16 @@
 """Releases of maps: publishing, promoting, rolling back, canaries, and what changed between two versions."""
 
-from mapserver.releases.release import difference, end_canary, promote, publish, roll_back, start_canary
+from mapserver.releases.release import (
+    difference,
+    end_canary,
+    promote,
+    publish,
+    roll_back,
+    start_canary,
+    trust_calibration,
+)
 from mapserver.releases.requests import Desk
 from mapserver.releases.version_diff import Difference
 
 __all__ = ["Desk", "Difference", "difference", "end_canary", "promote", "publish", "roll_back", "start_canary"]
+__all__ += ["trust_calibration"]

@@ -3,15 +3,19 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import msgspec
+
+from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
-from fleetmap.mapformat import decode_tile
+from fleetmap.mapformat import decode_manifest, decode_tile
 from mapserver.fleet_statistics.canary_test import threshold_for
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND, open_requests
+from mapserver.quality.figures import TRUSTED_KEY, TrustedCalibration, trusted_calibrations
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases import rules
 from mapserver.releases.version_diff import Difference, manifest_difference
 from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, NewCanary, VerdictRow, VersionInfo
-from mapserver.store.rows import ReleaseChanges, SiteReleases
+from mapserver.store.rows import LogEntry, ReleaseChanges, SiteReleases
 from mapserver.trust.signing import try_update_lists
 
 _USUAL_GATE = GateSettings()
@@ -43,6 +47,31 @@ def publish(
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
     _change(store, site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
     return draft.version
+
+
+def trust_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> VersionInfo:
+    """The draft with a person's word in its manifest that its calibrations are right.
+
+    It stays a draft for the gate to judge. The word is about calibrations by their fingerprint: versions that are built on this one
+    inherit it, other calibrations do not. Nothing changes where recordings judged all of them, or they are trusted already.
+
+    Raises UsageError without a name and a reason, StateError for a version that is no draft, StoreError where the disk refuses.
+    """
+    if not (actor.name and actor.reason):
+        raise UsageError("trusting a calibration needs who and why; name --reason")
+    manifest, evidence = decode_manifest(store.blob(draft.manifest_sha256)), store.evidence(draft.site, draft.version)
+    known = trusted_calibrations(manifest)
+    new = [
+        TrustedCalibration(rig.rig, sorted(rig.unknown()), actor.name, actor.reason)
+        for rig in (evidence.calibrations if evidence else None) or ()
+        if rig.unknown() and rig.rig not in {choice.rig for choice in known}
+    ]
+    if not new:
+        return draft
+    words = {TRUSTED_KEY: to_plain([*known, *new])}
+    changed = msgspec.structs.replace(manifest, configuration=manifest.configuration | words)
+    detail = "; ".join(f"calibration {choice.rig}, {', '.join(choice.subjects)} not judged" for choice in new)
+    return store.replace_manifest(draft, changed, LogEntry("calibration trusted", detail, draft.version, actor))
 
 
 def judge_draft(store: MapStore, draft: VersionInfo, gate: GateSettings) -> GateVerdict:
@@ -163,5 +192,5 @@ def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSett
     row = VerdictRow(store.now_ns(), verdict.accepted, forced, reasons, verdict.report)
     store.record_verdict(draft, row, actor)
     if not verdict.accepted and not forced:
-        raise rules.refusal(draft, verdict)
+        raise rules.refusal(draft, verdict, store.folder)
     return None if current is None else current.version

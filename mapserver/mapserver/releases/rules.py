@@ -4,7 +4,9 @@ draft -> current when published; current -> published when another becomes curre
 published -> retired by `gc`, once newer ones are enough; published or retired -> current when promoted.
 """
 
+import shlex
 from dataclasses import replace
+from pathlib import Path
 
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from mapserver.quality.gate import GateVerdict
@@ -36,15 +38,22 @@ def is_forced(verdict: GateVerdict, *, force: bool) -> bool:
     return force and bool(verdict.reasons) and not verdict.hard_reasons
 
 
-def refusal(draft: VersionInfo, verdict: GateVerdict) -> GateRefusedError:
-    """The error for a draft that the gate refuses."""
-    reasons = "; ".join((*verdict.hard_reasons, *verdict.reasons))
-    way_out = (
-        "this cannot be forced"
-        if verdict.hard_reasons
-        else "`mapserver inspect` shows the draft, `publish --force --reason TEXT` publishes it all the same"
+def refusal(draft: VersionInfo, verdict: GateVerdict, store: Path) -> GateRefusedError:
+    """The error for a draft that the gate refuses; its last line is the command that publishes it all the same, where there is one."""
+    words = f"draft {draft.version} of {draft.site} is refused: {'; '.join((*verdict.hard_reasons, *verdict.reasons))}"
+    if verdict.hard_reasons:
+        return GateRefusedError(f"{words}; this cannot be forced")
+    trusts = set(verdict.reasons) == set(verdict.unjudged)
+    when = (
+        "Record what is missing, or, if you know that the calibration is right"
+        if trusts
+        else "To publish it all the same"
     )
-    return GateRefusedError(f"draft {draft.version} of {draft.site} is refused: {reasons}; {way_out}")
+    where = f"--site {draft.site} --store {shlex.quote(str(store))} --version {draft.version}"
+    option = "--trust-calibration" if trusts else "--force"
+    return GateRefusedError(
+        f"{words}; `mapserver inspect` shows the draft\n{when}:\n  mapserver publish {where} {option} --reason 'WHY'"
+    )
 
 
 def publication(rows: SiteReleases, draft: int, judged_against: int | None, actor: Actor) -> ReleaseChanges:

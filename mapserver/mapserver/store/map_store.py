@@ -13,6 +13,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,6 +32,7 @@ from fleetmap.mapformat import (
 )
 from fleetmap.mapformat.building import BUILDING_KEY
 from fleetmap.mapformat.version_file import ExportHead, open_export
+from mapserver.quality.figures import carried_evidence, trusted_calibrations
 from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
     check_no_link,
@@ -207,6 +209,31 @@ class MapStore(StoreQueries):
                 detail = f"draft {draft.version}: {'; '.join(verdict.reasons)}"
                 self._transactions.log(connection, draft.site, LogEntry(kind, detail, draft.version, actor))
 
+    def replace_manifest(self, draft: VersionInfo, manifest: Manifest, entry: LogEntry) -> VersionInfo:
+        """The draft with another manifest of the same tiles, as it was made, and a line in the log.
+
+        Raises StateError where it is no draft any more or somebody else changed it, StoreError where the disk refuses.
+        """
+        data = encode_manifest(manifest)
+        with self._locked(shared=True):
+            new = replace(draft, manifest_sha256=self._blobs.put(data), manifest_bytes=len(data))
+            with self._transactions.write() as connection:
+                done = connection.execute(
+                    """UPDATE versions SET manifest_sha256 = ?, manifest_bytes = ?
+                       WHERE site = ? AND version = ? AND state = 'draft' AND manifest_sha256 = ?""",
+                    (new.manifest_sha256, len(data), draft.site, draft.version, draft.manifest_sha256),
+                )
+                if not done.rowcount:
+                    raise StateError(
+                        f"draft {draft.version} of site {draft.site} was changed by somebody else meanwhile; try again"
+                    )
+                connection.execute(
+                    "UPDATE version_blobs SET sha256 = ? WHERE site = ? AND version = ? AND kind = 'manifest'",
+                    (new.manifest_sha256, draft.site, draft.version),
+                )
+                self._transactions.log(connection, draft.site, entry)
+        return new
+
     def check_bytes(self, version: VersionInfo) -> None:
         """Raises StoreError or MapFormatError unless all bytes that robots need of a version are there and right."""
         manifest = decode_manifest(self._blobs.get(version.manifest_sha256))
@@ -257,6 +284,7 @@ class MapStore(StoreQueries):
         with open_export(path) as reader, self._locked(shared=True):
             reader.check_whole()
             manifest = reader.manifest()
+            carried_evidence(manifest), trusted_calibrations(manifest)
             sha256 = reader.head.blobs[0].sha256
             known = self._known_import(manifest, sha256)
             if known is not None:

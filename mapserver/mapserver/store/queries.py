@@ -9,12 +9,12 @@ from typing import Any
 import msgspec
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import UsageError
+from fleetmap.errors import MapFormatError, StoreError, UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
-from mapserver.quality.figures import Evidence
+from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
 from mapserver.store.access.chain import AuditLine, AuditMark
 from mapserver.store.access.operators import OperatorQueries
 from mapserver.store.blobs import BlobFolder
@@ -203,10 +203,24 @@ class StoreQueries:
         ]
 
     def evidence(self, site: str, version: int) -> Evidence | None:
-        """What was measured of a version when it was built, None for one that came without; UsageError as `version`."""
+        """What was measured of a version when it was built, None for one that came without; errors as of `manifest`.
+
+        An imported one has what its manifest carries.
+        """
         self.version(site, version)
         rows = self._transactions.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
-        return msgspec.json.decode(rows[0]["figures"], type=Evidence) if rows else None
+        return (
+            msgspec.json.decode(rows[0]["figures"], type=Evidence)
+            if rows
+            else carried_evidence(self.manifest(site, version))
+        )
+
+    def trusted(self, info: VersionInfo) -> list[TrustedCalibration]:
+        """The calibrations of a version that a person trusts; none where its manifest is damaged, which `verify` finds."""
+        try:
+            return trusted_calibrations(self.manifest(info.site, info.version))
+        except (StoreError, MapFormatError):
+            return []
 
     def events(
         self, site: str, span_ns: tuple[int | None, int | None] = (None, None), *, after: int = 0, limit: int = -1

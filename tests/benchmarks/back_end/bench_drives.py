@@ -25,7 +25,7 @@ from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from fleetsim.scene.layout import Layout
-from mapserver import BuildOptions, GateSettings, build_map
+from mapserver import Actor, BuildOptions, GateSettings, build_map
 from mapserver.config import survey_settings
 from mapserver.library import BuiltMap
 from mapserver.survey.loops.loops import Loops
@@ -34,7 +34,7 @@ SCENARIO, SEED = "fulfilment-wing", 907
 ROBOTS = ("survey-south", "survey-north", "survey-south-back", "survey-north-back")
 SHARE_LIMIT, PEAK_LIMIT_MB, ATE_LIMIT_M = 1 / 3, 4096.0, 0.05  # of the driving time; of memory; over all frames
 # The aisles do look alike, and straight aisles show little of a calibration: what an operator says of such a site.
-GATE = GateSettings(allow_unjudged_calibration=True, max_aliased_share=1.0)
+GATE = GateSettings(max_aliased_share=1.0)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
 
 
@@ -62,7 +62,7 @@ def measure(recordings: list[Path], store: Path, options: BuildOptions) -> dict[
         "peak_of_a_process_beside_mb": round(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e6),
     }
     try:
-        made.publish(gate=GATE)
+        made.publish(gate=GATE, trust_calibration=True, actor=Actor("bench", "a simulated rig"))
         row["gate"] = "published"
     except GateRefusedError as error:
         row["gate"] = str(error)

@@ -8,6 +8,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from locclient import cli
+from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
 from mapserver import releases
 from mapserver.store import MapStore
@@ -36,6 +37,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with MapStore.open(folder, create=True) as maps:
         save_sample_draft(maps)
         releases.publish(maps, "lab")
+        save_sample_draft(maps, seed=2)
         save_sample_draft(maps, site="draft-only")
     return folder
 
@@ -54,6 +56,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--site", "lab", "--store", "STORE", "--prior", "1,2,3,0"], "positive"),
         (["--site", "lab", "--server", "nonsense"], "nonsense"),
         (["--site", "lab", "--store", "STORE", "--colour"], "--colour"),
+        (["--site", "lab", "--store", "STORE", "--version", "7"], "it has: 1, 2"),
+        (["--site", "lab", "--server", "tcp/127.0.0.1:1", "--version", "1"], "--store"),
     ],
 )
 def test_wrong_orders_end_with_2(
@@ -64,6 +68,13 @@ def test_wrong_orders_end_with_2(
     told = capsys.readouterr()
     assert said in told.err
     assert "Traceback" not in told.err + told.out
+
+
+def test_any_version_of_a_store_can_be_replayed_in(store: Path) -> None:
+    for site, version, sha256 in (("lab", None, 1), ("lab", 1, 1), ("lab", 2, 2), ("draft-only", 1, 1)):
+        wanted = LocalMapSource(store, site, version).ready().wanted
+        with MapStore.open(store, read_only=True) as maps:
+            assert wanted.manifest_sha256 == maps.version(site, sha256).manifest_sha256
 
 
 def test_bad_input_ends_with_3(

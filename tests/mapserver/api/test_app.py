@@ -13,6 +13,7 @@ from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_t
 from fleetmap.messages import RobotAck, RobotHealth
 from mapserver.api import app as app_module
 from mapserver.api import request_limits
+from mapserver.quality.figures import Evidence, RigEvidence
 from mapserver.store import DraftContent
 from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
@@ -269,6 +270,23 @@ def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server
     check_problem(server.client.post(f"{url}/publish", json={"actor": "ada", "force": True}), 422, "reason")
     assert server.client.post(f"{url}/publish", json=ADA | {"force": True}).json()["state"] == "current"
     assert server.client.get(f"{url}/quality").json()["verdicts"][-1]["forced"]
+
+
+def test_an_operator_trusts_a_calibration_over_http(server: Server) -> None:
+    evidence = Evidence(calibrations=[RigEvidence("a1", not_judged={"metric scale": "drive curves"})])
+    tile = random_tile(np.random.default_rng(5), cell=(0, 0))
+    server.store.save_draft(
+        "yard", DraftContent(tiles=[tile], vocabulary=b"w", details=draft_details(), evidence=evidence)
+    )
+    url = "/v1/sites/yard/versions/1"
+    check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "--trust-calibration")
+    check_problem(server.client.post(f"{url}/publish", json={"actor": "ada", "trust_calibration": True}), 422, "reason")
+    published = server.client.post(f"{url}/publish", json=ADA | {"trust_calibration": True}).json()
+    choice = {"rig": "a1", "subjects": ["metric scale"], "actor": "ada", "reason": "aisle 3"}
+    assert (published["state"], published["trusted_calibrations"]) == ("current", [choice])
+    assert server.client.get(f"{url}/quality").json()["trusted_calibrations"] == [choice]
+    (listed,) = server.client.get("/v1/sites/yard/versions").json()["versions"]
+    assert listed["trusted_calibrations"] == server.client.get(url).json()["configuration"]["trusted_calibrations"]
 
 
 def test_lists_come_in_pages(server: Server) -> None:

@@ -22,7 +22,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from mapserver.build.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
-from mapserver.quality.figures import Evidence, RigEvidence, merged
+from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, lookalike_words, probe_features
 from mapserver.survey.pipeline import Survey, survey
@@ -353,12 +353,18 @@ def test_a_later_version_is_compared_with_the_map_and_says_what_was_not_judged()
     assert "pair geometry of calibration a1: drive curves" in said.report["not_judged"]
 
 
-def test_a_fleet_whose_calibration_is_judged_elsewhere_may_say_so() -> None:
-    tiles = tiles_from_survey(sound()[0].map)
-    settings = GateSettings(allow_unjudged_calibration=True)
-    said = judge(manifest(tiles, 1), None, None, settings, Evidence(calibrations=[STRAIGHT]))
-    assert said.accepted, said.reasons
-    assert "pair geometry of calibration a1: drive curves" in said.report["not_judged"]
+@pytest.mark.parametrize(("rig", "passes"), [("a1", True), ("b2", False)])
+def test_a_calibration_that_a_person_trusts_passes_and_another_one_does_not(rig: str, passes: bool) -> None:
+    choice = {"rig": rig, "subjects": ["pair geometry"], "actor": "ada", "reason": "a board"}
+    draft = msgspec.structs.replace(
+        manifest(tiles_from_survey(sound()[0].map), 1), configuration={TRUSTED_KEY: [choice]}
+    )
+    said = judge(draft, None, None, GateSettings(), Evidence(calibrations=[STRAIGHT]))
+    assert (said.accepted, said.reasons) == (passes, said.unjudged)
+    words = "pair geometry of calibration a1: drive curves (ada trusts it: a board)"
+    assert (words in said.report["not_judged"]) is passes
+    doubt = RigEvidence("a1", doubted={"metric scale": "4 % off"})
+    assert not judge(draft, None, None, GateSettings(), Evidence(calibrations=[doubt])).accepted
 
 
 @pytest.mark.parametrize("has_current", [False, True])

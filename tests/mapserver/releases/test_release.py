@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.errors import GateRefusedError, StateError, StoreError, UsageError
+from fleetmap.errors import GateRefusedError, MapFormatError, StateError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path
 from mapserver import releases
+from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, RigEvidence, TrustedCalibration
 from mapserver.quality.gate import GateSettings
 from mapserver.releases.version_diff import SideBySide
 from mapserver.store import Actor, DraftContent, MapStore
@@ -80,6 +82,63 @@ def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
     ]
     save_sample_draft(store, seed=4)
     assert releases.publish(store, "lab", gate=GateSettings(max_bytes_share=100)) == 3
+
+
+STRAIGHT = Evidence(calibrations=[RigEvidence("a1", ["pair geometry"], {"metric scale": "drive curves"})])
+
+
+def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carries_it(
+    store: MapStore, tmp_path: Path
+) -> None:
+    """A refused draft is refused in another store, too; the choice travels with the version, and is no second user's word."""
+    report = {EVIDENCE_KEY: msgspec.to_builtins(STRAIGHT)}
+    tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
+    store.save_draft(
+        "lab",
+        DraftContent(tiles=tiles, vocabulary=b"w", details=draft_details(**report), archive=b"a", evidence=STRAIGHT),
+    )
+    command = f"mapserver publish --site lab --store {store.folder} --version 1 --trust-calibration --reason"
+    store.export_version("lab", 1, tmp_path / "refused.fmex", archive=False)
+    with MapStore.open(tmp_path / "other", create=True) as other:
+        other.import_version(tmp_path / "refused.fmex")
+        for at, its_command in ((store, command), (other, command.replace(str(store.folder), str(other.folder)))):
+            with pytest.raises(GateRefusedError, match="nothing judged the metric scale of calibration a1") as refused:
+                releases.publish(at, "lab")
+            assert its_command in str(refused.value).splitlines()[-1]
+    draft = store.version("lab", 1)
+    for nobody in (Actor("ada"), Actor("", "a board")):
+        with pytest.raises(UsageError, match="--reason"):
+            releases.trust_calibration(store, draft, nobody)
+    trusted = releases.trust_calibration(store, draft, ADA)
+    assert store.version("lab", 1) == trusted != draft
+    assert releases.trust_calibration(store, trusted, Actor("bob", "again")) == trusted
+    with pytest.raises(StateError, match="changed by somebody else"):
+        releases.trust_calibration(store, draft, ADA)
+    assert releases.publish(store, "lab") == 1
+    assert store.trusted(trusted) == [TrustedCalibration("a1", ["metric scale"], "ada", "a test")]
+    assert [(e.kind, e.actor, e.reason) for e in store.events("lab")][-2] == ("calibration trusted", "ada", "a test")
+    assert store.verify().faults == []
+    store.export_version("lab", 1, tmp_path / "trusted.fmex")
+    with MapStore.open(tmp_path / "third", create=True) as third:
+        third.import_version(tmp_path / "trusted.fmex")
+        assert releases.publish(third, "lab") == 1
+
+
+def test_an_import_with_damaged_evidence_is_refused(store: MapStore, tmp_path: Path) -> None:
+    for number, (key, words) in enumerate(
+        ((EVIDENCE_KEY, "report.evidence"), (TRUSTED_KEY, "trusted_calibrations")), 1
+    ):
+        details = draft_details(**{EVIDENCE_KEY: {"calibrations": 3}} if key == EVIDENCE_KEY else {})
+        if key == TRUSTED_KEY:
+            details = msgspec.structs.replace(details, configuration={TRUSTED_KEY: [{"rig": 4}]})
+        tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
+        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"w", details=details))
+        store.export_version("lab", number, tmp_path / "bad.fmex")
+        with (
+            MapStore.open(tmp_path / "other", create=True) as other,
+            pytest.raises(MapFormatError, match=f"{words}.*damaged"),
+        ):
+            other.import_version(tmp_path / "bad.fmex")
 
 
 def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(store: MapStore, monkeypatch) -> None:

@@ -1,5 +1,6 @@
 """`mapserver versions`, `inspect` and `diff`: the versions of a site, the content of one, the differences between two."""
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -21,15 +22,20 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
 
     with MapStore.open(store, read_only=True) as maps:
         infos = maps.versions(site)
+        trusted = {info.version: maps.trusted(info) for info in infos}
     if json:
-        print_json(infos)
+        print_json([asdict(info) | {"trusted_calibrations": trusted[info.version]} for info in infos])
         return
     table = Table("version", "state", "parent", "created", "tiles", "landmarks", "bytes")
     for info in infos:
         parent = "" if info.parent is None else str(info.parent)
         sizes = (str(info.tiles), str(info.landmarks), str(info.map_bytes))
         table.add_row(str(info.version), info.state, parent, info.created, *sizes)
-    Console().print(table)
+    console = Console(markup=False, emoji=False, highlight=False)
+    console.print(table)
+    for version, choices in trusted.items():
+        for choice in choices:
+            console.print(f"version {version}: {choice.sentence}")
 
 
 def inspect(

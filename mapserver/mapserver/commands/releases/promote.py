@@ -22,6 +22,13 @@ def publish(
     context: typer.Context,
     where: DraftOptions,
     by: ActorOptions,
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust-calibration",
+            help="Say that the calibration is right although no recording judged it; kept in the manifest; needs --reason.",
+        ),
+    ] = False,
     force: Annotated[
         bool,
         typer.Option("--force", help="Publish although the gate refuses, except beyond hard limits; needs --reason."),
@@ -40,9 +47,14 @@ def publish(
     gate = settings_of(context).gate
     with MapStore.open(where.store) as maps:
         builder = None if where.keys is None else BuilderFolder(where.keys)
+        draft = rules.chosen_draft(maps.releases(where.site), where.version)
         if builder is not None:
-            builder.check(rules.chosen_draft(maps.releases(where.site), where.version))
-        published = releases.publish(maps, where.site, where.version, actor=by.named(), force=force, gate=gate)
+            builder.check(draft)
+        if trust and (new := releases.trust_calibration(maps, draft, by.named())) != draft:
+            draft = new
+            if builder is not None:
+                builder.record(draft)
+        published = releases.publish(maps, where.site, draft.version, actor=by.named(), force=force, gate=gate)
         if builder is not None:
             builder.note_passed(where.site, published)
             sign_as_builder(maps, builder, where.site)

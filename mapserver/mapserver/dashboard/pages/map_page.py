@@ -244,6 +244,7 @@ def _quality_facts(quality: VersionQuality, plan: Plan) -> Markup:
     pairs.append(
         ("Recordings", ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in quality.manifest.recordings))
     )
+    pairs += [("Calibration", choice.sentence) for choice in quality.trusted]
     pairs += [(f"Doctor: {name}", "; ".join(words) or "no findings") for name, words in _findings(report)]
     return facts(pairs)
 
