@@ -76,14 +76,14 @@ def replay(
     give_back_free_memory()
     if prior is not None:
         robot.localizer.handle_prior(prior)
-    result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [])
+    truth_in_map = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
+    result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [], truth_in_map=truth_in_map)
     mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
     clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
     profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
     reporter = RunReporter(connection, result, profile)
     if options.viewer is not None:
         options.viewer.begin(loaded, profile, rectifier)
-    has_truth = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     for number, imu in enumerate(source.imu_before_each()):
         decode_s = time.process_time()
@@ -96,8 +96,8 @@ def replay(
         outcome = robot.handle(bundle)
         assert outcome is not None, "the bundle holds a frame"
         wall_s = time.monotonic() - wall_s
-        truth = source.truth_map_from_body(number) if has_truth else None
-        result.frames.append(frame_record(outcome, truth, wall_s, decode_s))
+        truth = source.truth_map_from_body(number)
+        result.frames.append(frame_record(outcome, truth if truth_in_map else None, wall_s, decode_s))
         result.estimates.append(outcome.estimate)
         result.truths.append(truth)
         reporter.handle(outcome)
@@ -107,6 +107,8 @@ def replay(
     if robot.ring is not None:
         robot.ring.finish()
     reporter.finish()
+    if not truth_in_map and any(truth is not None for truth in result.truths):
+        result.notes.append(result.alignment_note())
     return result
 
 

@@ -90,12 +90,12 @@ def first_fix_s(frames: Frames) -> float | None:
 
 def frame_ms(frames: Frames) -> dict[str, float] | None:
     """CPU milliseconds of the whole process per frame, after the warm-up frames."""
-    return _spread([1e3 * f.cpu_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
+    return spread([1e3 * f.cpu_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
 
 
 def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
     """Wall-clock milliseconds per frame, after the warm-up frames."""
-    return _spread([1e3 * f.wall_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
+    return spread([1e3 * f.wall_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
 
 
 def stage_ms(frames: Frames) -> dict[str, float]:
@@ -109,13 +109,13 @@ def stage_ms(frames: Frames) -> dict[str, float]:
 def error_m(frames: Frames) -> dict[str, float] | None:
     """Unaligned position errors of localised frames with a truth."""
     values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good]
-    return _spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
+    return spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
 
 
 def error_deg(frames: Frames) -> dict[str, float] | None:
     """Unaligned orientation errors of localised frames with a truth."""
     values = [f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good]
-    return _spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
+    return spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
 
 
 def status_share(frames: Frames) -> dict[str, float]:
@@ -232,7 +232,8 @@ def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int)
     return longest
 
 
-def _spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:
+def spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:
+    """Mean, median or percentiles of the values by their names; None without values."""
     if not values:
         return None
     shares = {"p50": 50, "median": 50, "p95": 95, "p99": 99, "max": 100}

@@ -6,19 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.mapformat import Manifest
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import Stamps, Trajectory
 from locclient.localization.estimate import Estimate
 from locclient.maps.map_source import FetchedTiles
 from locclient.replay.plots import RunPlot, save_picture
-from locclient.replay.run_metrics import METRICS, FrameRecord, localised
+from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
+
+_MIN_ALIGNED = 3  # frames, below which a fit is not defined
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """A finished replay, one entry a frame: records, estimates, and the true map_from_body (4, 4), None where unknown.
+    """A finished replay, one entry a frame: records, estimates, and the true pose of the body (4, 4), None where unknown.
+
+    truth_in_map: whether the truth is of the frame `map`; else it is of a frame of its own, and errors are known after a fit alone.
 
     manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failure_reports: how many failures the
     robot detected, and of their reports how many the server has and how many still wait for it.
@@ -31,6 +35,7 @@ class ReplayResult:
     tiles: FetchedTiles
     notes: list[str] = field(default_factory=list)
     failure_reports: dict[str, int] = field(default_factory=lambda: {"detected": 0, "delivered": 0, "waiting": 0})
+    truth_in_map: bool = True
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -56,10 +61,40 @@ class ReplayResult:
         """Status of each frame."""
         return [estimate.status for estimate in self.estimates]
 
+    def aligned_error_m(self) -> dict[str, float] | None:
+        """Position errors of the localised frames with a truth after the rigid fit of these positions to it; None below 3 frames.
+
+        frames: how many those are. scale: by which the estimate would have to be multiplied to fit best; it is not applied.
+        """
+        found = [
+            (estimate.map_from_body[:3, 3], truth[:3, 3])
+            for estimate, truth, good in zip(self.estimates, self.truths, localised(self.frames), strict=True)
+            if good and truth is not None and estimate.map_from_body is not None
+        ]
+        if len(found) < _MIN_ALIGNED:
+            return None
+        mine, true = (np.array(positions) for positions in zip(*found, strict=True))
+        truth_from_map, _ = align_points(true, mine)
+        errors_m = np.linalg.norm(transform_points(truth_from_map, mine) - true, axis=1)
+        return {
+            **(spread(errors_m.tolist(), ("median", "p95", "p99", "max")) or {}),
+            "frames": len(found),
+            "scale": align_points(true, mine, with_scale=True)[1],
+        }
+
+    def alignment_note(self) -> str:
+        """What a user should know of errors against a truth in another frame."""
+        found = self.aligned_error_m()
+        words = "the ground truth is in another frame than the map: error_m is unknown"
+        if found is None:
+            return f"{words}, and fewer than {_MIN_ALIGNED} localised frames have a truth to align"
+        return f"{words}; aligned_error_m is after the best rigid fit of the {found['frames']} localised frames with a truth"
+
     @property
     def report(self) -> dict[str, object]:
         """Figures of the run; docs/reports.md explains the keys."""
         built: dict[str, object] = {name: metric(self.frames) for name, metric in METRICS.items()}
+        built["aligned_error_m"] = self.aligned_error_m()
         built["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         built["map_version"] = self.manifest.version
         built["site"] = self.manifest.site
@@ -77,7 +112,8 @@ class ReplayResult:
 
     def save_picture(self, path: str | Path) -> None:
         """Draws path, landmarks and errors into a PNG file; UsageError where it cannot be written."""
-        truths_m = [np.full(3, np.nan) if truth is None else truth[:3, 3] for truth in self.truths]
+        known = [truth if self.truth_in_map else None for truth in self.truths]
+        truths_m = [np.full(3, np.nan) if truth is None else truth[:3, 3] for truth in known]
         plot = RunPlot(
             title=f"{self.manifest.site}, version {self.manifest.version}",
             frames=self.frames,

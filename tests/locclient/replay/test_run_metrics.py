@@ -1,15 +1,18 @@
 """What a run was worth, against sequences small enough to judge by hand."""
 
 from collections.abc import Iterable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fleetmap.failure_definition import radius_95_m
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3_exp
 from fleetmap.messages import Status
+from locclient.maps.map_source import FetchedTiles
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import METRICS, FrameRecord
+from locclient.replay.run_result import ReplayResult
 
 T, D, A, L, I = Status.TRACKING, Status.DEGRADED, Status.AMBIGUOUS, Status.LOST, Status.INITIALISING  # noqa: E741
 
@@ -242,3 +245,45 @@ def test_a_failure_ends_only_after_five_seconds_of_good_tracking() -> None:
     two = sequence((2, GOOD), (3, LOST), (6, GOOD), (3, LOST), (6, GOOD))
     assert counts(one)[1] == 1
     assert counts(two)[1] == 2
+
+
+def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: float = 1.0) -> ReplayResult:
+    """A run through a bend of which the truth is known in another frame, `truths` alone and 1 cm off, up and down by turns."""
+    places = np.array([[np.cos(k / 40), np.sin(k / 40), 0.0] for k in range(len(frames))])
+    truth_from_map = se3_exp(np.array([0.3, -2.0, 1.0, 40.0, -7.0, 3.0]))
+    estimates = []
+    for number, place in enumerate(places):
+        map_from_body = np.eye(4)
+        map_from_body[:3, 3] = place / scale + [0.0, 0.0, 0.01 * (-1) ** number]
+        estimates.append(SimpleNamespace(map_from_body=map_from_body))
+        if truths[number] is not None:
+            truths[number] = truth_from_map @ np.block(
+                [[np.eye(3), place[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]
+            )
+    return ReplayResult(frames, estimates, truths, None, FetchedTiles({}, {}), truth_in_map=False)  # type: ignore[arg-type]
+
+
+def test_errors_against_a_truth_in_another_frame_are_aligned() -> None:
+    """The fit is of the localised frames that have a truth: neither lost ones nor gaps of the truth count."""
+    frames = sequence((4.0, GOOD), (2.0, LOST), (4.0, GOOD))
+    truths: list[Array | None] = [np.eye(4)] * 100
+    truths[10:20] = [None] * 10
+    run = result(truths, frames)
+    run.estimates[50].map_from_body[:3, 3] += 3.0  # while it is lost
+    found = run.aligned_error_m()
+    assert found is not None
+    assert found["frames"] == 70
+    assert [found[name] for name in ("median", "max", "scale")] == pytest.approx([0.01, 0.01, 1.0], abs=1e-3)
+    assert "another frame" in run.alignment_note()
+    assert "70 localised frames" in run.alignment_note()
+
+
+def test_a_truth_of_another_scale_shows_and_one_of_few_frames_is_no_truth() -> None:
+    frames = sequence((10.0, GOOD))
+    twice = result([np.eye(4)] * 100, frames, scale=2.0).aligned_error_m()
+    assert twice is not None
+    assert twice["scale"] == pytest.approx(2.0, abs=0.01)
+    assert twice["median"] > 0.1
+    few = result([np.eye(4)] * 2 + [None] * 98, frames)
+    assert few.aligned_error_m() is None
+    assert "fewer than 3 localised frames" in few.alignment_note()

@@ -336,7 +336,6 @@ def test_a_first_version_whose_calibration_nobody_could_judge_waits_for_a_person
     assert not said.hard_reasons
     assert len(said.reasons) == 1
     assert "pair geometry of calibration a1: drive curves" in said.reasons[0]
-    assert "--force" in said.reasons[0]
 
 
 @pytest.mark.parametrize("has_current", [False, True])
