@@ -273,6 +273,7 @@ def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
     found: dict[str, Path] = {}
     for where in (DONE, HELD):
         with suppress(FileNotFoundError):
-            for path in filter(is_openable, sorted((inbox / where).iterdir())):
-                found.setdefault(path.name[:_HASH_SIGNS], path)
+            for path in sorted((inbox / where).iterdir()):
+                if not path.name.endswith(_REASON) and is_openable(path):
+                    found.setdefault(path.name[:_HASH_SIGNS], path)
     return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]
