@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # The whole path. Without a recording: a simulated warehouse is surveyed, mapped and served, and two robots of the next day, after
-# stock has moved, are localized in it. With one: half of its frames become the map, the other half is localized in it.
+# stock has moved, drive in it: their daemons (`locclient run`) play the recordings in real time as sensors, while the console is up, and
+# replays of the same recordings give the figures. With one: half of its frames become the map, the other half is localized in it.
 #
 #   deploy/demo.sh [--check] [RECORDING]      (run by `make demo`; --check looks at RECORDING and does nothing else)
 #
@@ -16,6 +17,7 @@ READY_WITHIN_S=60
 server_pid=
 robots_pid=
 prepare_pid=
+drive_pids=()
 replay_pids=()
 publish_options=()
 
@@ -60,7 +62,8 @@ if [[ ${1:-} == --check ]]; then
 fi
 recording=${1:-}
 check_recording "$recording"
-trap 'stop_server || true; kill $robots_pid $prepare_pid ${replay_pids[@]+"${replay_pids[@]}"} 2>/dev/null || true' EXIT
+trap 'stop_server || true; kill $robots_pid $prepare_pid ${drive_pids[@]+"${drive_pids[@]}"} \
+  ${replay_pids[@]+"${replay_pids[@]}"} 2>/dev/null || true' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
 rm -rf "$OUT"
@@ -76,11 +79,36 @@ build() {
   printf 'http %s, zenoh %s\n' "$http" "$zenoh"
 }
 
+# A robot's daemon, with a recording in the place of its sensors; speed: 1 in real time, 0 as fast as it localizes.
+drive() {
+  local robot=$1 recording=$2 speed=$3
+  printf '[run]\nserver = "%s"\nsite = "demo"\nrobot = "%s"\ncache = "%s"\nspool = "%s"\n[source]\nkind = "recording"\n' \
+    "$zenoh" "$robot" "$OUT/cache-$robot" "$OUT/spool-$robot.sqlite3" >"$OUT/$robot.toml"
+  printf 'recording = "%s"\nspeed = %s.0\n' "$recording" "$speed" >>"$OUT/$robot.toml"
+  "$BIN/locclient" run --config "$OUT/$robot.toml" --verbose >"$OUT/$robot-run.log" 2>&1 &
+  drive_pids+=("$!")
+}
+
+# All daemons have ended well, and no thread of theirs or of the server's died on the way.
+drives_ended() {
+  local number log
+  for number in "${!drive_pids[@]}"; do
+    wait "${drive_pids[$number]}" || { cat "$OUT"/*-run.log >&2; fail "a robot's daemon ended with status $?"; }
+  done
+  for log in "$OUT"/*-run.log "$OUT/server.log"; do
+    ! grep -q Traceback "$log" || { cat "$log" >&2; fail "something failed while it ran: see $log"; }
+  done
+  say "what the server knows of the robots"
+  "$BIN/python" deploy/demo_report.py robots "$http/v1/robots"
+}
+
+# Figures against the truth, from the store's folder: to the server the daemon reports. Status 6: it did not find itself; the table shows it.
 replay() {
-  local robot=$1
+  local robot=$1 status=0
   shift
-  "$BIN/locclient" replay "$@" --server "$zenoh" --site demo --robot "$robot" --cache "$OUT/cache-$robot" \
-    --report "$OUT/$robot.json" --trajectory "$OUT/$robot.tum" --picture "$OUT/$robot.png"
+  nice "$BIN/locclient" replay "$@" --store "$OUT/store" --site demo --robot "$robot" \
+    --report "$OUT/$robot.json" --trajectory "$OUT/$robot.tum" --picture "$OUT/$robot.png" || status=$?
+  ((status == 0 || status == 6))
 }
 
 record() {
@@ -96,7 +124,9 @@ half_of() {
   [[ $("$BIN/python" deploy/demo_report.py has-truth "$1") == no ]] || truth=(--frame-from-ground-truth)
   build "$1" --frames 0::2 ${truth[@]+"${truth[@]}"}
   say "a robot localizes the other frames in it"
+  drive demo-robot "$1" 0
   replay demo-robot "$1" --frames 1::2
+  drives_ended
   reports=("$OUT/demo-robot.json")
 }
 
@@ -113,13 +143,17 @@ warehouse() {
   build "$OUT/survey.mcap" --frame-from-ground-truth
   say "the robots come home with their recordings"
   wait "$robots_pid" || { cat "$OUT/robots.log" >&2; fail "recording the robots failed"; }
-  say "${ROBOTS[*]} are localized in yesterday's map, side by side"
+  say "${ROBOTS[*]} drive in yesterday's map, in real time; meanwhile their recordings are replayed for the figures"
   reports=()
+  for robot in "${ROBOTS[@]}"; do
+    drive "$robot" "$OUT/$robot.mcap" 1
+  done
   for robot in "${ROBOTS[@]}"; do
     replay "$robot" "$OUT/$robot.mcap" >"$OUT/$robot.log" 2>&1 &
     replay_pids+=("$!")
     reports+=("$OUT/$robot.json")
   done
+  drives_ended
   for number in "${!ROBOTS[@]}"; do
     robot=${ROBOTS[$number]}
     wait "${replay_pids[$number]}" || { cat "$OUT/$robot.log" >&2; fail "$robot could not be localized"; }
@@ -128,9 +162,6 @@ warehouse() {
 }
 
 if [[ -n $recording ]]; then half_of "$recording"; else warehouse; fi
-
-say "what the server knows of the robots"
-"$BIN/python" deploy/demo_report.py robots "$http/v1/robots"
 
 say "the result"
 "$BIN/python" deploy/demo_report.py table "$OUT/build.json" "${reports[@]}"

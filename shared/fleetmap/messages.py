@@ -157,6 +157,10 @@ OFF_MAP = "off_map"
 """Flag of RobotHealth: the robot is not localised, and where it is the map has no tile."""
 
 
+NOT_LOCALISED = "not_localised"
+"""Flag of RobotHealth: the robot has driven 5 m, or 20 s at an unknown speed, without finding itself where the map may cover."""
+
+
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
     """A robot's report: status of the localization, raised flags, metrics by name.
 

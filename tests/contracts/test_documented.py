@@ -134,7 +134,7 @@ def test_nightly_report_keys_are_documented() -> None:
 
 
 def test_replay_report_keys_are_documented() -> None:
-    keys = set(METRICS) | {"aligned_error_m", "peak_rss_mb", "map_version", "failure_reports"}
+    keys = set(METRICS) | {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failure_reports"}
     assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Replay"))} == keys
 
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from locclient.identity import MapAddress
     from locclient.replay.run_viewer import RunViewer
 
+NOT_LOCALISED_STATUS = 6
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
@@ -106,7 +108,7 @@ def replay(
     ] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Fetch the site's map, localize every frame of a recording in it, and report the result."""
+    """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: it did not find itself."""
     settings = settings_of(context)
     address = replace(map_options.address(), version=version)
     if version is not None and address.store is None:
@@ -166,6 +168,9 @@ def _run(
                 if files.mcap is not None:
                     viewer.write_mcap(files.mcap)
             _print_table(report)
+    if result.search.is_lost_run:
+        typer.echo(result.search.words, err=True)
+        raise typer.Exit(NOT_LOCALISED_STATUS)
 
 
 def _viewer_address(playback: PlaybackOptions, files: ResultFiles, *, insecure: bool) -> "ViewerAddress | None":

@@ -127,6 +127,8 @@ class Runtime:
                 self._parts.robot.ring.finish()
                 self._parts.replays.work()
             _log.info("stopped: %s", self._health(is_silent=False))
+            if words := self._figures.search.words:
+                _log.warning("stopped: %s", words)
 
     # --- the thread that localizes ------------------------------------------------------------------------------------
 
@@ -164,7 +166,10 @@ class Runtime:
         if parts.fleet_manager is not None:
             held = frozenset(loaded.version for loaded in parts.robot.held)
             parts.fleet_manager.adapter.after_frame(outcome, held)
+        was_lost = self._figures.search.is_long
         self._figures.handle(outcome)
+        if self._figures.search.is_long != was_lost:
+            _log.warning("%s", "localised again" if was_lost else self._figures.search.words)
         self._shared.bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
+from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
@@ -46,6 +47,7 @@ class ServerSync:
         self._replay_at_s = 0.0
         self.follows = True  # the server's choice of a version; False: somebody else's, whom the server is told
         self.on_change: Callable[[VersionChange], None] = lambda _: None
+        self._refusals = LogLimit(_log)  # what stays as it is would fill the log
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
         self.client, self._outbox, self._retry_s = client, outbox, retry_s
         self._clock_s, self._wall_ns = clock_s, wall_ns
@@ -112,6 +114,8 @@ class ServerSync:
         self._learn_frame()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
+            words = "site %s has no published version at this server: publish one with `mapserver publish`, or correct [run] site"
+            self._refusals.warning("no version", words, wanted.site)
             return
         if not self.follows:
             running = None if self._running is None else self._running.version

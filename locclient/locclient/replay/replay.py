@@ -106,6 +106,8 @@ def replay(
         options.progress(number)
     if robot.ring is not None:
         robot.ring.finish()
+    result.search = reporter.figures.search
+    result.notes += [words] if (words := result.search.words) else []
     reporter.finish()
     if not truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())

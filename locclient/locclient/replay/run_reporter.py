@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, LinkError
-from fleetmap.messages import OFF_MAP, RobotHealth, encode_message
+from fleetmap.messages import encode_message
 from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.replay_delivery import ReplayQueue, deliver_replay_part
@@ -17,7 +17,7 @@ from locclient.maps.map_client import MapClient
 from locclient.replay.run_metrics import METRICS
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile, failure_report
-from locclient.robot.health_report import FixFigures
+from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome
 
 _HEALTH_EVERY_NS, _POSE_EVERY_NS = 1_000_000_000, 500_000_000
@@ -38,7 +38,7 @@ class RunReporter:
         self._outbox: Outbox | None = None
         self._replays: ReplayQueue | None = None
         self._replayed_bytes: dict[str, int] = {}
-        self._fixes = FixFigures()
+        self.figures = HealthFigures()
         self._health_ns = self._pose_ns = -(2**62)
         self._broken = False
         refused = "; ".join(f"tile {x},{y}: {reason}" for (x, y), reason in result.tiles.refused.items())
@@ -46,8 +46,9 @@ class RunReporter:
 
     def handle(self, outcome: Outcome) -> None:
         """Sends what is due after a frame, which stands in the result already."""
-        self._fixes.handle(outcome.estimate, outcome.dock_error_m, outcome.speed_mps)
+        self.figures.handle(outcome)
         if outcome.failure is not None:
+            self.figures.count_failure()
             self._report_failure(outcome.failure)
         if self._replays is not None:
             self._replays.work()
@@ -120,25 +121,23 @@ class RunReporter:
         return after["waiting"] > 0
 
     def _publish_health(self) -> None:
-        if self._connection.client is None or self._broken:
+        """As `locclient run`, and with the errors where there is a ground truth."""
+        client, result = self._connection.client, self._result
+        if client is None or self._broken:
             return
-        result, estimate, mapped = self._result, self._result.estimates[-1], self._result.frames[-1].may_be_mapped
-        figures: dict[str, float | int | str | bool | None] = {
-            name: value for name, value in result.report.items() if isinstance(value, int | float | str | bool)
+        more: dict[str, Figure] = {
+            "frames": len(result.frames),
+            "frames_dropped": 0,
+            "tiles_held": len(result.tiles.tiles),
+            "tiles_refused": len(result.tiles.refused),
+            "map_word_hours": client.word_hours,
         }
-        for group in ("error_m", "frame_ms"):
-            spread = METRICS[group](result.frames)
-            if isinstance(spread, dict):
-                figures.update({f"{group}_{name}": value for name, value in spread.items()})
-        health = RobotHealth(
-            site=self._connection.site,
-            robot=self._connection.robot,
-            stamp_ns=estimate.stamp_ns,
-            version=estimate.map_version,
-            status=estimate.status,
-            flags=(*(["tiles_refused"] if result.tiles.refused else []), *([] if mapped else [OFF_MAP])),
-            metrics=figures | self._fixes.take(),
-        )
+        errors = METRICS["error_m"](result.frames)
+        if isinstance(errors, dict):
+            more |= {f"error_m_{name}": value for name, value in errors.items()}
+        site, robot = self._connection.site, self._connection.robot
+        # Without a wall clock: the server then measures durations by the recording's stamps, however fast it is played.
+        health = self.figures.report(site, robot, None, more, silent=False)
         self._send(lambda to: to.publish_health(health))
 
     def _send(self, act: Callable[[MapClient], None]) -> None:

@@ -14,18 +14,20 @@ from locclient.localization.estimate import Estimate
 from locclient.maps.map_source import FetchedTiles
 from locclient.replay.plots import RunPlot, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
+from locclient.robot.search_way import SearchWay
 
 _MIN_ALIGNED = 3  # frames, below which a fit is not defined
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReplayResult:
     """A finished replay, one entry a frame: records, estimates, and the true pose of the body (4, 4), None where unknown.
 
     truth_in_map: whether the truth is of the frame `map`; else it is of a frame of its own, and errors are known after a fit alone.
 
     manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failure_reports: how many failures the
-    robot detected, and of their reports how many the server has and how many still wait for it.
+    robot detected, and of their reports how many the server has and how many still wait for it. search: how far the robot had driven at the
+    end without finding itself.
     """
 
     frames: list[FrameRecord]
@@ -36,6 +38,7 @@ class ReplayResult:
     notes: list[str] = field(default_factory=list)
     failure_reports: dict[str, int] = field(default_factory=lambda: {"detected": 0, "delivered": 0, "waiting": 0})
     truth_in_map: bool = True
+    search: SearchWay = field(default_factory=SearchWay)
 
     @property
     def stamps_ns(self) -> Stamps:
@@ -100,6 +103,7 @@ class ReplayResult:
         built["site"] = self.manifest.site
         built["tiles"] = len(self.tiles.tiles)
         built["tiles_refused"] = {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())}
+        built["not_localised_m"] = self.search.metres
         built["failure_reports"] = self.failure_reports
         built["notes"] = self.notes
         return built

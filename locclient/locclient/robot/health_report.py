@@ -6,9 +6,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleetmap.failure_definition import is_blind, radius_95_m
-from fleetmap.messages import OFF_MAP, Cause, RobotHealth, Status
+from fleetmap.messages import NOT_LOCALISED, OFF_MAP, Cause, RobotHealth, Status
 from locclient.localization.estimate import Estimate
 from locclient.robot.robot import Outcome
+from locclient.robot.search_way import SearchWay
 
 _RECENT = 300
 Figure = float | int | str | bool | None
@@ -69,6 +70,7 @@ class HealthFigures:
         self._first_frame_ms: float | None = None
         self._fixes = FixFigures()
         self.last: Outcome | None = None  # the last frame
+        self.search = SearchWay()
 
     def handle(self, outcome: Outcome) -> None:
         """Counts a frame."""
@@ -83,12 +85,15 @@ class HealthFigures:
         self._frames += self._first_fix_s is not None
         self._localised += estimate.status is Status.TRACKING
         self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
+        self.search.handle(estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
 
     def count_failure(self) -> None:
         """Counts a detected failure."""
         self._failures += 1
 
-    def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
+    def report(
+        self, site: str, robot: str, wall_ns: int | None, more: Mapping[str, Figure], silent: bool
+    ) -> RobotHealth:
         """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
         last = None if self.last is None else self.last.estimate
         flags: list[str] = [Cause.NO_FRAMES] if silent else []
@@ -109,6 +114,9 @@ class HealthFigures:
             flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []
             flags += [] if self.last is None or self.last.may_be_mapped else [OFF_MAP]
+            flags += [NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
+            flags += [Cause.NO_MAP] if last.map_version is None else []
+            figures["not_localised_m"] = self.search.metres
         return RobotHealth(
             site=site,
             robot=robot,

@@ -1,6 +1,8 @@
 """`locclient replay`: wrong orders end with 2, bad input with 3, each with what to do next, and before any work."""
 
+import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.map_samples import save_sample_draft
+from support.worlds import robot_world
 
 Said = pytest.CaptureFixture[str]
 
@@ -141,3 +144,19 @@ def test_files_that_cannot_be_written_are_told_before_the_work(
     if option == "--picture":
         assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "picture.txt") == 2
         assert option in capsys.readouterr().err
+
+
+def test_a_robot_of_another_building_says_so_and_ends_with_6(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said
+) -> None:
+    ride, report = robot_world.write(tmp_path / "ride", robot_world.bundles(120)), tmp_path / "report.json"
+    store = tmp_path / "store"
+    with MapStore.open(store, create=True) as maps:
+        robot_world.save(maps, of=tuple(replace(tile, descriptors=~tile.descriptors) for tile in robot_world.tiles()))
+    assert status(monkeypatch, "replay", ride, "--store", store, "--site", "room", "--report", report) == 6
+    words = "nothing in the map agrees with the pictures"
+    assert words in capsys.readouterr().err
+    found = json.loads(report.read_text())
+    assert found["localised_share_of_all"] == 0.0
+    assert found["not_localised_m"] > 5.0
+    assert [note for note in found["notes"] if words in note]

@@ -104,6 +104,8 @@ class _Link:
     def __init__(self) -> None:
         self.told: list[RobotHealth] = []
 
+    word_hours = 0.5
+
     def publish_health(self, health: RobotHealth) -> None:
         self.told.append(health)
 
@@ -134,3 +136,9 @@ def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
     assert (sum(s.docks for s in sums), sum(s.docks_wrong for s in sums), sum(s.jumps for s in sums)) == (1, 1, 1)
     assert sum(s.landmarks_expected for s in sums) == 40 * 50
     assert sum(s.landmarks_seen for s in sums) == 40 * 40
+    own = HealthFigures()
+    own.handle(outcome)
+    as_run, last = own.report(robot_world.SITE, "r1", 5, {}, False), link.told[-1]
+    assert last.flags == as_run.flags
+    assert set(as_run.metrics) <= set(last.metrics), "what `run` tells, a replay tells"
+    assert (last.metrics["exposure"], last.metrics["sharpness"]) == (said.image.exposure, said.image.sharpness)
