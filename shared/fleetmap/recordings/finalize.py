@@ -9,7 +9,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
 from fleetmap.recordings.images import is_mosaic
-from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.ordering import ReadLog, check_together
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
@@ -53,6 +53,8 @@ def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
     period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     smooth = max(1, round(_SMOOTH_S / period_s))
     window = max(2, round(_WINDOW_S / period_s))
+    if len(imu) <= window + 2 * smooth:
+        return np.zeros(0)
     kernel = np.ones(smooth) / smooth
     accel = np.stack([np.convolve(column, kernel, "same") for column in imu.accel_mps2.T], axis=1)
     usable = np.abs(np.linalg.norm(accel, axis=1) - 9.81) < 1.0
@@ -127,6 +129,16 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         )
     if len(cameras) > count and not parts.has_depth:
         log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {count}")
+    wheel_ns, prior_ns = (np.array([v.stamp_ns for v in values], np.int64) for values in (parts.wheel, parts.priors))
+    truth_ns = np.zeros(0, np.int64) if parts.ground_truth is None else parts.ground_truth.stamps_ns
+    streams = {
+        "imu": parts.imu.stamps_ns,
+        "wheel odometry": wheel_ns,
+        "position priors": prior_ns,
+        "ground truth": truth_ns,
+    }
+    for what, stamps_ns in streams.items():
+        check_together(stamps_ns, what, parts.frame_stamps_ns)
     imu = parts.imu
     if len(imu) and parts.calibration.imu is None:
         how = "no calibration says how the IMU is mounted; pass one with --calibration FILE"

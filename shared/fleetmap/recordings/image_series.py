@@ -12,6 +12,7 @@ from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_onl
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
+_DAY_NS = 86_400_000_000_000
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,14 @@ class ImageSeries(Generic[T]):
         return ImageSeries(self.stamps_ns[indices], tuple(self.sources[int(i)] for i in indices))
 
     def forward(self, what: str, log: ReadLog) -> "ImageSeries[T]":
-        """Those whose stamps increase, as `forward_only`."""
-        return self.take(np.flatnonzero(forward_only(self.stamps_ns, what, log)))
+        """Those whose stamps increase, as `forward_only`; where days lie between them, those of the largest part."""
+        kept = np.flatnonzero(forward_only(self.stamps_ns, what, log))
+        parts = np.split(kept, np.flatnonzero(np.diff(self.stamps_ns[kept]) > _DAY_NS) + 1)
+        largest = max(parts, key=len)
+        if len(parts) > 1:
+            detail = f"{len(kept) - len(largest)} of {len(kept)} left out, more than a day from the others; was the clock set?"
+            log.note(f"{what}: stamps far apart", detail)
+        return self.take(largest)
 
 
 def pair_images(

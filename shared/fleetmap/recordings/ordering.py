@@ -20,6 +20,15 @@ DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not 
 # Of recordings whose stamps nobody took when the images were exposed
 UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's, which no exposure set and no other sensor shares")
 V = TypeVar("V")
+UNITS = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}  # by the nanoseconds in each
+_FINER = {1_000: "milliseconds", 1_000_000: "microseconds", 1_000_000_000: "nanoseconds"}  # by how many are in a second
+_SHORTEST_NS = {"imu": 100_000}  # between values in the median: no inertial sensor has more than 10 kHz
+_SHORTEST_OTHER_NS, _LONGEST_NS = (
+    500_000,
+    20_000_000_000,
+)  # no camera or odometry has more than 2 kHz or less than 0.05 Hz
+_EPOCH_NS = (9e17, 5e18)  # 1998 to 2128
+_FEWEST = 10  # values whose steps tell a unit
 
 
 @dataclass(slots=True)
@@ -59,8 +68,10 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
     """(N,) mask of a longest strictly increasing subsequence; the other stamps are noted in `log`.
 
     Stamps are never sorted: values that arrive out of order carry stamps that cannot be trusted. One stamp far in the
-    future costs itself, not all that follow. RecordingError where more than half would be left out.
+    future costs itself, not all that follow. RecordingError where more than half would be left out, and for stamps of
+    another unit.
     """
+    _check_steps(stamps_ns, what)
     steps = np.diff(stamps_ns)
     odd = np.flatnonzero(steps <= 0)
     if len(odd) == 0:
@@ -87,6 +98,64 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
         )
         raise RecordingError(f"{what}: {fault}")
     return kept
+
+
+def _check_steps(stamps_ns: Stamps, what: str) -> None:
+    """RecordingError for stamps whose median step no such sensor has, with the unit that they look like."""
+    if len(stamps_ns) < _FEWEST:
+        return
+    steps, shortest = np.diff(stamps_ns), _SHORTEST_NS.get(what, _SHORTEST_OTHER_NS)
+    step = int(np.median(steps[steps > 0])) if (steps > 0).any() else 0
+    middle = float(np.median(stamps_ns))
+    if step < shortest:
+        by_date = [ns for ns in UNITS if _EPOCH_NS[0] < middle * ns < _EPOCH_NS[1]]
+        for ns in by_date or [ns for ns in UNITS if step * ns >= shortest]:
+            why = f"as nanoseconds they are {step * 1e-9:.9f} s apart"
+            raise wrong_unit(what, UNITS[ns], why, f"multiply them by {ns}")
+    if step > _LONGEST_NS and what != "position priors":
+        finer = next((ns for ns in UNITS if step / ns < _LONGEST_NS), 1_000_000_000)
+        why = f"they are {step * 1e-9:.0f} s apart"
+        raise wrong_unit(what, f"{_FINER[finer]} that were read as seconds", why, f"divide them by {finer}")
+
+
+def check_seconds(value: float, where: str) -> None:
+    """RecordingError for what is too large for seconds since 1970, with the unit that it looks like."""
+    for ns, unit in _FINER.items():
+        if 1e10 < abs(value) < 1e11 * ns or (abs(value) > 1e10 and ns == 1_000_000_000):
+            raise wrong_unit(f"{where}:", unit, f"{value:.0f} is no time in seconds", f"divide them by {ns}")
+
+
+def check_together(stamps_ns: Stamps, what: str, frame_stamps_ns: Stamps) -> None:
+    """RecordingError where the stamps cover other times than the frames, and the same in another unit."""
+    if not len(stamps_ns) or not len(frame_stamps_ns) or _overlap(stamps_ns, 1, frame_stamps_ns):
+        return
+    for ns, unit in UNITS.items():
+        if _overlap(stamps_ns, ns, frame_stamps_ns):
+            raise wrong_unit(
+                what, unit, f"from {stamps_ns[0]}, the images' from {frame_stamps_ns[0]}", f"multiply them by {ns}"
+            )
+        if _overlap(frame_stamps_ns, ns, stamps_ns):
+            raise wrong_unit(
+                "images",
+                unit,
+                f"from {frame_stamps_ns[0]}, those of {what} from {stamps_ns[0]}",
+                f"multiply them by {ns}",
+            )
+
+
+def wrong_unit(what: str, unit: str, why: str, remedy: str) -> RecordingError:
+    """The error of stamps that are in another unit than they should be."""
+    name = what.replace("imu", "IMU")
+    return RecordingError(
+        f"{name} stamps look like {unit}: {why}; {remedy} where they are written, or leave this sensor out"
+    )
+
+
+def _overlap(stamps_ns: Stamps, factor: int, others_ns: Stamps) -> bool:
+    """Whether at least half of the shorter time is in the other, the stamps multiplied by `factor`."""
+    first, last = int(stamps_ns[0]) * factor, int(stamps_ns[-1]) * factor
+    begin, end = int(others_ns[0]), int(others_ns[-1])
+    return 2 * (min(last, end) - max(first, begin)) >= min(last - first, end - begin)
 
 
 def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.recordings import StoredFrame
+from fleetmap.recordings.ordering import UNITS, wrong_unit
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 
@@ -62,8 +63,14 @@ class Intake:
         self._finished = self._forget = False
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted."""
+        """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted.
+
+        RecordingError for a stamp in another unit than the IMU's.
+        """
         with self._changed:
+            _check_unit("images'", frame.stamp_ns, self._last_imu_ns)
+            if _coarser_unit(self._last_imu_ns, frame.stamp_ns):
+                self._imu, self._last_imu_ns = _ImuQueue(), -(2**62)
             if frame.stamp_ns <= self._last_frame_ns:
                 self.counts.frames_disordered += 1
                 return
@@ -76,8 +83,13 @@ class Intake:
             self._changed.notify_all()
 
     def put_imu(self, samples: ImuSamples) -> None:
-        """Inertial samples; what is not finite, absurd or not newer is refused and counted."""
+        """Inertial samples; what is not finite, absurd or not newer is refused and counted.
+
+        RecordingError for stamps in another unit than the frames'.
+        """
         with self._changed:
+            if len(samples):
+                _check_unit("imu", int(samples.stamps_ns[-1]), self._last_frame_ns)
             values = np.hstack([samples.gyro_radps, samples.accel_mps2])
             possible = np.asarray((np.abs(values) < _ABSURD).all(axis=1))
             for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
@@ -93,8 +105,9 @@ class Intake:
             self._changed.notify_all()
 
     def put_wheel(self, sample: WheelSample) -> None:
-        """Wheel odometry."""
+        """Wheel odometry; RecordingError for a stamp in another unit than the frames'."""
         with self._changed:
+            _check_unit("wheel odometry", sample.stamp_ns, self._last_frame_ns)
             self._wheel.append(sample)
             del self._wheel[:-1000]
 
@@ -154,3 +167,13 @@ class Intake:
     def _imu_is_there(self) -> bool:
         """Up to the oldest frame, which may be another one than when the wait began."""
         return self._finished or self._last_imu_ns >= self._frames[0].stamp_ns + self._offset_ns
+
+
+def _coarser_unit(stamp_ns: int, other_ns: int) -> int | None:
+    """The nanoseconds in the unit in which a stamp is another sensor's, to 1 %; None for nanoseconds and where none fits."""
+    return next((ns for ns in UNITS if stamp_ns > 0 and abs(stamp_ns * ns - other_ns) < 0.01 * other_ns), None)
+
+
+def _check_unit(what: str, stamp_ns: int, other_ns: int) -> None:
+    if ns := _coarser_unit(stamp_ns, other_ns):
+        raise wrong_unit(what, UNITS[ns], f"{stamp_ns} beside {other_ns} of another sensor", f"multiply them by {ns}")

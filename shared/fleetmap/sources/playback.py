@@ -10,6 +10,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.replay_source import ReplaySource
 
 _ROOM_WAIT_S = 0.1
+_LONGEST_GAP_S = 10.0  # between frames: a longer one, of days where a clock was set, is not waited for
 
 
 class RecordingSource:
@@ -23,9 +24,12 @@ class RecordingSource:
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         """See Source."""
-        begun_s, first_ns = self._clock_s(), self._source.recorded_stamp_ns(0)
+        begun_s, recorded_s = self._clock_s(), 0.0
         for number, imu in enumerate(self._source.imu_before_each()):
-            if wait(self._ahead_s(number, first_ns, begun_s)):
+            if number:
+                gap_ns = self._source.recorded_stamp_ns(number) - self._source.recorded_stamp_ns(number - 1)
+                recorded_s += min(gap_ns * 1e-9, _LONGEST_GAP_S)
+            if wait(self._ahead_s(recorded_s, begun_s)):
                 return
             while not self._speed and not intake.wait_for_room(_ROOM_WAIT_S):
                 if wait(0.0):
@@ -44,8 +48,5 @@ class RecordingSource:
         """See Source."""
         self._recording.close()
 
-    def _ahead_s(self, number: int, first_ns: int, begun_s: float) -> float:
-        if not self._speed:
-            return 0.0
-        recorded_s = (self._source.recorded_stamp_ns(number) - first_ns) * 1e-9
-        return max(0.0, recorded_s / self._speed - (self._clock_s() - begun_s))
+    def _ahead_s(self, recorded_s: float, begun_s: float) -> float:
+        return max(0.0, recorded_s / self._speed - (self._clock_s() - begun_s)) if self._speed else 0.0

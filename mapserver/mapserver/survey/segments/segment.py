@@ -94,6 +94,9 @@ class SegmentSurvey:
 
 def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
     """Segments of equal time, at least as long as the settings say; a single one of what is too short to be cut."""
+    if settings.seconds and len(stamps_ns):  # a gap, of days where a clock was set, is not cut into segments
+        steps_ns = np.minimum(np.diff(stamps_ns), int(settings.seconds * 1e9))
+        stamps_ns = stamps_ns[0] + np.concatenate([[0], np.cumsum(steps_ns)])
     seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
     count = int(seconds / settings.seconds) if settings.seconds else 1
     last = len(stamps_ns) - 1

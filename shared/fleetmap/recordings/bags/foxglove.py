@@ -130,7 +130,10 @@ def _message_class(channel: Channel) -> Any:
 
 
 def _stamp_ns(message: Message) -> int:
-    return int(message.timestamp.seconds) * 1_000_000_000 + int(message.timestamp.nanos)
+    stamp_ns = int(message.timestamp.seconds) * 1_000_000_000 + int(message.timestamp.nanos)
+    if abs(stamp_ns) >= 2**63:
+        raise ValueError(f"a stamp of {message.timestamp.seconds} s is beyond 64 bits of nanoseconds")
+    return stamp_ns
 
 
 def _xyz(vector: Message) -> tuple[float, float, float]:

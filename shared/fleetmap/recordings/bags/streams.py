@@ -42,6 +42,7 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from fleetmap.sensors.source_settings import Topics
 
+_LAST_NS = 2**63 - 1  # MCAP's times have a bit more
 _SAME_LENS = 0.02  # of the focal length
 V = TypeVar("V")
 _RECTIFIED = re.compile(
@@ -229,7 +230,7 @@ def _collect(container: Container, topics: Topics) -> tuple[dict[int, _Stream], 
         if type_name(channel) in IMAGE_TYPES:
             if _takes_image(stream, data, f"{container.path}: {channel.topic}"):
                 container.keep(0)
-                stream.log_times_ns.append(log_time_ns)
+                stream.log_times_ns.append(min(log_time_ns, _LAST_NS))
                 stream.places.append(place)
             continue
         if type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"):
@@ -239,7 +240,7 @@ def _collect(container: Container, topics: Topics) -> tuple[dict[int, _Stream], 
             stream.has_lens = _is_lens(stream, bytes(data))
             stream.messages, stream.log_times_ns = [], []
         container.keep(len(data))
-        stream.log_times_ns.append(log_time_ns)
+        stream.log_times_ns.append(min(log_time_ns, _LAST_NS))
         stream.messages.append(bytes(data))
     return streams, list(unused.values())
 

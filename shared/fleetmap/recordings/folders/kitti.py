@@ -11,7 +11,7 @@ from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, exis
 from fleetmap.recordings.folders.table_files import natural_key
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import decode_grey
-from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
@@ -62,7 +62,9 @@ def _stamps(path: Path, log: ReadLog) -> Stamps | None:
     if not file.is_file():
         return None
     log.files.append(file)
-    return np.round(_table(file, (1,))[:, 0] * 1e9).astype(np.int64)
+    seconds = _table(file, (1,))[:, 0]
+    check_seconds(float(np.abs(seconds).max(initial=0.0)), str(file))
+    return np.round(seconds * 1e9).astype(np.int64)
 
 
 def _stamp(number: int, stamps_of_number: Stamps | None, path: Path) -> int:

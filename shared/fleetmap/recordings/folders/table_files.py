@@ -9,17 +9,20 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows
+from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, wrong_unit
 from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+
+_LAST_NS = 2**63 - 1
 
 
 def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
     """Stamps (N,) in ns and values (N, columns) of a text table.
 
     A line holds an integer and then numbers, separated by commas or blanks; # begins a comment. Lines that are no such
-    row (a file cut off in the middle of one) are noted in `log`; RecordingError where no line is.
+    row (a file cut off in the middle of one) are noted in `log`; RecordingError where no line is, and for stamps with
+    decimals.
     """
     text = _read_text(path).replace(",", " ")
     dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (columns,))])
@@ -30,6 +33,8 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
     except ValueError:
         table = _read_rows_singly(path, text, dtype, log)
     if len(table) == 0:
+        first = next((words[0] for line in text.splitlines() if (words := line.partition("#")[0].split())), "")
+        _check_whole(first, str(path))
         raise RecordingError(f"{path} holds no row of a stamp in ns and {columns} numbers; the recording is incomplete")
     log.files.append(path)
     return table["stamp_ns"], table["values"]
@@ -55,11 +60,25 @@ def read_name_table(path: Path) -> tuple[Stamps, list[str]]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdigit() or not name.strip():
+        _check_whole(stamp.strip(), f"{path}, line {number}")
+        if not stamp.strip().isdecimal() or not name.strip() or int(stamp) > _LAST_NS:
             raise RecordingError(f"{path}, line {number}: {line[:60]!r} is no stamp in ns, a comma and a file name")
         stamps.append(int(stamp))
         names.append(check_inside(name.strip(), f"{path}, line {number}"))
     return np.array(stamps, np.int64), names
+
+
+def _check_whole(word: str, where: str) -> None:
+    """RecordingError for a number with a decimal point or exponent where a whole number of ns is expected."""
+    try:
+        value = float(word)
+    except ValueError:
+        return
+    if word.lstrip("+-").isdecimal() or not np.isfinite(value):
+        return
+    names = {1e17: "nanoseconds that a program rounded", 1e14: "microseconds", 1e11: "milliseconds", 0.0: "seconds"}
+    unit = next(name for least, name in names.items() if abs(value) >= least)
+    raise wrong_unit(f"{where}:", unit, f"{word[:40]} is no whole number", "write all digits of the nanoseconds")
 
 
 def check_inside(name: str, where: str) -> str:
@@ -94,8 +113,8 @@ def _read_rows_singly(path: Path, text: str, dtype: "np.dtype[np.void]", log: Re
         try:
             stamp, values = int(words[0]), [float(word) for word in words[1 : columns + 1]]
         except ValueError:
-            values = []
-        if len(values) == columns:
+            stamp, values = 0, []
+        if len(values) == columns and abs(stamp) <= _LAST_NS:
             rows.append((stamp, values))
         else:
             bad += 1

@@ -9,7 +9,7 @@ from fleetmap.recordings.calibration_files import load_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize
 from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, paired_cameras
 from fleetmap.recordings.folders.table_files import natural_key, read_ground_truth, read_imu
-from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.tum import check_table
 
@@ -70,6 +70,7 @@ def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
 def _stamp_ns(seconds: str, where: Path) -> int:
     """Nanoseconds of a decimal number of seconds, without rounding it to a float on the way."""
     whole, _, part = seconds.partition(".")
-    if not whole.isdigit() or (part and not part.isdigit()):
+    if not whole.isdecimal() or (part and not part.isdecimal()):
         raise RecordingError(f"{where}: {seconds!r} is no time in seconds; copy the recording again")
+    check_seconds(float(whole), str(where))
     return int(whole) * 1_000_000_000 + int(part[:9].ljust(9, "0"))

@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little endian
@@ -93,8 +94,13 @@ class CdrWriter:
         return self._pack("<f", 4, value)
 
     def time(self, stamp_ns: int) -> "CdrWriter":
-        """builtin_interfaces/Time."""
+        """builtin_interfaces/Time; RecordingError for a stamp that it cannot hold."""
         seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        if not 0 <= seconds < 2**31:
+            raise RecordingError(
+                f"the stamp {stamp_ns} ns is not within 1970 to 2038, as ROS 2 writes it; set the sensor's clock, or leave "
+                "out these values"
+            )
         return self._pack("<i", 4, seconds).unsigned(nanoseconds)
 
     def header(self, stamp_ns: int, frame_id: str) -> "CdrWriter":

@@ -1,0 +1,126 @@
+"""Stamps in another unit are refused by its name, and no stamp costs more than the values there are."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import open_recording
+from fleetmap.recordings.finalize import gravity_direction_errors_rad
+from fleetmap.recordings.ordering import ReadLog, forward_only
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
+from fleetmap.sources.intake import Intake
+from mapserver.survey.segments.segment import planned
+from mapserver.survey.settings import SegmentSettings
+from support.recordings import mcap_samples
+from support.recordings.bag_samples import write_rosbag1, write_rosbag2
+from support.recordings.recording_samples import make_sample, write_euroc, write_tumvi
+
+SAMPLE = make_sample(12)
+YEAR_NS = 365 * 86_400 * 10**9
+
+
+def messages(topic: str, factor: float, monkeypatch: pytest.MonkeyPatch) -> list[mcap_samples.Message]:
+    """The sample as ROS messages, the header's stamps of one topic multiplied by a factor."""
+    monkeypatch.setattr(mcap_samples, "SAMPLE", SAMPLE)
+    imu = ImuSamples(SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2)
+    monkeypatch.setattr(mcap_samples, "IMU", imu)
+    found = []
+    for name, kind, stamp_ns, data in mcap_samples.foreign_messages():
+        written = data
+        if topic in name:
+            written = data[:4] + struct.pack("<iI", *divmod(int(stamp_ns * factor), 10**9)) + data[12:]
+        found.append((name, kind, stamp_ns, written))
+    return found
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "microseconds"), (1e-6, "milliseconds"), (1e-9, "seconds")])
+@pytest.mark.parametrize(
+    ("topic", "what"), [("imu0", "IMU"), ("cam0/image_raw", "left images"), ("image_raw", "images")]
+)
+def test_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topic: str, what: str, factor: float, unit: str
+) -> None:
+    """An IMU in microseconds took half a minute to read, one in milliseconds hours."""
+    found = messages(topic, factor, monkeypatch)
+    paths = [write_rosbag1(tmp_path / "a.bag", found), write_rosbag2(tmp_path / "b", found)]
+    for path in [*paths, mcap_samples.write_foreign(tmp_path / "c.mcap", found)]:
+        with pytest.raises(RecordingError, match=f"{what} stamps look like {unit}.*multiply"):
+            open_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "unit"),
+    [
+        ("{0:.6f}", "seconds"),
+        ("{us}", "microseconds"),
+        ("{ms}", "milliseconds"),
+        ("{us}.25", "microseconds"),
+        ("{ns:.17e}", "nanoseconds"),
+        ("nan", "nan"),
+        ("99999999999999999999", "no|holds no"),
+    ],
+)
+@pytest.mark.parametrize("table", ["imu0", "cam0"])
+def test_tables(tmp_path: Path, table: str, stamp: str, unit: str) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    file = folder / f"mav0/{table}/data.csv"
+    head, *rows = file.read_text().splitlines()
+    lines = [head]
+    for row in rows:
+        ns, _, rest = row.partition(",")
+        written = stamp.format(int(ns) * 1e-9, ns=float(ns), us=int(ns) // 1000, ms=int(ns) // 10**6)
+        lines.append(f"{written},{rest}")
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match=unit):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(10**3, "milliseconds"), (10**6, "microseconds"), (10**9, "nanoseconds")])
+def test_tables_of_seconds(tmp_path: Path, factor: int, unit: str) -> None:
+    folder = write_tumvi(tmp_path / "r", SAMPLE)
+    for number in (0, 1):
+        times = folder / f"cam{number}/times.txt"
+        names = [row.split()[0] for row in times.read_text().splitlines()[1:]]
+        times.write_text("\n".join(f"{name} {int(name) * factor // 10**9} 1.5" for name in names))
+    with pytest.raises(RecordingError, match=unit):
+        open_recording(folder)
+
+
+def test_work_is_bounded_whatever_stamps_say(tmp_path: Path) -> None:
+    """A decade between two frames, and a rate that no sensor has: no step is taken for each second or sample of them."""
+    count = 3000
+    imu = ImuSamples(np.arange(count) * 5, np.zeros((count, 3)), np.tile([0, 0, 9.81], (count, 1)))
+    assert len(gravity_direction_errors_rad(imu, 1.0)) == 0
+    for stamps_ns in (np.array([0, 1, 170 * YEAR_NS]), np.array([-100 * YEAR_NS, 0, 100 * YEAR_NS])):
+        assert len(planned(stamps_ns, SegmentSettings(seconds=60.0))) <= 3
+        assert forward_only(stamps_ns, "imu", ReadLog()).all()
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    for number in (0, 1):
+        file = folder / f"mav0/cam{number}/data.csv"
+        *rows, last = file.read_text().splitlines()
+        file.write_text("\n".join([*rows, f"{int(SAMPLE.stamps_ns[-1]) + 170 * YEAR_NS},{last.partition(',')[2]}"]))
+    recording = open_recording(folder)
+    assert len(recording) == len(SAMPLE.stamps_ns) - 1
+    assert any("more than a day" in issue.detail for issue in recording.issues)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(10**3, "microseconds"), (10**6, "milliseconds"), (10**9, "seconds")])
+def test_a_live_source(factor: int, unit: str) -> None:
+    now_ns = 1_700_000_000_123_456_789
+    intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=0.1)
+    early, late = (
+        ImuSamples(np.array([ns // factor]), np.zeros((1, 3)), np.zeros((1, 3))) for ns in (now_ns, now_ns + 10**9)
+    )
+    intake.put_imu(early)
+    intake.put_frame(CameraFrame(now_ns + 5, np.zeros((4, 4), np.uint8)))
+    for put, value in (
+        (intake.put_imu, late),
+        (intake.put_wheel, WheelSample(now_ns // factor, np.zeros(3), 0.0, 0.1, 0.1)),
+    ):
+        with pytest.raises(RecordingError, match=f"look like {unit}"):
+            put(value)  # type: ignore[operator]
+    intake.finish()
+    assert len(intake.take(1.0).imu) == 0
