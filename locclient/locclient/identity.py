@@ -7,6 +7,7 @@ identity.json  site, robot and endpoint
 """
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -46,8 +47,9 @@ class RobotIdentity:
     @classmethod
     def load(cls, folder: Path) -> Self | None:
         """The identity in a folder, None where the robot is not enrolled; UsageError where it cannot be read."""
-        if not (folder / "robot.pem").is_file():
-            return None
+        with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
+            if not (folder / "robot.pem").is_file():
+                return None
         with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
             data = (folder / "identity.json").read_bytes()
         try:
@@ -133,7 +135,8 @@ class RobotIdentity:
         # Before the certificate: with it the robot may meet a server that another authority signed.
         self._write("servers.ca", answer.servers.encode())
         self._write("robot.pem", key + answer.certificate.encode())
-        (self.folder / "next.pem").unlink(missing_ok=True)
+        with suppress(OSError):  # a key that has a certificate is not asked for again
+            (self.folder / "next.pem").unlink()
 
     def _next_key(self, old: bytes) -> bytes:
         from fleetmap.trust import enrolment

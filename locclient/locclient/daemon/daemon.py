@@ -117,7 +117,9 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             imu_wait_s=run.imu_wait_s,
         )
         outbox_file = configured_outbox(run, site, name)
-        outbox = Outbox(outbox_file, max_bytes=run.spool_bytes)
+        outbox = Outbox(outbox_file, max_bytes=run.spool_bytes, is_needed=False)
+        if outbox.fault:
+            _log.error("failures are not kept: %s", outbox.fault)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
         begun_s = time.monotonic()
@@ -160,7 +162,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         profile = RobotProfile(site, name, *mounting, config.localizer, *clock, pictures=run.replays)
         replays: ReplayQueue | None = None
         if server is not None and keeps_replay:
-            server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes)
+            server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes, is_needed=False)
             replays = ReplayQueue(server.replays, profile, run.replays)
         yield RuntimeParts(
             profile=profile,

@@ -6,11 +6,12 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from fleetmap.errors import FleetmapError, LinkError, RecordingError
+from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sources.intake import Intake
@@ -86,7 +87,7 @@ class Runtime:
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
-        self._cache_faults = 0
+        self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
         self._fetched_again: set[str] = set()
         self._shown_grid: WantedVersion | None = None
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
@@ -201,7 +202,8 @@ class Runtime:
 
     def _health(self, is_silent: bool) -> RobotHealth:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
-        spool = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
+        with suppress(StoreError):  # the thread of the disk or of the network says so
+            self._outbox_counts = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
         tiles = {
             "tiles_held": sum(len(loaded.tiles) for loaded in self._parts.robot.held),
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
@@ -209,7 +211,7 @@ class Runtime:
         }
         server = self._parts.server
         word: dict[str, Figure] = {} if server is None else {"map_word_hours": server.client.word_hours}
-        profile, more = self._parts.profile, {**counts, **spool, **tiles, **word}
+        profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles, **word}
         return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, is_silent)
 
     def _count_cache_faults(self) -> int:

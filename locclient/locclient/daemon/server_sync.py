@@ -44,7 +44,7 @@ class ServerSync:
         """retry_s: when a postponed version is offered again. upkeep: called once an hour; what it refuses goes into the log."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self._replayed_bytes: dict[str, int] = {}
-        self._replay_at_s = 0.0
+        self._replay_at_s = self._deliver_at_s = 0.0
         self.follows = True  # the server's choice of a version; False: somebody else's, whom the server is told
         self.on_change: Callable[[VersionChange], None] = lambda _: None
         self._refusals = LogLimit(_log)  # what stays as it is would fill the log
@@ -81,8 +81,7 @@ class ServerSync:
             return
         try:
             self._publish_health()
-            if not deliver(self.client, self._outbox):
-                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
+            self._deliver(now_s)
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
@@ -206,11 +205,28 @@ class ServerSync:
 
     # --- reports ------------------------------------------------------------------------------------------------------
 
+    def _deliver(self, now_s: float) -> None:
+        """A spool that cannot be read or written holds up neither maps nor health."""
+        if now_s < self._deliver_at_s:
+            return
+        try:
+            if not deliver(self.client, self._outbox):
+                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
+        except StoreError as error:
+            self._deliver_at_s = now_s + _MAX_BACKOFF_S
+            _log.warning("reports of failures wait: %s", error)
+
     def _send_replay(self, now_s: float) -> None:
         """A part of a recording, at most one in a second, while no report waits and no version is fetched."""
-        if self.replays is None or now_s < self._replay_at_s or self._outbox.waiting():
+        if self.replays is None or now_s < self._replay_at_s:
             return
-        goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+        goes_on = False
+        try:
+            if self._outbox.waiting():
+                return
+            goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+        except StoreError as error:
+            _log.warning("recordings of failures wait: %s", error)
         self._replay_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
 
     def _publish_health(self) -> None:

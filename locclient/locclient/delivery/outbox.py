@@ -32,11 +32,24 @@ class Outbox:
     anew: a robot that cannot report must still drive. For any thread; each call opens the file for itself.
     """
 
-    def __init__(self, path: Path, *, max_bytes: int) -> None:
-        """Makes the file and its folder; raises StoreError where that is not possible."""
+    def __init__(self, path: Path, *, max_bytes: int, is_needed: bool = True) -> None:
+        """Makes the file and its folder; raises StoreError where that is not possible.
+
+        is_needed: False keeps the reason in `fault` instead, and tries again at each call.
+        """
         self._path = path
         self._max_bytes = max_bytes
         self.set_aside: Path | None = None
+        self._is_made, self.fault = False, ""
+        try:
+            self._make()
+        except StoreError as error:
+            if is_needed:
+                raise
+            self.fault = str(error)
+
+    def _make(self) -> None:
+        path = self._path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -47,8 +60,9 @@ class Outbox:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:
-            reason = f"the spool {path} cannot be used ({error}); choose another file with [run] spool"
+            reason = f"the spool {path} cannot be used ({error}); check the disk and whose file it is, or choose another with [run] spool"
             raise StoreError(reason) from error
+        self._is_made, self.fault = True, ""
 
     def put(self, report: QueuedReport) -> None:
         """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""
@@ -58,7 +72,7 @@ class Outbox:
 
     def waiting(self, limit: int = 1) -> list[QueuedReport]:
         """The oldest reports."""
-        with self._transaction() as database:
+        with self._transaction("DEFERRED") as database:
             rows = database.execute("SELECT id, payload FROM report ORDER BY number LIMIT ?", (limit,)).fetchall()
         return [QueuedReport(*row) for row in rows]
 
@@ -72,7 +86,7 @@ class Outbox:
 
     def counts(self) -> dict[str, int]:
         """`waiting` now; `delivered`, `dropped` for want of room and `refused` (damaged ones among them) since the file was made."""
-        with self._transaction() as database:
+        with self._transaction("DEFERRED") as database:
             known = dict(database.execute("SELECT name, value FROM count").fetchall())
             waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]
         return {"waiting": waiting, **{name: known.get(name, 0) for name in ("delivered", "dropped", "refused")}}
@@ -121,10 +135,12 @@ class Outbox:
         return database
 
     @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
+    def _transaction(self, kind: str = "IMMEDIATE") -> Iterator[sqlite3.Connection]:
+        if not self._is_made:
+            self._make()
         try:
             with closing(self._open()) as database:
-                database.execute("BEGIN IMMEDIATE")
+                database.execute(f"BEGIN {kind}")
                 try:
                     yield database
                 except BaseException:
@@ -132,4 +148,6 @@ class Outbox:
                     raise
                 database.execute("COMMIT")
         except sqlite3.Error as error:
-            raise StoreError(f"the spool {self._path} refused ({error}); is its disk full or damaged?") from error
+            raise StoreError(
+                f"the spool {self._path} refused ({error}); is its disk full, read-only or damaged?"
+            ) from error

@@ -4,6 +4,7 @@ import os
 import secrets
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -59,18 +60,25 @@ class TileCache:
         return sum(self._sizes.values())
 
     def get(self, sha256: str) -> bytes | None:
-        """The bytes of an address; None where they are not here. Damaged ones are removed, which is a fault."""
+        """The bytes of an address; None where they are not here or cannot be read. Damaged ones are removed. Both are faults."""
         path = self._path(sha256)
         try:
             data = verified(path.read_bytes(), sha256)
-            os.utime(path)
         except FileNotFoundError:
             self._sizes.pop(sha256, None)
             return None
-        except (OSError, MapFormatError) as error:
+        except OSError as error:  # the bytes may be good
+            self._sizes.pop(sha256, None)
+            self._note(f"{path} cannot be read ({error.strerror}); check the disk and whose file it is")
+            return None
+        except MapFormatError as error:
             self._note(f"cached {sha256} cannot be used and was removed: {error}")
             self._remove(sha256)
             return None
+        with suppress(
+            OSError
+        ):  # a disk that cannot be written, or another account's file: good to read, and never evicted
+            os.utime(path)
         # Dictionaries keep their order: last used is last.
         self._sizes[sha256] = self._sizes.pop(sha256, len(data))
         return data
@@ -103,7 +111,7 @@ class TileCache:
                 f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
-        if not self._write(self._active_path(site), to_json(record)):
+        if record != self._active.get(site) and not self._write(self._active_path(site), to_json(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
         self._reserved.pop(site, None)
@@ -170,11 +178,13 @@ class TileCache:
     def _scan(self) -> dict[str, int]:
         found = []
         for leftover in (*self._folder.glob("*/*/.*.tmp"), *self._folder.glob("sites/*/kept/.*.tmp")):
-            leftover.unlink(missing_ok=True)  # by a process that died while writing
+            with suppress(OSError):
+                leftover.unlink()  # by a process that died while writing
         for path in self._folder.glob("blobs/??/*"):
-            if len(path.name) == 64:
-                status = path.stat()
-                found.append((status.st_mtime_ns, path.name, status.st_size))
+            with suppress(OSError):
+                if len(path.name) == 64:
+                    status = path.stat()
+                    found.append((status.st_mtime_ns, path.name, status.st_size))
         return {name: size for _, name, size in sorted(found)}
 
     def _read_active(self) -> dict[str, ActiveVersion]:
@@ -193,6 +203,9 @@ class TileCache:
         try:
             record = msgspec.json.decode(path.read_bytes(), type=ActiveVersion)
             return msgspec.structs.replace(record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs))
+        except OSError as error:
+            self._note(f"{path} cannot be read ({error.strerror}); check the disk and whose file it is")
+            return None
         except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
             self._note(f"{path} is damaged ({error}); the version has to be fetched again")
             return None
@@ -227,7 +240,8 @@ class TileCache:
             _sync_folder(path.parent)
         except OSError as error:
             self._note(f"{path} cannot be written ({error.strerror}); make space for the cache")
-            self._try_unlink(temporary)
+            with suppress(OSError):
+                temporary.unlink()
             return False
         return True
 

@@ -1,5 +1,6 @@
 """Versions that a fleet manager had the robot download. All of them stay on the disk until it deletes them."""
 
+import logging
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from locclient.maps.tile_cache import ActiveVersion, TileCache
 from locclient.maps.version_download import Origins, TooLargeError, download
 
 _TOGETHER = 2  # a file, and the blobs that are taken out of it
+_log = logging.getLogger(__name__)
 
 
 class NoRoomError(StoreError):
@@ -33,17 +35,20 @@ class FleetMaps:
         origins: Origins,
         check_admitted: Callable[[WantedVersion], None],
     ) -> None:
-        """folder: for files on their way. Raises StoreError where the disk refuses, UsageError for origins that are none."""
+        """folder: for files on their way. Raises UsageError for origins that are none. A disk that refuses now refuses downloads later."""
         origins.check()
         self._cache, self._site, self._folder, self._origins = cache, site, folder, origins
         self._check_admitted = check_admitted
-        with disk_errors(f"{folder} cannot be used", "choose another cache"):
-            folder.mkdir(parents=True, exist_ok=True)
-            for leftover in folder.glob("*.fmex"):
-                leftover.unlink()
         active = cache.active(site)
-        if active is not None and active not in cache.kept(site):
-            cache.keep(site, active.version, active.blobs)
+        try:
+            with disk_errors(f"{folder} cannot be used", "choose another cache"):
+                folder.mkdir(parents=True, exist_ok=True)
+                for leftover in folder.glob("*.fmex"):
+                    leftover.unlink()
+            if active is not None and active not in cache.kept(site):
+                cache.keep(site, active.version, active.blobs)
+        except StoreError as error:
+            _log.warning("maps of the fleet manager cannot be downloaded: %s", error)
 
     def versions(self) -> list[tuple[int, bool]]:
         """The versions on the disk, oldest first, and which of them is enabled."""

@@ -1,7 +1,13 @@
 """Options of numba, in this one place: cached, without the GIL, and without fast-math so that bits repeat."""
 
+import atexit
 import os
+import shutil
+import tempfile
+import warnings
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -10,6 +16,7 @@ from fleetmap.errors import FleetmapError
 
 F = TypeVar("F", bound=Callable[..., object])
 
+_config: Any = numba.config  # without types
 KERNELS: list[Any] = []  # numba's dispatchers of all kernels that were imported
 
 
@@ -42,9 +49,14 @@ def uncounted_inner_kernel(function: F) -> F:
 
 
 def _cached(function: F, **options: Any) -> F:
+    compile_it = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     try:
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    except RuntimeError as error:  # numba found no folder
+        try:
+            compiled = compile_it(function)
+        except RuntimeError:  # numba found no folder that it can write
+            _move_cache()
+            compiled = compile_it(function)
+    except (RuntimeError, OSError) as error:
         asked = os.environ.get("NUMBA_CACHE_DIR") or "the user's cache"
         raise FleetmapError(
             f"compiled kernels can be kept neither in {asked} nor beside {function.__code__.co_filename}; "
@@ -52,3 +64,18 @@ def _cached(function: F, **options: Any) -> F:
         ) from error
     KERNELS.append(compiled)
     return cast(F, compiled)
+
+
+def _move_cache() -> None:
+    """Copies a set folder that cannot be written, for this process, to one that can: numba does not read the first."""
+    before = Path(_config.CACHE_DIR)
+    if not _config.CACHE_DIR or not before.is_dir():
+        return
+    places = (os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], "/dev/shm")
+    place = next((place for place in places if place and os.access(place, os.W_OK)), None)
+    folder = tempfile.mkdtemp(prefix="fleetmap-kernels-", dir=place)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    with suppress(OSError):  # of what cannot be read; it is compiled again
+        shutil.copytree(before, folder, dirs_exist_ok=True)
+    warnings.warn(f"compiled kernels in {before} cannot be written; a copy in {folder} is used", stacklevel=2)
+    os.environ["NUMBA_CACHE_DIR"] = _config.CACHE_DIR = folder

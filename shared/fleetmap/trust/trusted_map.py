@@ -49,19 +49,33 @@ class TrustedMap:
     ) -> None:
         """root: bytes of the trusted root; None pins the one that is met first, for a server on the same machine.
 
-        Raises StoreError where the folder cannot be used.
+        A folder that cannot be used is no fresh word: `admitted` raises it, until it can be.
         """
         self._folder, self._site, self._ask, self._wall_s = folder, check_name(site, "site"), ask, wall_s
         self._pinned_root, self._is_first_use = root, root is None
         self._list: SiteList | None = None
         self._fault: LinkError | StoreError | None = None
-        with disk_errors(f"the folder {folder} for signed lists cannot be used", "choose another cache"):
-            folder.mkdir(parents=True, exist_ok=True)
+        self._kept_clock_s = self._clock_s = 0.0
+        self._is_open = False
+        try:
+            self._open()
+        except StoreError as error:
+            self._fault = error
+            _log.warning("no new map can be taken for site %s: %s", site, error)
+
+    def _open(self) -> None:
+        with disk_errors(
+            f"the folder {self._folder} for signed lists cannot be used", "check the disk and whose it is"
+        ):
+            self._folder.mkdir(parents=True, exist_ok=True)
             self._kept_clock_s = self._clock_s = self._read_clock()
+        self._is_open = True
 
     def refresh(self) -> None:
         """Asks the server for its lists. Why they cannot be had or believed is raised by `admitted`, not here."""
         try:
+            if not self._is_open:
+                self._open()
             with disk_errors(f"the signed lists in {self._folder} cannot be written", "make space"), self._locked():
                 self._refresh()
             self._fault = None

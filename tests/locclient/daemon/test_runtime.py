@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.errors import FleetmapError, RecordingError
+from fleetmap.errors import FleetmapError, RecordingError, StoreError
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import (
     FailureAck,
@@ -270,3 +270,15 @@ def test_faults_of_the_tile_cache_reach_the_server(world: World) -> None:
     parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
     Runtime(parts, ServiceManager("")).run()
     assert world.fleet.robots("room")[0].last_health["metrics"]["cache_faults"] == len(parts.caches)
+
+
+def test_a_spool_on_a_disk_that_refuses_costs_no_estimate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> object:
+        raise StoreError("attempt to write a readonly database")
+
+    listener = Listener()
+    parts = world.parts(ScriptedSource(list(robot_world.bundles(5))), robot_world.new_robot(), listener)
+    for name in ("counts", "waiting", "put"):
+        monkeypatch.setattr(parts.outbox, name, refuse)
+    Runtime(parts, ServiceManager("")).run()
+    assert len(listener.estimates) == 5

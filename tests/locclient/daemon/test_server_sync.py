@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub
-from fleetmap.errors import LinkError
+from fleetmap.errors import LinkError, StoreError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import (
@@ -351,3 +351,19 @@ def test_a_recording_travels_a_part_a_second_and_behind_all_reports(world: World
     assert world.parts == [0, PART_BYTES, 2 * PART_BYTES]
     assert world.table == ["f2"]
     assert replays.counts()["delivered"] == 1
+
+
+def test_a_spool_that_refuses_holds_up_neither_maps_nor_health(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: int = 1) -> list[QueuedReport]:
+        raise StoreError("attempt to write a readonly database")
+
+    asked: list[None] = []
+    monkeypatch.setattr(world.outbox, "waiting", lambda *_: asked.append(None) or refuse())
+    world.sync.replays = world.outbox
+    number = world.publish(seed=8)
+    for _ in range(5):
+        world.step()
+    assert [version.version for version in world.sync.fetched] == [number]
+    assert len(asked) == 2, "reports and recordings are tried again after half a minute"
+    world.step(31.0)
+    assert len(asked) == 4
