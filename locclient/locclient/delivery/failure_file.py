@@ -5,7 +5,7 @@ The recording is for people and for clients that see otherwise. The attachment o
 
 from dataclasses import replace
 from itertools import chain
-from math import atan2
+from math import atan2, prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -32,6 +32,7 @@ from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image, PositionPrior
+from locclient.delivery.failure_checks import MAX_ROWS, check_record
 from locclient.localization.calibration.parameters import CalibrationState
 from locclient.localization.image_quality import ImageQuality
 from locclient.localization.localizer_state import LocalizerState
@@ -44,13 +45,14 @@ _FORMAT = 1
 _WIDTH_PX = 320  # of pictures
 _QUALITIES, _PICTURE_BYTES = (70, 50, 30), 24 << 10
 _MAX_UNPACKED_BYTES = 64 << 20
+_Shape = Annotated[list[Annotated[int, msgspec.Meta(ge=0, le=MAX_ROWS)]], msgspec.Meta(max_length=2)]
 _ARRAYS = ("<f8", "<f4", "<i8", "<u8", "<u4", "|u1", "|i1", "|b1")
 
 
 class QueryRecord(msgspec.Struct, frozen=True, array_like=True):
     """A map query: features (N), the columns of the right image (N,), NaN where unknown, and which of them the robot had measured."""
 
-    slices: int
+    slices: Annotated[int, msgspec.Meta(ge=0, le=MAX_ROWS)]
     pixels: Array | None = None
     octaves: NDArray[np.int8] | None = None
     angles_deg: NDArray[np.float32] | None = None
@@ -110,7 +112,7 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
 
 
 def read_failure_file(path: Path) -> tuple[FailureSummary, LocalizerRecord]:
-    """Both attachments, decoded; RecordingError for what no client of this version has written."""
+    """Both attachments, decoded and checked; RecordingError for what no client of this version has written."""
     attachments = attachments_of(path)
     with zstandard.ZstdDecompressor().stream_reader(attachments[LOCALIZER]) as reader:
         try:
@@ -123,14 +125,26 @@ def read_failure_file(path: Path) -> tuple[FailureSummary, LocalizerRecord]:
         raise RecordingError(
             f"{path}: the localizer's part has more than {_MAX_UNPACKED_BYTES} bytes; no robot writes that"
         )
+    summary = decode_summary(attachments[SUMMARY])
+    try:
+        return summary, decode_record(data, summary)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
+    """The localizer's part, unpacked, decoded and checked; RecordingError for what no client of this version has written."""
     try:
         record = msgspec.msgpack.decode(data, type=LocalizerRecord, dec_hook=_decoded_array)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError, TypeError) as error:
         raise RecordingError(
-            f"{path}: the localizer's part cannot be read ({error}); it was written by another fleetmap, the recording itself plays "
+            f"the localizer's part cannot be read ({error}); it was written by another fleetmap, the recording itself plays "
             "with `locclient replay`"
         ) from error
-    return decode_summary(attachments[SUMMARY]), record
+    check_record(record)
+    if [frame.odometry.stamp_ns for frame in record.frames] != [each.stamp_ns for each in summary.moments]:
+        raise RecordingError("the summary is of other frames than the localizer's part; fetch it again")
+    return record
 
 
 # --- the localizer's part ---------------------------------------------------------------------------------------------
@@ -199,12 +213,12 @@ def _encoded_array(value: Any) -> Any:
 
 
 def _decoded_array(kind: type, value: Any) -> Any:
-    form, shape, data = value
-    if form not in _ARRAYS or len(shape) > 2:
-        raise ValueError(f"an array of {form!r} with {len(shape)} axes")
-    count = int(np.prod(shape, dtype=np.int64))
-    is_short = form == "<f8" and len(data) == 4 * count
-    return np.frombuffer(data, "<f4" if is_short else form).astype(form).reshape(shape)
+    form, shape, data = msgspec.convert(value, tuple[str, _Shape, bytes])
+    if form not in _ARRAYS:
+        raise ValueError(f"an array of {form!r:.20}")
+    is_short = form == "<f8" and len(data) == 4 * prod(shape)
+    stored = "<f4" if is_short else "|u1" if form == "|b1" else form
+    return np.frombuffer(data, stored).astype(form).reshape(shape)
 
 
 # --- the recording's part ---------------------------------------------------------------------------------------------

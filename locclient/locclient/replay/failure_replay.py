@@ -117,13 +117,12 @@ class KeptPerception:
 
 
 def _features(query: QueryRecord) -> FrameFeatures:
-    arrays = query.pixels, query.octaves, query.angles_deg, query.descriptors, query.right_px
-    if any(array is None for array in arrays):
+    if query.pixels is None:
         raise RecordingError(
             "a map query without features is over before they are there; was the file made by a robot?"
         )
-    pixels, octaves, angles_deg, descriptors, right_px = arrays
-    features = Features(pixels, octaves, angles_deg, descriptors)  # type: ignore[arg-type]
+    pixels, octaves, angles_deg, descriptors, right_px = (getattr(query, name) for name in query.__struct_fields__[1:6])
+    features = Features(pixels, octaves, angles_deg, descriptors)
     made = KeptFeatures(features, np.column_stack([features.pixels, np.full(len(features), np.nan)]))
     made.kept_px = np.asarray(right_px)
     return made

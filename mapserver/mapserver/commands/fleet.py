@@ -129,13 +129,14 @@ def replay(
     json: Json = False,
 ) -> None:
     """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
-    import subprocess
     import sys
     from importlib.util import find_spec
     from pathlib import Path
     from tempfile import TemporaryDirectory
 
     from fleetmap.errors import StateError
+    from fleetmap.log_lines import printable
+    from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
     from mapserver.store import MapStore
 
     if find_spec("locclient") is None:
@@ -149,12 +150,16 @@ def replay(
         options = ["--store", str(store), "--site", site, *(["--json"] if json else [])]
         if version is not None:
             options += ["--manifest", maps.version(site, version).manifest_sha256]
-        # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md).
-        done = subprocess.run(
-            [sys.executable, "-m", "locclient.cli", "replay-failure", str(path), *options], check=False
-        )
-    if done.returncode:
-        raise typer.Exit(done.returncode)
+        # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md), and the file is a robot's.
+        command = [sys.executable, "-m", "locclient.cli", "replay-failure", str(path), *options]
+        done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
+    if done.has_network:
+        typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
+    for text, is_error in ((done.errors, True), (done.output, False)):
+        for line in text.splitlines():
+            typer.echo(line if json and not is_error else printable(line), err=is_error)
+    if done.status:
+        raise typer.Exit(done.status)
 
 
 FLEET = Group(

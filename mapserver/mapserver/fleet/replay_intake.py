@@ -124,8 +124,10 @@ def _read(path: Path, data: bytes, named: tuple[str, str, str]) -> FailureReplay
                 f"the recording has {len(recording)} pictures; a failure's has at most {_MAX_PICTURES}"
             )
         stored = [recording.stored_frame(number) for number in range(len(recording))]
+    if any(frame.depth is not None for frame in stored):
+        raise RecordingError("the recording has depth images; a failure's has none")
     pictures = [(frame.stamp_ns, frame.left.data) for frame in stored]
-    for stamp_ns, jpeg in pictures:
+    for stamp_ns, jpeg in [*pictures, *((frame.stamp_ns, frame.right.data) for frame in stored if frame.right)]:
         size = image_size(jpeg)
         if not (jpeg.startswith(b"\xff\xd8") and jpeg.endswith(b"\xff\xd9")) or len(jpeg) > _MAX_PICTURE_BYTES:
             raise RecordingError(f"the picture at {stamp_ns} is no JPEG of at most {_MAX_PICTURE_BYTES} bytes")

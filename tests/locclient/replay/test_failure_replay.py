@@ -1,9 +1,13 @@
 """A failure's recording repeats what the robot said, to the bit; another map may say otherwise; what no robot wrote is refused."""
 
+import os
+import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -17,12 +21,15 @@ from fleetmap.recordings import open_recording
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from locclient import cli
-from locclient.delivery.failure_file import read_failure_file
+from locclient.delivery.failure_file import QueryRecord, read_failure_file
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.failure_replay import Comparison, compare_failure
 from locclient.replay.replay import load_map
+from mapserver import cli as server_cli
+from mapserver.fleet import bounded_process
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
-from support.fleet.failed_robot import failed
+from support.fleet.failed_robot import failed, send_replay
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
@@ -129,6 +136,80 @@ def test_a_state_that_no_robot_wrote_is_refused(carried: Carried, tmp_path: Path
         read_failure_file(_changed(carried, tmp_path / "spoiled.mcap", spoiled))
 
 
+def _state_of(carried: Carried, frames: int) -> Any:
+    """The localizer's part as a robot sends it, with its first frames."""
+    packed = attachments_of(carried.file)[LOCALIZER]
+    state = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed), strict=False)
+    return state | {"frames": state["frames"][:frames]}
+
+
+def _packed_array(values: Any) -> list[Any]:
+    array = np.asarray(values)
+    return [array.dtype.str, list(array.shape), array.tobytes()]
+
+
+def _query(name: str, make: Callable[[int], Any]) -> Callable[[Any], None]:
+    """Another array of the first map query, for its number of features."""
+    place = QueryRecord.__struct_fields__.index(name)
+
+    def change(state: Any) -> None:
+        query = next(frame["query"] for frame in state["frames"] if frame["query"] and frame["query"][1])
+        query[place] = _packed_array(make(query[1][1][0]))
+
+    return change
+
+
+def _odometry(name: str, value: Any) -> Callable[[Any], None]:
+    return lambda state: state["frames"][3]["odometry"].update({name: value})
+
+
+NO_ROBOT_WRITES = {
+    "one descriptor": _query("descriptors", lambda n: np.zeros((1, 32), np.uint8)),
+    "short descriptors": _query("descriptors", lambda n: np.zeros((n, 1), np.uint8)),
+    "no octaves": _query("octaves", lambda n: np.zeros(0, np.int8)),
+    "an octave of -128": _query("octaves", lambda n: np.full(n, -128, np.int8)),
+    "octaves of another kind": _query("octaves", np.zeros),
+    "pixels outside the picture": _query("pixels", lambda n: np.full((n, 2), 1e9)),
+    "pixels that are no numbers": _query("pixels", lambda n: np.full((n, 2), np.nan)),
+    "too many features": _query("pixels", lambda n: np.zeros((10_001, 2))),
+    "columns without end": _query("right_px", lambda n: np.full(n, 1e300)),
+    "a picture without pixels": lambda state: state["camera"].update(width_px=0),
+    "a picture of 60000 pixels": lambda state: state["camera"].update(width_px=60_000, height_px=60_000),
+    "a lens that is none": lambda state: state["camera"].update(focal_px=float("nan")),
+    "no rotation": _odometry("odom_from_body", _packed_array(np.zeros((4, 4)))),
+    "a transform without a place": _odometry("odom_from_body", _packed_array(np.full((4, 4), np.inf))),
+    "a covariance that is none": _odometry("cov_rot_trans", _packed_array(-np.eye(6))),
+    "a skew covariance": _odometry("cov_rot_trans", _packed_array(np.triu(np.ones((6, 6))))),
+    "stamps that fall": _odometry("stamp_ns", 1),
+    "slices without end": lambda state: next(f["query"] for f in state["frames"] if f["query"]).__setitem__(0, 10**12),
+    "a hypothesis that is not there": lambda state: state["state"]["candidates"].update(disambiguated=7),
+    "settings without end": lambda state: state["settings"]["fix"].update(top_places=10**15),
+}
+
+
+@pytest.mark.parametrize("what", NO_ROBOT_WRITES)
+def test_arrays_that_no_robot_wrote_reach_no_kernel(carried: Carried, tmp_path: Path, what: str) -> None:
+    state = _state_of(carried, frames=30)
+    NO_ROBOT_WRITES[what](state)
+    spoiled = zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(state))
+    with pytest.raises(RecordingError, match=r"no robot writes that|cannot be read"):
+        read_failure_file(_changed(carried, tmp_path / "spoiled.mcap", spoiled))
+
+
+@pytest.mark.slow
+def test_arbitrary_arrays_break_nothing(carried: Carried) -> None:
+    """In a process whose kernels check their bounds, which are compiled for that once: whatever decodes and passes is played."""
+    cache = Path(".pytest_cache/bounds_checked").absolute()
+    checked = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": os.pathsep.join(sys.path)}
+    program = Path(__file__).parents[2] / "support/fleet/arbitrary_failures.py"
+    command = [sys.executable, str(program), str(carried.file), str(carried.folder / "store")]
+    done = subprocess.run(command, env=os.environ | checked, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    played, refused = map(int, done.stdout.split())
+    assert played >= 1, "what the robot wrote"
+    assert refused > 10
+
+
 def test_what_unpacks_without_end_is_refused(carried: Carried, tmp_path: Path) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(300_000_000))
     with pytest.raises(RecordingError, match="no robot writes that"):
@@ -159,3 +240,28 @@ def test_the_command_answers(
     assert end.value.code in (0, None), said
     assert "then:" in said
     assert "says the same of every frame" in said
+
+
+def test_the_server_replays_it_in_a_process_with_limits(
+    carried: Carried, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    store = carried.folder / "store"
+    with MapStore.open(store) as maps:
+        fleet = Fleet(maps)
+        assert fleet.take_failure("room", "r1", carried.report).refused == ""
+        send_replay(fleet, "room", "r1", carried.report.id, carried.file.read_bytes())
+    monkeypatch.setattr(sys, "argv", ["mapserver", "fleet", "replay", "1", "--store", str(store)])
+
+    def run() -> tuple[int, str]:
+        with pytest.raises(SystemExit) as end:
+            server_cli.main()
+        said = capfd.readouterr()
+        return int(end.value.code or 0), said.out + said.err
+
+    status, said = run()
+    assert status == 0, said
+    assert "says the same of every frame" in said
+    monkeypatch.setattr(bounded_process, "ProcessLimits", partial(bounded_process.ProcessLimits, cpu_s=1))
+    status, said = run()
+    assert status == 3
+    assert "the replay of failure 1 was ended by SIG" in said

@@ -1,0 +1,219 @@
+"""Checks a decoded failure recording before any kernel sees it: robots write it, and a robot may be anybody's.
+
+Every array of the record is in ARRAYS by its field's name, with dtype, shape and a check of its values. Letters in a shape are lengths
+that all arrays of one record share.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from itertools import pairwise
+from math import isfinite
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from fleetmap.config import Section
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import AnyArray
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import PositionPrior
+
+MAX_ROWS = 10_000  # of an array, and members of a list
+_MAX_DEPTH = 16
+_MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
+_ANGLE_TOLERANCE, _COVARIANCE_TOLERANCE = 1e-3, 1e-6
+_MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m")
+
+
+class Kind(NamedTuple):
+    """What an array must be. is_good: of values, by the camera."""
+
+    dtype: str
+    shape: tuple[int | str, ...]
+    is_good: Callable[[AnyArray, StereoCamera], bool]
+
+
+def _finite(values: AnyArray, _: StereoCamera) -> bool:
+    return bool(np.isfinite(values).all())
+
+
+def _any(_: AnyArray, __: StereoCamera) -> bool:
+    return True
+
+
+def _rigid(target_from_source: AnyArray, _: StereoCamera) -> bool:
+    if not np.isfinite(target_from_source).all() or np.abs(target_from_source).max() > 1e7:
+        return False
+    rotation = target_from_source[:3, :3]
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ANGLE_TOLERANCE) and np.linalg.det(rotation) > 0
+    return bool(is_rotation and np.array_equal(target_from_source[3], [0.0, 0.0, 0.0, 1.0]))
+
+
+def _covariance(matrix: AnyArray, _: StereoCamera) -> bool:
+    if not np.isfinite(matrix).all():
+        return False
+    tolerance = _COVARIANCE_TOLERANCE * max(float(np.abs(matrix).max()), 1e-12)
+    return bool(np.abs(matrix - matrix.T).max() <= tolerance and np.linalg.eigvalsh(matrix)[0] >= -tolerance)
+
+
+def _prior_covariance(matrix: AnyArray, camera: StereoCamera) -> bool:
+    """Infinite variances of a position prior are what nobody said."""
+    known = np.isfinite(np.diagonal(matrix))
+    return not np.isnan(matrix).any() and _covariance(matrix[np.ix_(known, known)], camera) if known.any() else True
+
+
+def _within(pixels: AnyArray, camera: StereoCamera) -> bool:
+    return bool(np.all((pixels > -1) & (pixels < (camera.width_px + 1, camera.height_px + 1))))
+
+
+def _columns(right_px: AnyArray, camera: StereoCamera) -> bool:
+    return bool(np.all(np.isnan(right_px) | (np.abs(right_px) <= 2 * camera.width_px)))
+
+
+def _octaves(octaves: AnyArray, _: StereoCamera) -> bool:
+    return bool(np.all((octaves >= 0) & (octaves < 32)))
+
+
+def _rising(ids: AnyArray, _: StereoCamera) -> bool:
+    return bool(np.all(ids[1:] > ids[:-1]))
+
+
+_TRANSFORM, _COVARIANCE, _VECTOR = (
+    Kind("<f8", (4, 4), _rigid),
+    Kind("<f8", (6, 6), _covariance),
+    Kind("<f8", (3,), _finite),
+)
+_TRANSFORMS = (
+    "body_from_cam base_from_body odom_from_body previous_from_body new_odom_from_old_odom search_odom_from_body "
+    "view_odom_from_body map_from_body now_map_from_body query_map_from_body map_from_base failed_places"
+)
+ARRAYS: Mapping[str, Kind] = {
+    **dict.fromkeys(_TRANSFORMS.split(), _TRANSFORM),
+    **dict.fromkeys(("cov_rot_trans", "now_cov", "query_cov", "cov_bias_cam"), _COVARIANCE),
+    **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), _VECTOR),
+    # a map query: features
+    "pixels": Kind("<f8", ("n", 2), _within),
+    "octaves": Kind("|i1", ("n",), _octaves),
+    "angles_deg": Kind("<f4", ("n",), _finite),
+    "descriptors": Kind("|u1", ("n", 32), _any),
+    "right_px": Kind("<f8", ("n",), _columns),
+    "is_tried": Kind("|b1", ("n",), _any),
+    # landmarks that a hypothesis has observed
+    "ids": Kind("<u4", ("n",), _rising),
+    "points_odom": Kind("<f8", ("n", 3), _finite),
+    "expected": Kind("<u8", ("n",), _any),
+    "found": Kind("<u8", ("n",), _any),
+    # tracks of the odometry, which no recording keeps
+    "track_ids": Kind("<i8", (0,), _any),
+    "track_pixels": Kind("<f8", (0, 3), _any),
+}
+_MOTION = {0: _TRANSFORM, 1: _COVARIANCE}
+
+
+def check_record(record: Any) -> None:
+    """Raises RecordingError, naming the field, for a LocalizerRecord that no robot writes."""
+    camera = record.camera
+    sizes = camera.width_px, camera.height_px
+    numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
+    if not all(map(isfinite, numbers)) or not all(1 <= side <= _MAX_SIDE_PX for side in sizes):
+        raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
+    if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
+        raise _refused("camera", f"focal length, centre and baseline {numbers}")
+    _Walk(camera).check(record, "", 0)
+    stamps = [frame.odometry.stamp_ns for frame in record.frames]
+    if any(later <= earlier for earlier, later in pairwise(stamps)):
+        raise _refused("frames", "stamps that do not increase")
+    disambiguated, hypotheses = record.state.candidates.disambiguated, record.state.candidates.hypotheses
+    if disambiguated is not None and disambiguated >= len(hypotheses):
+        raise _refused("state.candidates.disambiguated", f"{disambiguated} of {len(hypotheses)} hypotheses")
+    for place, frame in enumerate(record.frames):
+        query = frame.query
+        given = () if query is None else [getattr(query, name) is None for name in query.__struct_fields__[1:]]
+        if any(given) and not all(given):
+            raise _refused(f"frames[{place}].query", "some arrays of a map query without the others")
+
+
+def _refused(where: str, what: str) -> RecordingError:
+    return RecordingError(f"{where}: {what}; no robot writes that, the recording itself plays with `locclient replay`")
+
+
+class _Walk:
+    """Goes through all values of a record."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+
+    def check(self, value: Any, where: str, depth: int) -> None:
+        if depth > _MAX_DEPTH:
+            raise _refused(where, f"more than {_MAX_DEPTH} levels")
+        if isinstance(value, Section):
+            self._settings(value, where, depth)
+        elif isinstance(value, msgspec.Struct):
+            self._members(value, value.__struct_fields__, where, depth)
+        elif is_dataclass(value):
+            self._members(value, [field.name for field in fields(value)], where, depth)
+        elif isinstance(value, Mapping):
+            self._many(list(value.items()), where, depth)
+        elif hasattr(value, "_fields"):
+            self._members(value, value._fields, where, depth)
+        elif isinstance(value, list | tuple):
+            self._many(value, where, depth)
+        else:
+            self._number(value, where)
+
+    def _members(self, value: Any, names: Sequence[str], where: str, depth: int) -> None:
+        lengths: dict[str, int] = {}
+        for name in names:
+            member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
+            if isinstance(member, np.ndarray):
+                kind = ARRAYS.get(name)
+                if isinstance(value, PositionPrior) and name == "cov_rot_trans":
+                    kind = _COVARIANCE._replace(is_good=_prior_covariance)
+                self._array(member, kind, at, lengths)
+            else:
+                self.check(member, at, depth + 1)
+
+    def _many(self, values: Sequence[Any], where: str, depth: int) -> None:
+        if len(values) > MAX_ROWS:
+            raise _refused(where, f"{len(values)} of them, at most {MAX_ROWS} are read")
+        name = where.rpartition(".")[2].partition("[")[0]
+        for place, value in enumerate(values):
+            at = f"{where}[{place}]"
+            if isinstance(value, np.ndarray):
+                self._array(value, _MOTION.get(place) if name == "motions" else ARRAYS.get(name), at, {})
+            else:
+                self.check(value, at, depth + 1)
+
+    def _array(self, array: AnyArray, kind: Kind | None, where: str, lengths: dict[str, int]) -> None:
+        if kind is None:
+            raise _refused(where, "an array where none belongs")
+        expected = tuple(
+            lengths.setdefault(size, length) if isinstance(size, str) else size
+            for size, length in zip(kind.shape, array.shape, strict=False)
+        )
+        if array.dtype.str != kind.dtype or len(array.shape) != len(kind.shape) or array.shape != expected:
+            raise _refused(
+                where, f"an array {array.shape} of {array.dtype}, where {kind.shape} of {kind.dtype} belongs"
+            )
+        if max(array.shape) > MAX_ROWS or not kind.is_good(array, self._camera):
+            raise _refused(where, f"values that cannot be, of shape {array.shape}")
+
+    def _settings(self, value: Section, where: str, depth: int) -> None:
+        for name in value.__struct_fields__:
+            member, at = getattr(value, name), f"{where}.{name}"
+            is_number = isinstance(member, int | float) and name != "seed"
+            if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
+                raise _refused(at, f"{member}")
+            self.check(member, at, depth + 1)
+
+    def _number(self, value: Any, where: str) -> None:
+        name = where.rpartition(".")[2]
+        if isinstance(value, bool | str | Enum | None):
+            return
+        if isinstance(value, int) and abs(value) <= _MAX_INT:
+            return
+        if isinstance(value, float) and (isfinite(value) or name in _MAY_BE_INFINITE):
+            return
+        raise _refused(where, f"{value!r:.80}")

@@ -1,0 +1,90 @@
+"""Runs a program over a stranger's file: with limits, without a network where the system allows that, and ended with its process group."""
+
+import os
+import resource
+import shutil
+import signal
+import subprocess
+from contextlib import suppress
+from dataclasses import dataclass
+from tempfile import TemporaryFile
+
+from fleetmap.errors import FleetmapError
+
+_NO_NETWORK = ("--map-current-user", "--net", "--")
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessLimits:
+    """Of one process: address space, processor time, time, each file that it writes (its output too), and open files."""
+
+    memory_bytes: int = 4 << 30
+    cpu_s: int = 600
+    wall_s: float = 900.0
+    file_bytes: int = 64 << 20
+    open_files: int = 256
+
+    def apply(self) -> None:
+        """Sets those of this process, for good."""
+        for kind, wanted in (
+            (resource.RLIMIT_AS, self.memory_bytes),
+            (resource.RLIMIT_CPU, self.cpu_s),
+            (resource.RLIMIT_FSIZE, self.file_bytes),
+            (resource.RLIMIT_NOFILE, self.open_files),
+            (resource.RLIMIT_CORE, 0),
+        ):
+            hard = resource.getrlimit(kind)[1]
+            limit = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+            resource.setrlimit(kind, (limit, limit))
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a program ended: its status, and what it wrote. has_network: the system let nobody take it away."""
+
+    status: int
+    output: str
+    errors: str
+    has_network: bool
+
+
+def without_network() -> list[str]:
+    """The words before a command that leave it without a network; none where the system refuses that to this account."""
+    unshare = shutil.which("unshare")
+    if unshare is None:
+        return []
+    words = [unshare, *_NO_NETWORK]
+    asked = subprocess.run([*words, "true"], stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    return words if asked.returncode == 0 else []
+
+
+def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
+    """Runs a command within limits. Raises FleetmapError, naming `what`, where it is ended by one of them or by a fault of its own."""
+    prefix = without_network()
+    with TemporaryFile() as output, TemporaryFile() as errors:
+        process = subprocess.Popen(
+            [*prefix, *command],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=errors,
+            start_new_session=True,
+            preexec_fn=limits.apply,  # noqa: PLW1509  commands have one thread
+        )
+        try:
+            status = process.wait(limits.wall_s)
+        except subprocess.TimeoutExpired as error:
+            raise FleetmapError(f"{what} was ended after {limits.wall_s:.0f} s; it is made to take long") from error
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        for file in (output, errors):
+            file.seek(0)
+        said, complained = (file.read(limits.file_bytes).decode("utf-8", "replace") for file in (output, errors))
+    if status < 0:
+        most = f"{limits.memory_bytes >> 20} MiB or {limits.cpu_s} s of processor time"
+        raise FleetmapError(
+            f"{what} was ended by {signal.Signals(-status).name}: it took more than {most}, or broke the program; "
+            "report it with the recording"
+        )
+    return Ended(status, said, complained, has_network=not prefix)
