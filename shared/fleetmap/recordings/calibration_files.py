@@ -42,6 +42,18 @@ _NOISE_KEYS = {
     "accel_noise_mps2_rthz": "accelerometer_noise_density",
     "accel_walk_mps3_rthz": "accelerometer_random_walk",
 }
+_MOUNTINGS = ("body_from_cam", "T_cam_imu", "T_imu_cam")
+# What Kalibr and OpenVINS say of an IMU besides its noise, and the value that changes nothing
+_IMU_INTRINSICS: dict[str, Any] = {
+    "T_i_b": np.eye(4),
+    "Tw": np.eye(3),
+    "Ta": np.eye(3),
+    "R_IMUtoGYRO": np.eye(3),
+    "R_IMUtoACC": np.eye(3),
+    "Tg": np.zeros((3, 3)),
+    "time_offset": 0.0,
+}
+_LARGEST_PX = 32_768
 Values = Mapping[str, Any]
 
 
@@ -56,12 +68,12 @@ class CalibrationFile:
 def load_calibration(path: Path) -> CalibrationFile:
     """The calibration of a Kalibr camchain with this module's extra keys.
 
-    An `imu*.yaml` of Kalibr beside a camchain that has no noise values is read too. CalibrationError for missing files,
-    nonsense and impossible values.
+    Kalibr's `imu*.yaml` or OpenVINS' `kalibr_imu_chain.yaml` beside a camchain that has no noise values is read too.
+    CalibrationError for missing files, nonsense and impossible values.
     """
     found = parse_calibration(_read(path), str(path))
     if found.calibration.imu is not None and not found.topics.get("noise"):
-        for candidate in sorted(path.parent.glob("imu*.yaml")):
+        for candidate in sorted([*path.parent.glob("imu*.yaml"), *path.parent.glob("kalibr_imu_chain.yaml")]):
             noise = _imu_noise(read_yaml(candidate), str(candidate))
             if noise is not None:
                 return replace(found, calibration=replace(found.calibration, imu=noise))
@@ -84,9 +96,19 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
             f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...), or for a "
             "single camera ROS's camera_info file"
         )
+    for number, name in enumerate(names):
+        if name != f"cam{number}":
+            raise CalibrationError(
+                f"{where}: cam{number} is missing, there is {', '.join(names)[:80]}; number cameras from cam0"
+            )
     noise = _imu_noise(values, where)
-    first = _section(values, names[0], where)
-    has_imu = bool(values.get("has_imu", noise is not None or "T_cam_imu" in first))
+    is_mounted = any(key in _section(values, "cam0", where) for key in _MOUNTINGS)
+    has_imu = bool(values.get("has_imu", noise is not None or is_mounted))
+    if has_imu and not is_mounted:
+        raise CalibrationError(
+            f"{where}: cam0: nothing says how the IMU is mounted; add T_cam_imu (Kalibr's) or T_imu_cam (OpenVINS'), or take the "
+            "IMU's noise out, to use the cameras alone"
+        )
     cameras: list[CameraCalibration] = []
     topics: dict[str, str] = {"noise": "given"} if noise is not None else {}
     for name in names:
@@ -138,7 +160,7 @@ def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
     Defaults where it says nothing.
     """
     where, values = str(path), read_yaml(path)
-    body_from_imu = matrix_4x4(values["T_BS"], f"{where}: T_BS") if "T_BS" in values else np.eye(4)
+    body_from_imu = matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")
     return body_from_imu, _imu_noise(values, where) or ImuNoise()
 
 
@@ -156,17 +178,35 @@ def matrix_4x4(value: object, where: str) -> Array:
     CalibrationError unless it is a rigid transform.
     """
     data = value.get("data") if isinstance(value, dict) else value
+    shape = (value.get("rows"), value.get("cols")) if isinstance(value, dict) else (4, 4)
     try:
-        matrix = np.array(data, dtype=np.float64).reshape(4, 4)
+        matrix = np.array(data, dtype=np.float64)
+        if matrix.shape not in ((4, 4), (16,)) or shape != (4, 4):
+            raise ValueError
+        matrix = matrix.reshape(4, 4)
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{where}: {_brief(value)} is no 4x4 matrix; write four rows of four numbers") from None
-    rotation = matrix[:3, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=2e-3) and np.linalg.det(rotation) > 0
-    if not (np.isfinite(matrix).all() and is_rotation and np.array_equal(matrix[3], [0, 0, 0, 1])):
+    if fault := _fault_of(matrix):
         raise CalibrationError(
-            f"{where}: {np.round(matrix, 4).tolist()} is no rotation and translation; check its rows"
+            f"{where}: {np.round(matrix, 4).tolist()} is no rotation and translation: {fault}; check its rows"
         )
     return matrix
+
+
+def _fault_of(matrix: Array) -> str:
+    """Why (4, 4) is no rigid transform; empty if it is one."""
+    if not np.isfinite(matrix).all():
+        return "not all of it is finite"
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        is_turned = np.array_equal(matrix[:, 3], [0, 0, 0, 1])
+        return "it is transposed" if is_turned else "its last row is not 0 0 0 1"
+    rotation = matrix[:3, :3]
+    if np.allclose(rotation @ rotation.T, np.eye(3), atol=2e-3):
+        return "" if np.linalg.det(rotation) > 0 else "it mirrors, an axis has the wrong sign"
+    scale = float(np.cbrt(abs(np.linalg.det(rotation))))
+    if scale > 0 and np.allclose(rotation @ rotation.T, scale**2 * np.eye(3), atol=2e-3 * scale**2):
+        return f"its rotation is scaled by {scale:.4g}"
+    return "the rows of its rotation are not of unit length and at right angles"
 
 
 def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: str) -> CameraCalibration:
@@ -195,12 +235,21 @@ def _ros_camera(values: Values, where: str) -> CameraCalibration:
 def _body_from_cam(values: Values, previous: CameraCalibration | None, where: str) -> Array:
     if "body_from_cam" in values:
         return matrix_4x4(values["body_from_cam"], f"{where}: body_from_cam")
+    mountings = []
+    if "T_imu_cam" in values:  # OpenVINS: rotation from the camera to the IMU, position of the camera in the IMU
+        mountings.append(matrix_4x4(values["T_imu_cam"], f"{where}: T_imu_cam"))
     if "T_cam_imu" in values:
-        return se3_inverse(matrix_4x4(values["T_cam_imu"], f"{where}: T_cam_imu"))
+        mountings.append(se3_inverse(matrix_4x4(values["T_cam_imu"], f"{where}: T_cam_imu")))
+    if mountings:
+        if not np.allclose(mountings[0], mountings[-1], atol=1e-3):
+            raise CalibrationError(f"{where}: T_cam_imu is not the inverse of T_imu_cam; keep the one that is right")
+        return mountings[-1]
     if previous is None:
         return np.eye(4)
     if "T_cn_cnm1" not in values:
-        raise CalibrationError(f"{where}: neither T_cam_imu nor T_cn_cnm1 says where the camera sits; add one of them")
+        raise CalibrationError(
+            f"{where}: neither T_cam_imu, T_imu_cam nor T_cn_cnm1 says where the camera sits; add one of them"
+        )
     return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
 
 
@@ -212,6 +261,10 @@ def _camera(values: Values, distortion_key: str, where: str) -> CameraCalibratio
             "a fisheye as pinhole with equidistant"
         )
     width, height = _numbers(_need(values, "resolution", where), 2, f"{where}: resolution")
+    if any(side != int(side) or not 0 < side <= _LARGEST_PX for side in (width, height)):
+        raise CalibrationError(
+            f"{where}: resolution is {width:g} x {height:g}; write the images' width and height in pixels"
+        )
     intrinsics = _numbers(_need(values, "intrinsics", where), 4, f"{where}: intrinsics (fx fy cx cy)")
     if _need(values, "distortion_model", where) != "none":
         _need(values, distortion_key, where)
@@ -224,7 +277,23 @@ def _imu_noise(values: Values, where: str) -> ImuNoise | None:
     inner = values.get("imu0", values.get("imu", values))
     if not isinstance(inner, dict) or not any(key in inner for key in _NOISE_KEYS.values()):
         return None
-    given = {name: _numbers([inner[key]], 1, f"{where}: {key}")[0] for name, key in _NOISE_KEYS.items() if key in inner}
+    given = {
+        name: float(_numbers([inner[key]], 1, f"{where}: {key}")[0])
+        for name, key in _NOISE_KEYS.items()
+        if key in inner
+    }
+    for key, neutral in _IMU_INTRINSICS.items():
+        if key in inner and not _is_near(inner[key], neutral):
+            raise CalibrationError(
+                f"{where}: {key} of the IMU is {_brief(inner[key])}, which is not supported; correct the samples by it, and write "
+                f"{np.asarray(neutral).tolist()}"
+            )
+    for key in ("gyroscopes", "accelerometers"):
+        if isinstance(inner.get(key), dict) and not _is_near(inner[key].get("M"), np.eye(3)):
+            raise CalibrationError(
+                f"{where}: {key}: M of the IMU is {_brief(inner[key].get('M'))}, which is not supported; correct the samples by it, "
+                "or calibrate with --imu-models calibrated"
+            )
     for name, value in given.items():
         if not 0 < value < 10:
             raise CalibrationError(
@@ -233,9 +302,19 @@ def _imu_noise(values: Values, where: str) -> ImuNoise | None:
     return ImuNoise(**given)
 
 
+def _is_near(value: object, wanted: Any) -> bool:
+    try:
+        found = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        return False
+    return found.shape == np.shape(wanted) and bool(np.allclose(found, np.asarray(wanted), atol=1e-3))
+
+
 def _numbers(value: object, count: int | None, where: str) -> Array:
     data: Any = value.get("data") if isinstance(value, dict) else value  # OpenCV's and ROS's {rows, cols, data}
     try:
+        if isinstance(data, str) or any(isinstance(v, bool) for v in data):
+            raise ValueError
         numbers = np.array([float(v) for v in data], np.float64)  # YAML 1.1 reads 1e-5 as text
     except (TypeError, ValueError, OverflowError):
         raise CalibrationError(f"{where}: {_brief(value)} are not numbers") from None
@@ -247,7 +326,7 @@ def _numbers(value: object, count: int | None, where: str) -> Array:
 def _need(values: Values, key: str, where: str) -> Any:
     if key not in values:
         none = "; images without distortion have distortion_model: none" if key.startswith("distortion") else ""
-        raise CalibrationError(f"{where}: {key} is missing; it holds {_brief(list(values))}{none}")
+        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(values)[:200]}{none}")
     return values[key]
 
 
@@ -301,6 +380,7 @@ def _parse_yaml(text: str, where: str) -> Values:
 def _check_events(text: str, where: str) -> None:
     """CalibrationError for what no calibration has and what is dear to load: aliases, tags, deep nesting, long words."""
     depth = 0
+    mappings: list[tuple[set[str], list[bool]] | None] = []
     for count, event in enumerate(yaml.parse(text, Loader=_LOADER)):
         if count > _MAX_EVENTS:
             raise CalibrationError(f"{where} holds more than {_MAX_EVENTS} values; a calibration has some hundred")
@@ -308,11 +388,29 @@ def _check_events(text: str, where: str) -> None:
             raise CalibrationError(f"{where} uses YAML's aliases (& and *); write the values out")
         if (tag := getattr(event, "tag", None)) is not None:
             raise CalibrationError(f"{where} uses the YAML tag {_brief(tag)}; write plain values")
+        _check_repeated(event, mappings, where)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _MAX_DEPTH:
             raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
             raise CalibrationError(f"{where} holds a value of {len(event.value)} signs; the limit is {_MAX_WORD}")
+
+
+def _check_repeated(event: object, stack: list[tuple[set[str], list[bool]] | None], where: str) -> None:
+    """CalibrationError for a key that a mapping has twice. stack: for each open mapping its keys, and whether a key comes next."""
+    top = stack[-1] if stack else None
+    if isinstance(event, yaml.CollectionEndEvent):
+        stack.pop()
+        return
+    is_node = isinstance(event, yaml.NodeEvent)
+    if top is not None and is_node:
+        if isinstance(event, yaml.ScalarEvent) and top[1][0]:
+            if event.value in top[0]:
+                raise CalibrationError(f"{where} has the key {_brief(event.value)} twice; keep the one that is right")
+            top[0].add(event.value)
+        top[1][0] = not top[1][0]
+    if isinstance(event, yaml.CollectionStartEvent):
+        stack.append((set(), [True]) if isinstance(event, yaml.MappingStartEvent) else None)
 
 
 def _row(values: Array) -> str:

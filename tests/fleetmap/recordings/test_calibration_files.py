@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -11,7 +12,7 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import se3, se3_exp
 from fleetmap.recordings import format_calibration, read_calibration
 from fleetmap.recordings.calibration_files import load_calibration, parse_calibration, read_euroc_camera
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, stereo_baseline_m
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration, kalibr_text
 
@@ -148,3 +149,127 @@ def test_lenses_of_every_layout(
     assert coefficients is not None
     assert camera.distortion.tolist() == coefficients[:kept]
     assert camera.intrinsics_px.tolist() == [400, 410, 310, 230]
+
+
+EYE3, EYE = np.eye(3).tolist(), np.eye(4).tolist()
+LENS = {
+    "camera_model": "pinhole",
+    "distortion_model": "radtan",
+    "distortion_coeffs": [-0.28, 0.07, 2e-4, 1e-5],
+    "intrinsics": [400.0, 410.0, 310.0, 230.0],
+    "resolution": [640, 480],
+}
+NOISE = {
+    "accelerometer_noise_density": 2e-3,
+    "accelerometer_random_walk": 3e-3,
+    "gyroscope_noise_density": 1.7e-4,
+    "gyroscope_random_walk": 1.9e-5,
+}
+MOUNTED = se3_exp(np.array([0.4, -1.2, 0.3, 0.1, -0.2, 0.05]))
+
+
+class PlainDumper(yaml.SafeDumper):
+    """Without aliases of values that occur twice."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def open_vins(folder: Path, **imu: object) -> Path:
+    """A rig in the two files of OpenVINS, which begin as OpenCV's do; its keys of the IMU replaced by others."""
+    cameras = {}
+    for number, shift in enumerate((0.0, 0.11)):
+        body_from_cam = MOUNTED @ se3(np.eye(3), np.array([shift, 0.0, 0.0]))
+        cameras[f"cam{number}"] = {**LENS, "T_imu_cam": body_from_cam.tolist(), "cam_overlaps": [1 - number]}
+    given = {**NOISE, "T_i_b": EYE, "model": "kalibr", "time_offset": 0.0, "update_rate": 200.0, "Tw": EYE3, "Ta": EYE3}
+    given |= {"R_IMUtoGYRO": EYE3, "R_IMUtoACC": EYE3, "Tg": np.zeros((3, 3)).tolist(), **imu}
+    (folder / "kalibr_imu_chain.yaml").write_text("%YAML:1.0\n\n" + yaml.dump({"imu0": given}, Dumper=PlainDumper))
+    file = folder / "kalibr_imucam_chain.yaml"
+    file.write_text("%YAML:1.0 # the file's type\n\n" + yaml.dump(cameras, Dumper=PlainDumper))
+    return file
+
+
+def test_the_chains_of_open_vins(tmp_path: Path) -> None:
+    """T_imu_cam is the other direction than Kalibr's T_cam_imu; the IMU's noise is in a second file."""
+    found = read_calibration(open_vins(tmp_path))
+    np.testing.assert_allclose(found.cameras[0].body_from_cam, MOUNTED, atol=1e-12)
+    assert stereo_baseline_m(found) == pytest.approx(0.11)
+    assert found.imu is not None
+    assert found.imu.gyro_noise_radps_rthz == pytest.approx(1.7e-4)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("Tw", (1.02 * np.eye(3)).tolist()),
+        ("Tg", (0.01 * np.eye(3)).tolist()),
+        ("R_IMUtoACC", np.eye(3)[[1, 0, 2]].tolist()),
+        ("T_i_b", MOUNTED.tolist()),
+        ("time_offset", 0.02),
+        ("accelerometers", {"M": (1.02 * np.eye(3)).tolist()}),
+    ],
+)
+def test_what_an_imu_needs_besides_is_refused_by_its_key(tmp_path: Path, key: str, value: object) -> None:
+    with pytest.raises(CalibrationError, match=f"{key}.* not supported; correct the samples"):
+        read_calibration(open_vins(tmp_path, **{key: value}))
+
+
+def rig(**changes: Any) -> str:
+    """A pair with an IMU, keys of cam0 replaced, or taken out where they are None."""
+    first = {key: value for key, value in {**LENS, "T_cam_imu": EYE, **changes}.items() if value is not None}
+    beside = se3(np.eye(3), np.array([-0.1, 0, 0])).tolist()
+    values = {"cam1": {**LENS, "T_cn_cnm1": beside}, "cam0": first, "imu0": NOISE}
+    return yaml.dump(values, Dumper=PlainDumper, sort_keys=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (rig(T_cam_imu=None), "how the IMU is mounted; add T_cam_imu"),
+        (rig(distortion_coeffs=None), "distortion_coeffs is missing"),
+        (rig(distortion_coeffs=None, distortion_coefficients=[0.1] * 4), "distortion_coeffs is missing.*coefficients"),
+        (rig(intrinsics=None), "intrinsics is missing"),
+        (rig(intrinsics=[400, True, 310, 230]), "are not numbers"),
+        (rig(intrinsics=[400, 400, 310, 2300]), "principal point"),
+        (rig(intrinsics=["400 px", 400, 310, 230]), "are not numbers"),
+        (rig(intrinsics=[float("nan"), 400, 310, 230]), "4 numbers are expected"),
+        (rig(resolution=None), "resolution is missing"),
+        (rig(resolution=[640.5, 480]), "resolution is 640.5 x 480"),
+        (rig(resolution=[0, 480]), "resolution is 0 x 480"),
+        (rig(T_cam_imu=MOUNTED.T.tolist()), "it is transposed"),
+        (rig(T_cam_imu=(MOUNTED @ np.diag([1.1, 1.1, 1.1, 1])).tolist()), "scaled by 1.1"),
+        (rig(T_cam_imu=np.diag([1.0, 1, -1, 1]).tolist()), "it mirrors"),
+        (rig(T_cam_imu=EYE[:3]), "is no 4x4 matrix"),
+        (rig(T_cam_imu={"rows": 2, "cols": 8, "data": np.eye(4).ravel().tolist()}), "is no 4x4 matrix"),
+        (rig(T_cam_imu=[[str(v) + " m" for v in row] for row in EYE]), "is no 4x4 matrix"),
+        (rig(T_cam_imu=MOUNTED.tolist(), T_imu_cam=MOUNTED.tolist()), "not the inverse of T_imu_cam"),
+        (rig().replace("T_cn_cnm1", "T_cnm1_cn"), "cam1: neither T_cam_imu, T_imu_cam nor T_cn_cnm1"),
+        (rig().replace("cam0:", "cam2:"), "cam0 is missing"),
+        (rig().replace("imu0:", "cam0: {}\nimu0:"), "the key 'cam0' twice"),
+        (rig().replace("resolution:", "\tresolution:"), "is not YAML"),
+        (rig().replace("pinhole", "&a pinhole"), "aliases"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_named(text: str, says: str) -> None:
+    with pytest.raises(CalibrationError, match=says):
+        parse_calibration(text, "rig.yaml")
+
+
+def test_a_file_that_opencv_writes(tmp_path: Path) -> None:
+    """Matrices with their tag, the second camera first."""
+    file = tmp_path / "rig.yaml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for number in (1, 0):
+        storage.startWriteStruct(f"cam{number}", cv2.FileNode_MAP)
+        for key, text in (("camera_model", "pinhole"), ("distortion_model", "plumb_bob")):
+            storage.write(key, text)
+        for key, values in (("intrinsics", LENS["intrinsics"]), ("distortion_coeffs", [-0.28, 0.07, 2e-4, 1e-5, 0.01])):
+            storage.write(key, np.array([values]))
+        storage.write("resolution", np.array([[640.0, 480.0]]))
+        storage.write("T_imu_cam", MOUNTED @ se3(np.eye(3), np.array([0.1 * number, 0, 0])))
+        storage.endWriteStruct()
+    storage.release()
+    found = read_calibration(file)
+    assert [len(camera.distortion) for camera in found.cameras] == [5, 5]
+    np.testing.assert_allclose(found.cameras[0].body_from_cam, MOUNTED, atol=1e-9)
+    assert stereo_baseline_m(found) == pytest.approx(0.1)
