@@ -18,8 +18,9 @@ PYTEST_ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
-# Modules are compiled when they are first imported: of most that come along none ever is.
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
+# pip compiles libraries, COMPILE the sources here, also where PYTHONDONTWRITEBYTECODE forbids programs to do it as they go.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+COMPILE := $(BIN)/python -m compileall -q shared mapserver locclient
 # Stamps: the time of the last install. Installing for development covers what the demo runs.
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
@@ -33,6 +34,7 @@ help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
 demo: demo-recording $(RUN_STAMP)
+	@$(COMPILE)
 	@BIN=$(BIN) deploy/demo.sh "$(RECORDING)"
 
 # Before the minute of installing.
@@ -40,6 +42,7 @@ demo-recording:
 	@deploy/demo.sh --check "$(RECORDING)"
 
 test: $(DEV_STAMP)
+	@$(COMPILE) tests
 	$(BIN)/python -m pytest $(TESTS) --ignore=$(BENCHMARKS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(DEV_STAMP)
@@ -89,9 +92,11 @@ $(BIN)/python:
 $(DEV_STAMP): $(INPUTS) | $(BIN)/python
 	@echo "installing fleetmap with everything that tests need into $(VENV)"
 	@$(INSTALL) -e ".[dev]"
+	@$(COMPILE)
 	@touch $(RUN_STAMP) $(DEV_STAMP)
 
 $(RUN_STAMP): $(INPUTS) | $(BIN)/python
 	@echo "installing fleetmap, server, client and simulator, into $(VENV)"
 	@$(INSTALL) -e ".[server,client,sim]"
+	@$(COMPILE)
 	@touch $(RUN_STAMP)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from fleetmap.console import plain_console
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings.images import StoredFrame, StoredImage, grey_image, jpeg_image, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -28,7 +28,7 @@ _PLAN_PX_PER_M = 12
 
 def _progress() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    return Progress(*columns, console=plain_console(stderr=True))
 
 
 def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Session:

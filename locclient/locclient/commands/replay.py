@@ -59,7 +59,7 @@ class MapOptions:
 class PlaybackOptions:
     """The frames of a recording that are played, and how."""
 
-    frames: Annotated[str, typer.Option(help="Frames to play, as a Python slice A:B:C.")] = ":"
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to play.")] = ":"
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file to use instead of the recording's own.")
     ] = None
@@ -126,9 +126,9 @@ def _run(
     files: ResultFiles,
     settings: "LocclientConfig",
 ) -> None:
-    from rich.console import Console
     from rich.progress import Progress
 
+    from fleetmap.console import plain_console
     from fleetmap.encoding import to_json
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.tum import write_tum
@@ -143,7 +143,7 @@ def _run(
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     with open_recording(path, opening) as recording:
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         with _viewing(source, at, is_wanted=files.mcap is not None) as viewer:
@@ -215,13 +215,14 @@ def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: b
 
 
 def _print_table(report: dict[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from fleetmap.console import plain_console
 
     table = Table("measure", "value")
     for name, value in report.items():
         table.add_row(name, _shown(value))
-    Console().print(table)
+    plain_console().print(table)
 
 
 def _shown(value: object) -> str:

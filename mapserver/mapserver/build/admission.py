@@ -11,6 +11,7 @@ from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
+from mapserver.doctor.findings import grouped
 from mapserver.doctor.run_checks import run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
@@ -47,16 +48,12 @@ class CheckedRecording:
 
     def remarks(self) -> list[str]:
         """The statements, with one remark for all checks that lack the same; one that was measured keeps its figure."""
-        lacking: dict[str, list[Finding]] = {}
-        for finding in self.findings:
-            if finding.verdict is not Verdict.OK:
-                is_unknown = finding.verdict is Verdict.NOT_JUDGED and finding.value is None and finding.missing
-                lacking.setdefault(finding.missing if is_unknown else finding.name, []).append(finding)
+        bad = [finding for finding in self.findings if finding.verdict is not Verdict.OK]
         return self._with_corrections(
-            f"not judged: {', '.join(f.name for f in same)}: {missing}"
+            f"not judged: {', '.join(f.name for f in same)}: {same[0].missing}"
             if len(same) > 1
-            else f"{same[0].name}: {same[0].sentence}"
-            for missing, same in lacking.items()
+            else f"{same[0].name}: {sentence}"
+            for same, sentence in grouped(bad)
         )
 
     def _with_corrections(self, words: Iterable[str]) -> list[str]:

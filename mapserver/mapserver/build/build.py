@@ -15,6 +15,7 @@ from rich.console import Console
 
 from fleetmap.bow import encode_vocabulary
 from fleetmap.config import to_dict
+from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
@@ -195,7 +196,7 @@ def build_draft(
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
         raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
-    times, console = StageTimes(time.perf_counter), Console(stderr=True)
+    times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
     with (
         single_threaded_libraries(),
         open_side_process(options.threads) as side,

@@ -59,8 +59,7 @@ def calibrate(
     if guess is not None:
         _from_guess(recordings, out, guess, config_path(context), topics)
         return
-    from rich.console import Console
-
+    from fleetmap.console import plain_console
     from mapserver.calibration import estimate_calibration
     from mapserver.calibration.calibration_file import corrected_file
     from mapserver.config import survey_settings
@@ -72,7 +71,7 @@ def calibrate(
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
         rig = sources[0].calibration
-    _print(Console(), estimate)
+    _print(plain_console(), estimate)
     if out is None:
         return
     if not any(p.is_judged for p in estimate.parameters):
@@ -86,12 +85,12 @@ def calibrate(
 @contextmanager
 def _shown() -> "Iterator[SurveyTools]":
     """Tools of a survey whose progress is shown."""
-    from rich.console import Console
     from rich.progress import Progress
 
+    from fleetmap.console import plain_console
     from mapserver.survey.survey_inputs import SurveyTools
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=plain_console(stderr=True), transient=True) as progress:
         task = progress.add_task("", total=None)
         yield SurveyTools(lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of))
 

@@ -25,13 +25,13 @@ def convert(
         raise UsageError(f"{out} exists; choose another name or replace it with --force")
     if out.exists() and recording.exists() and out.samefile(recording):
         raise UsageError(f"{out} is the recording itself; choose another name")
-    from rich.console import Console
     from rich.progress import Progress
 
+    from fleetmap.console import plain_console
     from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from fleetmap.recordings.mcap.writer import copy_to_mcap
 
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
         for issue in source.issues:
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)

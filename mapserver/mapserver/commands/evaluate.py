@@ -34,9 +34,9 @@ def evaluate(
     config: ConfigFile = None,
 ) -> None:
     """Print the errors of a trajectory: aligned rigidly, aligned with scale, as it is, from stamp to stamp, and its drift."""
-    from rich.console import Console
     from rich.table import Table
 
+    from fleetmap.console import plain_console
     from fleetmap.recordings.tum import read_covariances, read_tum
     from mapserver.evaluation.summary_table import summary
 
@@ -49,4 +49,4 @@ def evaluate(
     table = Table("error", "value", title=f"{estimate.name} against {options.ground_truth.name}")
     for key, value in found.items():
         table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
-    Console().print(table)
+    plain_console().print(table)

@@ -38,7 +38,7 @@ class LiveCommandOptions(SurveyOptions):
 
     speed: Annotated[float, typer.Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
     sensors: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drive with the [source] and [topics] of this file instead.")
+        Path | None, typer.Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
     ] = None
     record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Where --sensors are recorded to.")] = None
     server: Annotated[
@@ -76,8 +76,7 @@ def live(
         )
     if options.frozen != (options.map is not None):
         raise UsageError("--map VERSION --frozen localizes in a version; without both of them a map is made")
-    from rich.console import Console
-
+    from fleetmap.console import plain_console
     from fleetmap.foxglove import require_foxglove, viewer_address
 
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
@@ -107,7 +106,7 @@ def live(
         viewer = None if foxglove is None else _viewer(foxglove, drive)
         tell = _teller(bus, ros2_bus, viewer)
         see = None if viewer is None else viewer.see
-        result = run_live(request, drive, tell, is_stopped, Console(stderr=True), see)
+        result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
     typer.echo(result.figures.words())
     if result.built is not None:
         typer.echo(result.built.sentence)

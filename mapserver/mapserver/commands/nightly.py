@@ -31,8 +31,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     options.check()
     import time
 
-    from rich.console import Console
-
+    from fleetmap.console import plain_console
     from fleetmap.recordings import FrameSelection
     from mapserver.nightly import NightRequest, run_night
 
@@ -40,7 +39,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     asked = {name: value for name, value in options.asked(context).items() if name != "report"}
     request = NightRequest(now_ns=time.time_ns(), config=config_path(context), **asked)
     try:
-        sentence = run_night(request, settings_of(context).gate, Console(stderr=True))
+        sentence = run_night(request, settings_of(context).gate, plain_console(stderr=True))
     except BusyError:
         raise
     except FleetmapError:

@@ -1,6 +1,5 @@
 """`mapserver serve`: a store on HTTP and on the bus."""
 
-import ssl
 from collections.abc import AsyncIterator
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
@@ -166,6 +165,7 @@ def serve(
 
     raise_file_limit()
     host, port = at.host_and_port()
+    typer.echo(f"mapserver serve starts with the store {store}; `ready` follows", err=True)
     from fleetmap.bus import check_endpoint
     from mapserver.serving.bus_access import check_binding, prepare_bus
 
@@ -303,6 +303,8 @@ def _run(
     )
     config.load()
     if http.certificate is not None and config.ssl is not None:
+        import ssl
+
         config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
         renew = partial(http.certificate.renew, config.ssl)
         tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))

@@ -160,6 +160,8 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
         return not_judged(name.value, sigma, parameter.reason or _LONGER)
     verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
+    if tolerance is _NOISE:
+        words = f"{1 + value:.1f} times the data sheet, sigma {sigma_all:.1f}"
     if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # dear if it is true: neither sure nor silent
         return replace(not_judged(name.value, f"{words}: that may be chance", _LONGER), value=value)
     if is_bad:

@@ -1,6 +1,6 @@
 """Findings of the checks, and their limits."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -56,3 +56,29 @@ def worst(findings: Sequence[Finding]) -> Verdict:
     """The worst verdict of all; NOT_JUDGED without any."""
     order = list(Verdict)
     return max((f.verdict for f in findings), key=order.index, default=Verdict.NOT_JUDGED)
+
+
+def grouped(findings: Sequence[Finding]) -> list[tuple[list[Finding], str]]:
+    """Findings with one sentence each; those that could not be judged for want of the same, without any figure, share one."""
+    groups: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in findings:
+        is_unknown = finding.verdict is Verdict.NOT_JUDGED and finding.value is None and finding.missing
+        groups.setdefault((finding.missing,) if is_unknown else (finding.name, finding.sentence), []).append(finding)
+    return [
+        (same, f"{Verdict.NOT_JUDGED}: {same[0].missing}" if len(same) > 1 else same[0].sentence)
+        for same in groups.values()
+    ]
+
+
+def summary(findings: Sequence[Finding], decisive: Container[str]) -> str:
+    """All findings in one line, such as `24 ok, 2 not judged: good enough to build`; decisive: checks whose failure a build refuses."""
+    counts = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
+    shown = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    failed = [finding.name for finding in findings if finding.verdict is Verdict.FAIL]
+    if refused := [name for name in failed if name in decisive]:
+        return f"{shown}: a map of it would be wrong, `mapserver build` refuses it: {', '.join(refused)}"
+    if failed:
+        return f"{shown}: not good enough: {', '.join(failed)}"
+    if not counts[Verdict.OK]:
+        return f"{shown}: nothing was found to be right"
+    return f"{shown}: good enough to build" + (", with the warnings below" if counts[Verdict.WARN] else "")

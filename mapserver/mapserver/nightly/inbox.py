@@ -33,6 +33,7 @@ _HASH_SIGNS = 12
 _MAX_NAME_BYTES = 200  # of 255: the hash goes before the name, a number too, and `.reason.txt` behind it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
+_MOST_ISSUES = 5
 _KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 # Of one recording: an hour of two cameras at 30 Hz are 216,000 files
 _MOST_FILES, _DEEPEST = 2_000_000, 32
@@ -57,10 +58,15 @@ class Arrivals:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recording that can be read."""
+    """A recording that can be read; found: what its reader missed in it, in words."""
 
     path: Path
     sha256: str
+    found: str = ""
+
+    def why(self, reason: str) -> str:
+        """A reason with what the reader found, which is often what is behind it."""
+        return f"{reason}; when it was read: {self.found}" if self.found else reason
 
 
 def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
@@ -98,7 +104,8 @@ def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
     try:
         before, seconds = _state(path)
         with _limited(seconds), open_recording(path, options) as recording:
-            found = Recorded(path, recording.content_hash())
+            issues = "; ".join(f"{issue.what} {issue.detail}".rstrip() for issue in recording.issues[:_MOST_ISSUES])
+            found = Recorded(path, recording.content_hash(), issues)
     except _TooSlowError:
         found = f"{path} was not read within {seconds:.0f} s; is it whole? Copy it again"
     except Exception as error:  # whatever a library makes of a stranger's file, the night goes on

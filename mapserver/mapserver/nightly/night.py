@@ -245,16 +245,17 @@ class _Night:
         self._report.builds.append({"version": draft.version, **draft.report})
         self._say(draft.sentence)
         for sha256, reason in draft.left_out.items():
-            self._put_away(by_hash.pop(sha256).path, boxes.HELD, sha256, reason)
+            recorded = by_hash.pop(sha256)
+            self._put_away(recorded.path, boxes.HELD, sha256, recorded.why(reason))
         for recorded in [r for r in by_hash.values() if r.path in unusable]:
-            self._put_away(recorded.path, boxes.BAD, recorded.sha256, unusable[recorded.path])
+            self._put_away(recorded.path, boxes.BAD, recorded.sha256, recorded.why(unusable[recorded.path]))
         rest = [recorded for recorded in by_hash.values() if recorded.path not in unusable]
         self._publish(self._maps.version(request.site, draft.version), rest)
 
     def _put_all_away(self, recordings: list[Recorded], unusable: dict[Path, str], reason: str) -> None:
         for recorded in recordings:
             where = boxes.BAD if recorded.path in unusable else boxes.HELD
-            self._put_away(recorded.path, where, recorded.sha256, unusable.get(recorded.path, reason))
+            self._put_away(recorded.path, where, recorded.sha256, recorded.why(unusable.get(recorded.path, reason)))
 
     def _replayed(self) -> list[Path]:
         """Recordings of the current version that the inbox still has."""

@@ -65,6 +65,12 @@ def test_an_error_that_costs_3_cm_warns_and_that_of_another_rig_fails(parameter:
     assert verdicts(estimate(**{name: 1.01 * limit.fail_above + slack}))[parameter.value] is Verdict.FAIL
 
 
+def test_noise_is_told_in_multiples_of_the_data_sheet() -> None:
+    noise = ParameterEstimate(P.GYRO_NOISE, 3.3, 0.1, "", True, "")
+    (told,) = findings_of(replace(estimate(), parameters=(noise,)), FOCAL_PX)
+    assert told.sentence.startswith("4.3 times the data sheet")
+
+
 def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     """One percent of baseline, 10 cm of 10 m, two and a half sigmas from nothing."""
     sigma = np.hypot(0.1 * 0.003, TOLERANCES[P.BASELINE].floor)

@@ -17,6 +17,7 @@ from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, Stamps
 from mapserver.calibration import CalibrationParameter
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.doctor.findings import grouped, not_judged, summary
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro, gyro_check
 from mapserver.doctor.inertial import gravity_magnitude
 from mapserver.doctor.run_checks import TURN_FRAMES, _camera_turns, _Frames
@@ -267,3 +268,18 @@ def test_the_real_flight_agrees_with_its_calibration() -> None:
     assert findings["camera-imu time offset"].value == pytest.approx(0, abs=2)
     assert findings["gyro scale"].value == pytest.approx(1, abs=0.02)
     assert findings["gyro axes"].value == pytest.approx(0, abs=1.5)
+
+
+def test_findings_in_one_line_and_those_that_lack_the_same_in_one_row() -> None:
+    good, bad = Finding("images", Verdict.OK, 0.0, "", "whole"), Finding("depth", Verdict.FAIL, 1.0, "", "none")
+    lacking = [not_judged(name, "0 inertial samples", "record an IMU") for name in ("imu rate", "gyro axes")]
+    known = replace(not_judged("baseline", "+1 %", "record an IMU"), value=0.01)
+    assert summary([good, *lacking], {"depth"}) == "1 ok, 2 not judged: good enough to build"
+    assert summary(lacking, {"depth"}) == "2 not judged: nothing was found to be right"
+    assert "`mapserver build` refuses it: depth" in summary([good, bad], {"depth"})
+    assert summary([good, bad], set()) == "1 ok, 1 fail: not good enough: depth"
+    assert [([f.name for f in same], words) for same, words in grouped([good, *lacking, known])] == [
+        (["images"], "whole"),
+        (["imu rate", "gyro axes"], "not judged: record an IMU"),
+        (["baseline"], known.sentence),
+    ]

@@ -153,13 +153,17 @@ def test_what_came_in_becomes_a_version_once(hall: Path) -> None:
 
 def test_each_recording_goes_where_it_belongs_with_its_reason(hall: Path) -> None:
     record(hall / "inbox", "lost one", 7)
-    record(hall / "inbox", "dark one", 8)
+    dark = record(hall / "inbox", "dark one", 8)
+    max((dark / "mav0/cam1/data").iterdir()).unlink()
     (hall / "inbox/empty").mkdir()
     (hall / "inbox/notes.txt").write_text("not for the night")
     assert "2 done, 1 held, 2 bad" in spend(hall)
     assert names(hall / "inbox/held") == ["lost one", "lost one.reason.txt"]
     assert names(hall / "inbox/bad") == ["dark one", "dark one.reason.txt", "empty", "empty.reason.txt"]
     assert "empty folder" in (hall / "inbox/bad/empty.reason.txt").read_text()
+    (reason,) = (path.read_text() for path in (hall / "inbox/bad").glob("*dark one.reason.txt"))
+    assert "too dark; when it was read: " in reason
+    assert "1 of" in reason
     assert (hall / "inbox/notes.txt").is_file()
     report = last_report(hall / "store", "hall")
     assert report is not None

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
     """List the versions of a site with their states, oldest first."""
-    from rich.console import Console
     from rich.table import Table
 
+    from fleetmap.console import plain_console
     from mapserver.store import MapStore
 
     with MapStore.open(store, read_only=True) as maps:
@@ -31,7 +31,7 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
         parent = "" if info.parent is None else str(info.parent)
         sizes = (str(info.tiles), str(info.landmarks), str(info.map_bytes))
         table.add_row(str(info.version), info.state, parent, info.created, *sizes)
-    console = Console(markup=False, emoji=False, highlight=False)
+    console = plain_console()
     console.print(table)
     for version, choices in trusted.items():
         for choice in choices:
@@ -46,7 +46,7 @@ def inspect(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Show a version's manifest: tiles, sizes, recordings and the build's report."""
+    """Show a version: sizes, recordings and what was found in them, the gate's verdicts, history. --json has the whole manifest."""
     from mapserver.store import MapStore
 
     with MapStore.open(store, read_only=True) as maps:
@@ -57,7 +57,7 @@ def inspect(
     if json:
         _print_json(info, manifest, verdicts, history)
     else:
-        _print_tables(info, manifest, verdicts, history)
+        _print_words(info, manifest, verdicts, history)
 
 
 def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
@@ -95,41 +95,49 @@ def _print_json(
     print_json(shown)
 
 
-def _print_tables(
+_FIGURES = {
+    "path_m": "path {:.1f} m",
+    "duration_s": "{:.0f} s of driving",
+    "keyframes": "{} keyframes",
+    "ate_rmse_m": "{:.4f} m from the ground truth after alignment",
+}
+"""Of a build's report, in words; --json has all of it."""
+
+
+def _print_words(
     info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
 ) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from fleetmap.console import plain_console
+    from mapserver.quality.figures import trusted_calibrations
 
-    per_m = bytes_per_m(info, manifest)
-    console = Console()
-    console.print(
-        f"site {info.site} version {info.version}: {info.state}, parent {info.parent}, created {info.created}"
-    )
-    console.print(f"manifest {info.manifest_sha256}")
-    console.print(
-        f"{info.map_bytes} bytes for a robot" + ("" if per_m is None else f", {per_m:.0f} bytes per metre") + ", "
-        f"vocabulary {manifest.vocabulary.bytes} bytes {manifest.vocabulary.sha256}"
-    )
-    tiles = Table("x", "y", "landmarks", "bytes", "sha256", title=f"{info.tiles} tiles of {manifest.tile_size_m:g} m")
-    for tile in manifest.tiles:
-        tiles.add_row(str(tile.x), str(tile.y), str(tile.landmarks), str(tile.bytes), tile.sha256[:16])
-    console.print(tiles)
-    recordings = Table("recording", "frames", "sha256")
+    console, report, per_m = plain_console(), manifest.report, bytes_per_m(info, manifest)
+    built_on = "the first" if info.parent is None else f"built on version {info.parent}"
+    console.print(f"site {info.site} version {info.version}: {info.state}, {built_on}, created {info.created}")
+    sizes = f"{info.tiles} tiles of {manifest.tile_size_m:g} m, {info.landmarks} landmarks, {info.map_bytes} bytes for a robot"
+    console.print(sizes + ("" if per_m is None else f", {per_m:.0f} bytes per metre"))
+    figures = [words.format(report[key]) for key, words in _FIGURES.items() if isinstance(report.get(key), int | float)]
+    if isinstance(loops := report.get("loops"), dict):
+        figures.append(f"{loops.get('accepted', 0)} of {loops.get('candidates', 0)} possible loops accepted")
+    if figures:
+        console.print(", ".join(figures))
+    console.print(f"manifest {info.manifest_sha256}, vocabulary {manifest.vocabulary.sha256}")
+    findings = report.get("findings")
     for recording in manifest.recordings:
-        recordings.add_row(recording.name, str(recording.frames), recording.sha256[:16])
-    console.print(recordings)
-    report = Table("report", "value")
-    for key, value in manifest.report.items():
-        report.add_row(key, str(value))
-    console.print(report)
+        console.print(f"recording {recording.name}: {recording.frames} frames, SHA-256 {recording.sha256[:16]}")
+        for words in findings.get(recording.name, ()) if isinstance(findings, dict) else ():
+            console.print(f"  {words}")
+    for choice in trusted_calibrations(manifest):
+        console.print(choice.sentence)
     for verdict in verdicts:
-        word = "accepted" if verdict.accepted else "forced" if verdict.forced else "refused"
-        console.print(f"gate: {word}" + "".join(f"; {reason}" for reason in verdict.reasons))
+        word = "accepted" if verdict.accepted else "published by force" if verdict.forced else "refused"
+        console.print(f"gate: {word}, {_moment(verdict.stamp_ns)}")
+        for reason in verdict.reasons:
+            console.print(f"  {reason}")
     for event in history:
-        who = f" by {event.actor}" if event.actor else ""
-        why = f" ({event.reason})" if event.reason else ""
-        console.print(f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}")
+        if event.kind not in ("refused", "forced"):  # as the gate says above
+            who = f" by {event.actor}" if event.actor else ""
+            why = f" ({event.reason})" if event.reason else ""
+            console.print(f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}")
 
 
 def _moment(stamp_ns: int) -> str:
@@ -158,10 +166,11 @@ def diff(
 
 
 def _print_difference(found: "Difference") -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from fleetmap.console import plain_console
+
+    console = plain_console()
     table = Table("", "added", "changed", "removed", "kept", title=f"{found.site}: {found.before} to {found.after}")
     for name, *counts in (
         ("tiles", found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept),

@@ -12,7 +12,7 @@ from mapserver.commands.options import SiteName, StoreFolder, check_output
 
 
 def splats(
-    version: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
+    version: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
     site: SiteName,
     store: StoreFolder,
@@ -34,7 +34,7 @@ def splats(
 
 
 def changes(
-    before: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
+    before: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
     after: Annotated[int, typer.Argument(min=1, help="Another one.")],
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="File to write, .png or .geojson; replaced if it exists.")
@@ -79,7 +79,7 @@ class RefineOptions:
 
 @expand_options
 def refine(
-    version: Annotated[int, typer.Argument(min=1, help="Version that was built with [survey] surfel_map.")],
+    version: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
     recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
     site: SiteName,

@@ -102,9 +102,9 @@ def token(
 
 def list_(store: StoreFolder, json: Json = False) -> None:
     """List operators and programs with their roles, sessions and tokens."""
-    from rich.console import Console
     from rich.table import Table
 
+    from fleetmap.console import plain_console
     from mapserver.store import MapStore
 
     with MapStore.open(store, read_only=True) as maps:
@@ -116,7 +116,7 @@ def list_(store: StoreFolder, json: Json = False) -> None:
     table = Table("name", "role", "sessions", "tokens", "")
     for row in found:
         table.add_row(row.name, row.role, str(row.sessions), str(row.tokens), "disabled" if row.is_disabled else "")
-    Console().print(table)
+    plain_console().print(table)
 
 
 def _check_person(maps: "MapStore", name: str) -> None:

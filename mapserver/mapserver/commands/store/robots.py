@@ -89,9 +89,9 @@ def list_(
     json: Json = False,
 ) -> None:
     """Show the enrolled robots, the names in their certificates, and how long those last."""
-    from rich.console import Console
     from rich.table import Table
 
+    from fleetmap.console import plain_console
     from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
@@ -104,7 +104,7 @@ def list_(
     for row in rows:
         enrolled = datetime.fromtimestamp(row.enrolled_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
         table.add_row(row.site, row.robot, row.certificate, enrolled, row.state)
-    Console().print(table)
+    plain_console().print(table)
 
 
 ROBOTS = Group(

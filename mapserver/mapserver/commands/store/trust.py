@@ -245,9 +245,9 @@ def revoke(site: SiteArgument, people: PeopleOptions, public: PublicKeys = None)
 
 def status(store: StoreFolder, json: Json = False) -> None:
     """Show every role with its keys and the days that it lasts; status 1 where robots take no new maps, now or soon."""
-    from rich.console import Console
     from rich.table import Table
 
+    from fleetmap.console import plain_console
     from mapserver.store import MapStore
     from mapserver.trust.status import trust_status
 
@@ -260,7 +260,7 @@ def status(store: StoreFolder, json: Json = False) -> None:
         for role in found.roles:
             left = "" if role.days_left is None else f"{role.days_left:.1f}"
             table.add_row(role.role, str(role.number), str(role.keys), str(role.threshold), left, role.fault)
-        console = Console()
+        console = plain_console()
         console.print(table)
         for words in found.risks:
             console.print(words, style="yellow", markup=False, highlight=False)
