@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fleetmap.bus import Bus
     from fleetmap.trust.enrolment import CertificateInfo
 
-_RENEW_AFTER = timedelta(days=30)  # of 365: a robot that was parked for eleven months comes back
+_LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot that was parked for eleven months comes back
 _ANSWER_S = 20.0
 _ENROL = "enrol it: `mapserver robots enrol ROBOT --site SITE` on the server, `locclient enrol ROBOT.fleetmap` here"
 
@@ -71,8 +71,9 @@ class RobotIdentity:
         return certificate_info(self._read("robot.pem"))
 
     def is_renewal_due(self, now: datetime) -> bool:
-        """Whether the certificate is a month old."""
-        return now - self.certificate().begins > _RENEW_AFTER
+        """Whether the certificate is a month old, or was signed while the server's clock was ahead."""
+        left = self.certificate().ends - now
+        return not _LIFE - _RENEW_AFTER <= left <= _LIFE + timedelta(days=1)
 
     def renew(self, bus: "Bus") -> None:
         """Another key and certificate in the place of the present ones; connections that stand are not touched.

@@ -11,7 +11,11 @@ from typing import Any
 from fleetmap.messages import robot_key
 
 SITE_ANSWERS = ("manifests", "blobs", "patches", "trust")
-ROBOT_KEYS = ("ack", "health", "pose", "estimate", "wanted", "initial_pose", "failures", "replays", "alive", "renew")
+REPORTS = ("ack", "health", "pose", "estimate")
+QUESTIONS = ("wanted", "failures", "replays", "renew")
+ORDERS = ("wanted", "initial_pose")
+"""What the server alone publishes, to the robot that it is for: a copied identity could move its original otherwise."""
+ALIVE = ("alive",)
 # Far above what robots send: one message is dropped where two come closer together, without a burst.
 _MOST_HZ = {"ack": 10.0, "health": 10.0, "pose": 60.0, "estimate": 60.0}
 _REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20
@@ -101,12 +105,14 @@ class Access:
 
     def zenoh_config(self) -> dict[str, Any]:
         """Sections of zenoh's configuration that enforce the rules, and bound how often and how much a participant sends."""
-        rules = {rule.id: rule for holder in self._holders.values() for rule in _rules(holder)}
-        policies = [{"rules": [r.id for r in _rules(h)], "subjects": [h.certificate]} for h in self._holders.values()]
-        if not rules:  # zenoh refuses empty lists, and lists that are missing
-            rules = {_NOBODY: Rule(_NOBODY, Direction.IN, (Act.PUT,), (_NOBODY,))}
-            policies = [{"rules": [_NOBODY], "subjects": [_NOBODY]}]
-        subjects = [{"id": name, "cert_common_names": [name]} for name in self._holders or (_NOBODY,)]
+        groups: dict[tuple[Rule, ...], list[str]] = {}  # the certificates of one robot have the same rules
+        for holder in self._holders.values():
+            groups.setdefault(_rules(holder), []).append(holder.certificate)
+        if not groups:  # zenoh refuses empty lists, and lists that are missing
+            groups = {(Rule(_NOBODY, Direction.IN, (Act.PUT,), (_NOBODY,)),): [_NOBODY]}
+        rules = {rule.id: rule for group in groups for rule in group}
+        subjects = [{"id": names[0], "cert_common_names": names} for names in groups.values()]
+        policies = [{"rules": [r.id for r in group], "subjects": [names[0]]} for group, names in groups.items()]
         return {
             "access_control": {
                 "enabled": True,
@@ -146,21 +152,31 @@ def _includes(chunks: Sequence[str], others: Sequence[str]) -> bool:
 
 
 def _rules(holder: Holder) -> tuple[Rule, ...]:
-    name = holder.certificate
     if holder.purpose is Purpose.SURVEY:
-        return (Rule(f"{name}-says", Direction.IN, (Act.PUT,), ("fleetmap/*/live/survey",)),)
-    whats = ("renew",) if holder.purpose is Purpose.ENROL else ROBOT_KEYS
-    own = tuple(robot_key(holder.site, holder.robot, what) for what in whats)
+        return (Rule("survey-says", Direction.IN, (Act.PUT,), ("fleetmap/*/live/survey",)),)
+
+    def own(whats: Iterable[str]) -> tuple[str, ...]:
+        return tuple(robot_key(holder.site, holder.robot, what) for what in whats)
+
+    name = f"{holder.site}/{holder.robot}"
+    # A question and its answer are two messages in two directions; an answer that is an error is one too.
     if holder.purpose is Purpose.ENROL:
-        says = (Act.QUERY,)
-        return Rule(f"{name}-says", Direction.IN, says, own), Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), own)
-    maps = tuple(f"fleetmap/{holder.site}/{what}/*" for what in SITE_ANSWERS)
+        renew = own(("renew",))
+        return (
+            Rule(f"{name}-enrols", Direction.IN, (Act.QUERY,), renew),
+            Rule(f"{name}-enrolled", Direction.OUT, (Act.REPLY,), renew),
+        )
+    maps = tuple(f"fleetmap/{holder.site}/{what}/*" for what in SITE_ANSWERS)  # as robots of before ask
+    questions = own((*QUESTIONS, *(f"{what}/*" for what in SITE_ANSWERS)))
     return (
-        # A question and its answer are two messages in two directions; an answer that is an error is one too.
         Rule(f"{holder.site}-asks", Direction.IN, (Act.QUERY,), maps),
         Rule(f"{holder.site}-told", Direction.OUT, (Act.REPLY,), maps),
-        Rule(f"{name}-says", Direction.IN, (Act.PUT, Act.QUERY, Act.SHOW_ALIVE, Act.SUBSCRIBE), own),
-        Rule(f"{name}-told", Direction.OUT, (Act.PUT, Act.REPLY), own),
+        Rule(f"{name}-asks", Direction.IN, (Act.QUERY,), questions),
+        Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), questions),
+        Rule(f"{name}-reports", Direction.IN, (Act.PUT,), own(REPORTS)),
+        Rule(f"{name}-listens", Direction.IN, (Act.SUBSCRIBE,), own(ORDERS)),
+        Rule(f"{name}-ordered", Direction.OUT, (Act.PUT,), own(ORDERS)),
+        Rule(f"{name}-alive", Direction.IN, (Act.SHOW_ALIVE,), own(ALIVE)),
     )
 
 

@@ -395,6 +395,18 @@ def trust_key(site: str, file: str) -> str:
     return f"{_ROOT}/{site}/trust/{file}"
 
 
+def own_map_key(key: str, robot: str) -> str:
+    """The key under which a robot asks for what lies under the key of a map: the server's rules let it ask in no other name."""
+    root, site, rest = key.split("/", 2)
+    return f"{root}/{site}/robots/{robot}/{rest}"
+
+
+def shared_map_key(key: str) -> str:
+    """The key of a map that a robot asks for; inverse of `own_map_key`, and other keys as they are."""
+    chunks = key.split("/")
+    return "/".join((*chunks[:2], *chunks[4:])) if len(chunks) == 6 and chunks[2] == "robots" else key
+
+
 def split_key(key: str) -> tuple[str, str, str]:
     """Site, robot (or 'live', 'manifests', 'blobs', 'patches', 'trust') and last chunk of a key; raises LinkError for any other."""
     chunks = key.split("/") if len(key) <= _MAX_KEY else []

@@ -69,7 +69,7 @@ class World:
         self.heard: list[str] = []
         self.server.subscribe("fleetmap/*/robots/*/health", lambda key, _: self.heard.append(key))
         self.server.subscribe("fleetmap/*/live/*", lambda key, _: self.heard.append(key))
-        for what in ("robots/*/wanted", "blobs/*", "robots/*/renew"):
+        for what in ("robots/*/wanted", "blobs/*", "robots/*/blobs/*", "robots/*/renew"):
             self.server.queryable(f"fleetmap/*/{what}", lambda *_: b"honest")
 
     def join(self, certificate: str) -> Bus:
@@ -118,6 +118,8 @@ ALLOWED, DENIED = "honest", "silenced"
     [
         (OWN + "wanted", ALLOWED),
         ("fleetmap/hall/blobs/00ff", ALLOWED),
+        (OWN + "blobs/00ff", ALLOWED),
+        (OTHERS + "blobs/00ff", DENIED),
         (OWN + "renew", ALLOWED),
         (OTHERS + "wanted", DENIED),
         (OTHERS + "renew", DENIED),
@@ -206,6 +208,36 @@ def test_nobody_hears_what_is_for_others(make: Callable[[bool], World], is_guard
         assert set(heard) == {OWN + "wanted", OWN + "initial_pose"}
     else:
         assert OTHERS + "wanted" in heard, "the control"
+
+
+def test_only_the_server_orders_robots(make: Callable[[bool], World]) -> None:
+    """A copied identity: it moves neither its original nor others, and cannot answer in their place either."""
+    for is_guarded in (True, False):
+        world = make(is_guarded)
+        original, other = world.join("a.1"), world.join("b.1")
+        kinds = ("client",) if world.kind == "client" else (world.kind, "client")[: 1 + (world.kind == "peer")]
+        for kind in kinds:  # whoever attacks chooses the mode
+            before, world.kind = world.kind, kind
+            copy = world.join("a.1")
+            world.kind = before
+            heard: list[tuple[str, bytes]] = []
+            for bus, own in ((original, OWN), (other, OTHERS)):
+                for what in ("wanted", "initial_pose", "renew", "*"):
+                    bus.subscribe(own + what, lambda *sample, h=heard: h.append(sample))
+            copy.queryable(OWN + "wanted", lambda *_: b"EVIL")
+            world.settle()
+            for own in (OWN, OTHERS):
+                for what in ("wanted", "initial_pose", "renew", "failures", "alive"):
+                    copy.publish(own + what, b"EVIL")
+            world.settle()
+            said = answer(original, OWN + "wanted")
+            world.server.publish(OWN + "initial_pose", b"honest")
+            assert eventually(lambda h=heard: (OWN + "initial_pose", b"honest") in h, 5)
+            if is_guarded:
+                assert {payload for _, payload in heard} == {b"honest"}
+                assert said == ALLOWED
+            elif kind == "client":
+                assert (OWN + "initial_pose", b"EVIL") in heard, "the control"
 
 
 def test_presence_is_shown_for_oneself_alone(make: Callable[[bool], World]) -> None:
@@ -336,7 +368,7 @@ def test_rules_of_nobody_and_of_many() -> None:
     assert config["default_permission"] == "deny"
     assert all(config[name] for name in ("rules", "subjects", "policies"))
     many = Access(Holder(f"r{n}.1", f"s{n % 3}", f"r{n}") for n in range(300)).zenoh_config()["access_control"]
-    assert len(many["rules"]) == 3 * 2 + 300 * 2
+    assert len(many["rules"]) == 3 * 2 + 300 * 6
     assert len({rule["id"] for rule in many["rules"]}) == len(many["rules"])
     assert not ACCESS.permits("a.1", Direction.IN, Act.ANSWER, "fleetmap/hall/blobs/*")
     assert not ACCESS.permits("a.1", Direction.IN, Act.SUBSCRIBE, "fleetmap/hall/robots/*/wanted")

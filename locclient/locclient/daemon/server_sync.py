@@ -80,15 +80,16 @@ class ServerSync:
         if now_s < self._silent_until_s or not self.client.connected():
             return
         try:
+            # First: with a certificate that was renewed, and whose answer got lost, nothing else may be asked.
+            if now_s >= self._upkeep_at_s:
+                self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
+                self._upkeep()
             self._publish_health()
             self._deliver(now_s)
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
             self._send_replay(now_s)
-            if now_s >= self._upkeep_at_s:
-                self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
-                self._upkeep()
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
             self._silent_until_s = self._clock_s() + self._backoff_s

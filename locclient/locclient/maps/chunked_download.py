@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-from fleetmap.bus import Bus
+from fleetmap.bus import Bus, RobotQuestions
 from fleetmap.errors import LinkError, UnreachableError
 from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message
 
@@ -15,7 +15,12 @@ class ChunkReader:
     """Reads what a server sends in chunks. Chunks of an incomplete download are kept over errors and calls."""
 
     def __init__(
-        self, bus: Bus, *, timeout_s: float, patience_s: float, clock_s: Callable[[], float] = time.monotonic
+        self,
+        bus: Bus | RobotQuestions,
+        *,
+        timeout_s: float,
+        patience_s: float,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """timeout_s: for each chunk. patience_s: without any chunk, after which a read gives up; a later one resumes it."""
         self._bus = bus

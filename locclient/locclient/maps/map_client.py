@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from fleetmap.bus import Bus, Handle
+from fleetmap.bus import Bus, Handle, RobotQuestions
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import (
@@ -66,7 +66,7 @@ class MapClient(MapSource):
         self._bus, self._cache = bus, cache
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
-        self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
+        self._chunks = ChunkReader(RobotQuestions(bus, robot), timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
         self.takes_grids = False  # of planners, where versions have them; a robot localizes without
         self._begun = ""  # the manifest's address of the version that was admitted last

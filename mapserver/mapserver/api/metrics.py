@@ -58,6 +58,7 @@ _SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] 
     ("robots_seen", "Robots that reported in the last minute.", lambda robots: len(_seen(robots))),
     ("robots_current", "Robots on the wanted version.", lambda robots: sum(map(_is_current, robots))),
     ("robots_present", "Robots on the bus now.", lambda robots: sum(robot.is_present is True for robot in robots)),
+    ("robots_copied", "Robots that were connected twice.", lambda robots: sum(robot.is_copied for robot in robots)),
     (
         "clock_skew_max_seconds",
         "The most that a robot's clock is wrong.",

@@ -31,6 +31,7 @@ _STOP_WITHIN_S = 5  # requests under way may take so long still
 _END_WITHIN_S = 5.0  # and what works on threads so long after that
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
+_WARN_EVERY_S = 86_400.0
 _VIEW_EVERY_S = 0.5
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
@@ -135,6 +136,8 @@ class HttpOptions(OidcOptions):
         )
         if fault and not self.insecure:
             raise UsageError(fault)
+        if certificate is not None:
+            certificate.warn(frozenset(given))
         names = {host.lower(), *given} | (certificate.names() if certificate else frozenset())
         return GuardSettings(
             names=frozenset(names),
@@ -262,7 +265,7 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        groups = [tasks, admission_tasks(robots), alert_tasks(maps, fleet, settings.alerts, webhook)]
+        groups = [tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook)]
         if http.shown is not None:  # apart from the others: no robot waits for a viewer
             from mapserver.serving.fleet_viewer import FleetViewer
 
@@ -307,6 +310,7 @@ def _run(
 
         config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
         renew = partial(http.certificate.renew, config.ssl)
+        tasks.append(BackgroundTask("looking at the certificate of HTTP", _WARN_EVERY_S, http.certificate.warn))
         tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.

@@ -46,6 +46,7 @@ class LiveRobot:
     flags: tuple[str, ...]
     refused: str
     is_canary: bool
+    is_copied: bool
     clock_ahead_s: float | None
     metrics: Mapping[str, Any]
     calibration: tuple[CalibrationFigure, ...] = ()
@@ -120,6 +121,7 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         flags=tuple(health.get("flags", ())),
         refused=str((status.last_ack or {}).get("refused", "")),
         is_canary=status.is_canary,
+        is_copied=status.is_copied,
         clock_ahead_s=status.clock_ahead_s,
         metrics=health.get("metrics") or {},
         calibration=calibration_figures(health),

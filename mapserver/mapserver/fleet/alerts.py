@@ -1,16 +1,19 @@
 """What somebody should be told at once: robots fail too often, one stays lost, a night failed, a version was rolled back."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
 
 from fleetmap.config import Section
+from fleetmap.errors import StateError
 from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, figure, hour_of, kpis
 from mapserver.store import MapStore
+from mapserver.trust.status import trust_status
 
 _HEARD_WITHIN_S = 60.0
 _RATE_HOURS = 24
@@ -34,7 +37,8 @@ class AlertSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """Something that holds now. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapNightFailed or FleetmapCanaryRolledBack.
+    """Something that holds now. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapNightFailed,
+    FleetmapCanaryRolledBack or FleetmapTrustFault.
 
     about: the robot, job or version that it is about, empty for a site as a whole; since_ns: since when, nanoseconds since 1970.
     """
@@ -52,8 +56,14 @@ class Alert:
 
 
 def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
-    """All that hold now, by site; errors are the store's."""
-    return [alert for info in store.sites() for alert in _of_site(store, fleet, settings, (info.site, now_ns))]
+    """All that hold now, by site, and behind them faults of lists and certificates; errors are the store's."""
+    found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, (info.site, now_ns))]
+    with suppress(StateError):  # a store that is not signed
+        found += [
+            Alert("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
+            for fault in trust_status(store).faults
+        ]
+    return found
 
 
 def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site_now: tuple[str, int]) -> Iterator[Alert]:
@@ -61,6 +71,9 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site_now: t
     yield from _failure_rate(store, settings, site, now_ns)
     for robot in fleet.robots(site):
         yield from _lost(robot, settings, now_ns)
+        if robot.is_copied:
+            words = f"{robot.robot} of {site} was connected twice; was its certificate copied? `mapserver robots revoke` ends it"
+            yield Alert("FleetmapRobotCopied", site, robot.robot, now_ns, words)
     night = store.last_night(site)
     if night is not None and night.state == "failed":
         words = f"the night of {site} failed (job {night.id}): {night.message}"

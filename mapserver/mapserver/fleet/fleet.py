@@ -38,6 +38,7 @@ MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and 
 FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
 _FORGET_AFTER_NS = 600_000_000_000
 _GAP_NS = 60_000_000_000  # who was silent for longer begins anew
+_COPIED_NS = 3_600_000_000_000  # a copy that came for a minute is told for so long
 _USUAL = IngestSettings()
 
 
@@ -46,9 +47,10 @@ class RobotStatus:
     """One robot. version: what it runs, None before it said so; seconds_since: since it said anything.
 
     is_canary: whether it tries a version before the others. is_present: its liveliness token, None before the first look.
-    state_since_ns: since when, by the server's clock, it is localised, unsure (DEGRADED) or not localised, whichever it is now; None
-    before it reported. clock_ahead_s: by how much its wall clock is ahead of the server's, None before it reported. last_ack,
-    last_health and last_pose are its last messages as plain values, None before the first.
+    is_copied: whether its certificate was on two connections at once within the last hour. state_since_ns: since when, by the
+    server's clock, it is localised, unsure (DEGRADED) or not localised, whichever it is now; None before it reported. clock_ahead_s: by
+    how much its wall clock is ahead of the server's, None before it reported. last_ack, last_health and last_pose are its last messages
+    as plain values, None before the first.
     """
 
     site: str
@@ -57,6 +59,7 @@ class RobotStatus:
     wanted_version: int | None
     is_canary: bool
     is_present: bool | None
+    is_copied: bool
     clock_ahead_s: float | None
     seconds_since: float
     state_since_ns: int | None
@@ -74,6 +77,7 @@ class _Robot:
     skew: ClockSkew = field(default_factory=ClockSkew)
     is_present: bool | None = None
     is_stored: bool = False
+    copied_ns: int | None = None
 
 
 class Fleet:
@@ -141,7 +145,9 @@ class Fleet:
             is_gap = known is None or now_ns - known.seen_ns > _GAP_NS
             entry = self._entry(site, robot, now_ns, health.version)
             last = entry.report.get("health") or {}
-            if is_gap or _state(last.get("status")) != _state(health.status) or "state_since_ns" not in entry.report:
+            since_ns = entry.report.get("state_since_ns")
+            is_gap = is_gap or since_ns is None or since_ns > now_ns  # from before the clock was set back
+            if is_gap or _state(last.get("status")) != _state(health.status):
                 entry.report["state_since_ns"] = now_ns
             if health.wall_ns is not None:
                 entry.skew.take(health.wall_ns, now_ns)
@@ -209,6 +215,13 @@ class Fleet:
                     self._ingest.forget(key)
                 robot.is_stored = key in stored
 
+    def take_copied(self, copied: Iterable[tuple[str, str]]) -> None:
+        """Notes robots (site, name) whose certificate is on two connections now."""
+        with self._lock:
+            for key in copied:
+                if key in self._robots:
+                    self._robots[key].copied_ns = self._clock_ns()
+
     def flush(self) -> None:
         """Brings what was counted to the disk; raises StoreError where it refuses, and keeps it for the next time."""
         if self._ingest.has_counted():
@@ -228,6 +241,8 @@ class Fleet:
         """All robots (of a site), by site and name."""
         now_ns = self._clock_ns()
         with self._lock:
+            for robot in self._robots.values():
+                robot.seen_ns = min(robot.seen_ns, now_ns)  # the clock was set back: from now on silence counts
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
         assignments: dict[str, VersionAssignment] = {}
         for key, _ in chosen:
@@ -267,6 +282,7 @@ def _status(key: tuple[str, str], robot: _Robot, assignment: VersionAssignment, 
         wanted_version=assignment.wanted(key[1]).version,
         is_canary=assignment.is_canary(key[1]),
         is_present=robot.is_present,
+        is_copied=robot.copied_ns is not None and abs(now_ns - robot.copied_ns) < _COPIED_NS,
         clock_ahead_s=robot.skew.ahead_s,
         seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
         state_since_ns=robot.report.get("state_since_ns"),

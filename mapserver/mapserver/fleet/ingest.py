@@ -185,6 +185,8 @@ class Ingest:
     def _is_trace_due(self, stream: _Stream, health: RobotHealth, now_ns: int) -> bool:
         """Thinned by time; a changed status is kept, but no more than one a second."""
         quiet_ns = now_ns - stream.trace_ns
+        if quiet_ns < 0:  # the clock was set back
+            quiet_ns = _DAY_NS
         is_changed = health.status != stream.status and quiet_ns >= _LEAST_BETWEEN_TRACES_NS
         due = quiet_ns >= self._settings.trace_every_s * 1e9 or is_changed
         if due:

@@ -39,5 +39,5 @@ class RateLimit:
         self._buckets = {
             key: (level, then_ns)
             for key, (level, then_ns) in self._buckets.items()
-            if level + (now_ns - then_ns) * self._per_ns < self._burst
+            if level + abs(now_ns - then_ns) * self._per_ns < self._burst
         }

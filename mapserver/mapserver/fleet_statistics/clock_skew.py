@@ -18,9 +18,11 @@ class ClockSkew:
     def take(self, robot_ns: int, server_ns: int) -> None:
         """One message's stamp and when it came."""
         ahead_ns = robot_ns - server_ns
-        if self._begun_ns is None or server_ns - self._begun_ns >= _WINDOW_NS:
+        if self._begun_ns is None or not 0 <= server_ns - self._begun_ns < _WINDOW_NS:
+            # What was compared with a clock that was set back since is worth nothing.
+            is_set_back = self._begun_ns is not None and server_ns < self._begun_ns
             self._begun_ns = server_ns
-            self._best_ns = [None, self._best_ns[0]]
+            self._best_ns = [None, None if is_set_back else self._best_ns[0]]
         newest = self._best_ns[0]
         self._best_ns[0] = ahead_ns if newest is None else max(newest, ahead_ns)
 

@@ -69,13 +69,18 @@ def alert_tasks(
     return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, watch.look)]
 
 
-def admission_tasks(guard: BusGuard | None) -> list[BackgroundTask]:
+def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:
     """Those of the bus's door. Apart from the others, because a robot that was stolen must not wait for them."""
     if guard is None:
         return []
+
+    def look() -> None:
+        guard.look()
+        fleet.take_copied(guard.copied)
+
     return [
         BackgroundTask("admitting robots", _ADMIT_EVERY_S, guard.follow),
-        BackgroundTask("looking at who is connected", _CONNECTED_EVERY_S, guard.look),
+        BackgroundTask("looking at who is connected", _CONNECTED_EVERY_S, look),
     ]
 
 

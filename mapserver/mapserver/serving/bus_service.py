@@ -20,9 +20,11 @@ from fleetmap.messages import (
     decode_message,
     encode_message,
     manifest_key,
+    own_map_key,
     part_of,
     patch_key,
     robot_key,
+    shared_map_key,
     split_key,
     trust_key,
 )
@@ -76,10 +78,17 @@ class BusService:
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
             bus.queryable(robot_key("*", "*", "replays"), self._counted("replay", self._replay)),
-            bus.queryable(manifest_key("*", "*"), self._counted("manifest", self._parts(self._manifest))),
-            bus.queryable(blob_key("*", "*"), self._counted("blob", self._parts(self._blob))),
-            bus.queryable(patch_key("*", "*", "*"), self._counted("patch", self._parts(self._patch))),
-            bus.queryable(trust_key("*", "*"), self._counted("trust", self._parts(self._list_file))),
+            # Under a robot's own keys, where the queue serves robots in turn, and for robots of before under those that all share.
+            *(
+                bus.queryable(key, self._counted(what, self._parts(answer)))
+                for shared, what, answer in (
+                    (manifest_key("*", "*"), "manifest", self._manifest),
+                    (blob_key("*", "*"), "blob", self._blob),
+                    (patch_key("*", "*", "*"), "patch", self._patch),
+                    (trust_key("*", "*"), "trust", self._list_file),
+                )
+                for key in (own_map_key(shared, "*"), shared)
+            ),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
             bus.subscribe(live_key("*"), self._hear_survey),
         ]
@@ -133,7 +142,7 @@ class BusService:
         return counted
 
     def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
-        return lambda key, question: part_of(whole(key), question)
+        return lambda key, question: part_of(whole(shared_map_key(key)), question)
 
     def _sender(self, key: str) -> tuple[str, str]:
         """Site and robot of a robot's key; LinkError for one that may not speak, also where the bus let it through."""

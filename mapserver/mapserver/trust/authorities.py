@@ -8,6 +8,7 @@ A robot's certificate cannot play the server: another authority signed it, for a
 """
 
 import ipaddress
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -24,12 +25,14 @@ from fleetmap.bus import TlsFiles
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.trust.enrolment import certificate_info
 from mapserver.store.files import make_folder, write_atomically
+from mapserver.trust.http_certificate import ENDS_SOON_DAYS, check_times
 from mapserver.trust.keys import credential
 
 SERVERS_CA, ROBOTS_CA, SERVER = "servers-ca", "robots-ca", "server"
 DAYS = {SERVERS_CA: 3650, ROBOTS_CA: 1825, SERVER: 397, "robot": 365, "enrol": 1, "survey": 7}
 _BEGINS_EARLIER = timedelta(minutes=10)  # clocks of robots differ
 _PEM = s.Encoding.PEM
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,9 @@ class Authority:
         use = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
         names: list[x509.GeneralName] = [_host(host) for host in hosts]
         built = (
+            # Valid since its authority is: where the clock was ahead when it was signed, it would be refused once that is right.
             _builder(name, self.certificate.subject, key, days)
+            .not_valid_before(self.certificate.not_valid_before_utc)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(x509.ExtendedKeyUsage([use]), critical=False)
             .add_extension(
@@ -134,6 +139,21 @@ class Authorities:
         ends = {file: certificate_info(self._read(file)).ends for file in files}
         return {file: (end - self._now).total_seconds() / 86_400 for file, end in ends.items()}
 
+    def check(self) -> None:
+        """Raises UsageError for certificates of the bus that ended or have not begun, and for a key that does not fit."""
+        for file, step in (
+            (f"{SERVER}.pem", "`mapserver trust rotate server`"),
+            (f"{ROBOTS_CA}.crt", "`mapserver trust rotate robots-ca`, and enrol all robots anew"),
+            (f"{SERVERS_CA}.crt", "make a new store of keys, and enrol all robots anew"),
+        ):
+            found = x509.load_pem_x509_certificate(self._read(file))
+            check_times(self._path(file), found, self._now, step)
+            left = (found.not_valid_after_utc - self._now).days
+            if left < ENDS_SOON_DAYS:
+                _log.warning("%s ends in %d days, then no robot connects; %s", self._path(file), left, step)
+        if fault := self.tls.fault():
+            raise UsageError(f"{fault}; restore it, or make another one: `mapserver trust rotate server`")
+
     def _robots_ca(self) -> Authority:
         key = _load(self._path(f"{ROBOTS_CA}.pem"), credential(ROBOTS_CA))
         return Authority(key, x509.load_pem_x509_certificate(self._read(f"{ROBOTS_CA}.crt")))
@@ -153,6 +173,7 @@ class Authorities:
         key, subject = ec.generate_private_key(ec.SECP256R1()), _name(f"fleetmap {name}")
         built = (
             _builder(f"fleetmap {name}", subject, key.public_key(), DAYS[name])
+            .not_valid_before(datetime.now(UTC) - _BEGINS_EARLIER)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(x509.KeyUsage(False, False, False, False, False, True, True, False, False), critical=True)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -202,7 +223,6 @@ def _builder(name: str, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days:
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BEGINS_EARLIER)
         .not_valid_after(now + timedelta(days=days))
     )
 

@@ -3,6 +3,7 @@
 STORE/keys/robots.json names them. Whoever stands there is in the rules of the bus, and nobody else.
 """
 
+import hashlib
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ LISTENING = "tls/0.0.0.0:7447"
 
 SURVEY = Holder("live.survey", purpose=Purpose.SURVEY)
 _DAY_NS = 86_400_000_000_000
+_RULES_NS = _DAY_NS // 2
 _MAX_ROBOTS = 20_000
 _NAME_LENGTH = 40  # a certificate's name has 64 signs at most; the mark behind it makes it unique
 
@@ -36,7 +38,8 @@ _NAME_LENGTH = 40  # a certificate's name has 64 signs at most; the mark behind 
 class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
     """One robot. key: fingerprint of the key that may renew; before: of the one whose place it took, for an answer that was lost.
 
-    renewed_ns: when it got its last certificate, None while its bundle waits.
+    mark: at the end of the name in its certificates, another one after each renewal, so that rules can tell them apart; mark_before:
+    of the certificate before. renewed_ns: when it got its last certificate, None while its bundle waits.
     """
 
     site: str
@@ -44,13 +47,34 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
     mark: str
     key: str
     before: str = ""
+    mark_before: str = ""
     enrolled_ns: int
     renewed_ns: int | None = None
 
     @property
     def certificate(self) -> str:
         """Name in its certificates."""
-        return f"{self.robot[:_NAME_LENGTH]}.{self.mark}"
+        return self._named(self.mark)
+
+    @property
+    def next_mark(self) -> str:
+        """Mark of its next certificate: known before, so that a renewal need not change the rules."""
+        return hashlib.sha256(self.mark.encode()).hexdigest()[:8]
+
+    def holders(self, now_ns: int) -> Iterator[Holder]:
+        """Who may speak as this robot. A certificate that was renewed ends after 12 to 24 hours, for all robots in the same moment,
+        because new rules interrupt everybody: from then on it may only ask for the renewal, whose answer may have been lost."""
+        yield Holder(self.certificate, self.site, self.robot)
+        started_ns = (now_ns // _RULES_NS - 1) * _RULES_NS
+        is_new = self.renewed_ns is None or started_ns <= self.renewed_ns <= now_ns + _RULES_NS
+        if self.mark_before:
+            purpose = Purpose.ROBOT if is_new else Purpose.ENROL
+            yield Holder(self._named(self.mark_before), self.site, self.robot, purpose)
+        if not is_new:
+            yield Holder(self._named(self.next_mark), self.site, self.robot)
+
+    def _named(self, mark: str) -> str:
+        return f"{self.robot[:_NAME_LENGTH]}.{mark}"
 
     @property
     def bundle(self) -> str:
@@ -121,7 +145,7 @@ class RobotRegister:
         """The rules for the bus as of now."""
         now_ns, holders = self._store.now_ns(), [SURVEY]
         for entry in self.robots():
-            holders.append(Holder(entry.certificate, entry.site, entry.robot))
+            holders.extend(entry.holders(now_ns))
             # Used ones too, for as long as their certificate lasts: a copy then hears why it is refused, and stands in the log.
             if now_ns - entry.enrolled_ns < DAYS["enrol"] * _DAY_NS:
                 holders.append(Holder(entry.bundle, entry.site, entry.robot, Purpose.ENROL))
@@ -203,15 +227,26 @@ class RobotRegister:
                 is_repeated = (asked.old_fingerprint, asked.new_fingerprint) == (entry.before, entry.key)
                 if asked.old_fingerprint != entry.key and not is_repeated:
                     raise LinkError("this key may not renew; was the bundle used before, or a key restored?")
+                if not is_repeated:
+                    marks = {"mark": entry.next_mark, "mark_before": entry.mark} if entry.renewed_ns is not None else {}
+                    entry = msgspec.structs.replace(
+                        entry,
+                        key=asked.new_fingerprint,
+                        before=asked.old_fingerprint,
+                        renewed_ns=self._store.now_ns(),
+                        **marks,
+                    )
                 certificate = self.authorities.sign_robot(asked.new_key, entry.certificate)
-                entries[site, robot] = msgspec.structs.replace(
-                    entry, key=asked.new_fingerprint, before=asked.old_fingerprint, renewed_ns=self._store.now_ns()
-                )
+                entries[site, robot] = entry
         except LinkError as error:
             self._store.audit("renewal refused", f"{robot[:64]}: {error}"[:2000], site=site[:64])
             raise
         self._store.audit("robot renewed", f"{robot}, key {asked.new_fingerprint[:12]}", site=site)
         return encode_message(RenewalAnswer(certificate=certificate.decode(), servers=self.authorities.servers))
+
+    def note_copied(self, site: str, robot: str) -> None:
+        """Notes in the site's history that a robot's certificate was on two connections."""
+        self._store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
 
     def survey_tls(self) -> TlsFiles:
         """Files for a survey of this account that shows itself on the bus; StateError where the store has no authorities."""

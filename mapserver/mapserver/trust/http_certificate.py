@@ -2,10 +2,17 @@
 
 import logging
 import ssl
+from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fleetmap.errors import UsageError, disk_errors
 
+if TYPE_CHECKING:
+    from cryptography import x509
+
+ENDS_SOON_DAYS = 14
 _log = logging.getLogger(__name__)
 
 
@@ -17,16 +24,37 @@ class HttpCertificate:
         self._load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER))
         self._loaded = self._mark()
 
+    def warn(self, names: frozenset[str] = frozenset()) -> None:
+        """Says in the log what clients will refuse soon, or already. names: by which the server is to be reached."""
+        from cryptography import x509
+        from cryptography.x509.oid import ExtensionOID
+
+        chain = x509.load_pem_x509_certificates(self.certificate.read_bytes())
+        left = (chain[0].not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86_400
+        if left < ENDS_SOON_DAYS:
+            ends = f"{chain[0].not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
+            _log.warning("%s ends at %s, in %.1f days; put a renewed one in its place", self.certificate, ends, left)
+        own = _names(chain[0])
+        for name in sorted(names):
+            if name not in own and f"*.{name.partition('.')[2]}" not in own:
+                _log.warning(
+                    "%s is not for %s: it names %s", self.certificate, name, ", ".join(sorted(own)) or "nothing"
+                )
+        # Authorities that everybody knows sign by others of theirs, which clients do not know.
+        is_public = any(ext.oid == ExtensionOID.AUTHORITY_INFORMATION_ACCESS for ext in chain[0].extensions)
+        followers = list(pairwise(chain))
+        if (is_public and not followers) or any(one.issuer != by.subject for one, by in followers):
+            issuer = chain[0].issuer.rfc4514_string()
+            _log.warning("%s does not go on with the certificate of %s; give the full chain", self.certificate, issuer)
+        if self.key.stat().st_mode & 0o007:
+            _log.warning("every account of this machine can use the key %s; `chmod o= %s`", self.key, self.key)
+
     def names(self) -> frozenset[str]:
         """The DNS names that the certificate is for, those with a wildcard left out."""
         from cryptography import x509
 
         found = x509.load_pem_x509_certificate(self.certificate.read_bytes())
-        try:
-            extension = found.extensions.get_extension_for_class(x509.SubjectAlternativeName)
-        except x509.ExtensionNotFound:
-            return frozenset()
-        return frozenset(name.lower() for name in extension.value.get_values_for_type(x509.DNSName) if "*" not in name)
+        return frozenset(name for name in _names(found) if "*" not in name)  # addresses are let in anyway
 
     def renew(self, context: ssl.SSLContext) -> None:
         """Gives new connections the files' present content, where it is another one and fits together; else goes on with the old."""
@@ -52,9 +80,36 @@ class HttpCertificate:
                 f"--http-cert {self.certificate} and --http-key {self.key} cannot be served ({error}); give a certificate and its "
                 "unencrypted key as PEM files"
             ) from error
+        from cryptography import x509
+
+        found = x509.load_pem_x509_certificate(self.certificate.read_bytes())
+        check_times(self.certificate, found, datetime.now(UTC), "put a renewed one and its key in their place")
 
     def _mark(self) -> tuple[int, ...]:
         with disk_errors(f"{self.certificate} or {self.key} cannot be read", "check the paths and their rights"):
             return tuple(
                 mark for path in (self.certificate, self.key) for mark in (path.stat().st_mtime_ns, path.stat().st_ino)
             )
+
+
+def check_times(path: Path, certificate: "x509.Certificate", now: datetime, step: str) -> None:
+    """Raises UsageError for a certificate that clients refuse by their clocks. step: what to do about it."""
+    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    if not begins <= now < ends:
+        words = f"ended at {ends:%Y-%m-%d %H:%M}" if now >= ends else f"begins at {begins:%Y-%m-%d %H:%M}"
+        raise UsageError(
+            f"the certificate in {path} {words} UTC, and the clock says {now:%Y-%m-%d %H:%M} UTC: nobody would connect. Where the clock is "
+            f"right, {step}; else set it (`timedatectl`)"
+        )
+
+
+def _names(certificate: "x509.Certificate") -> frozenset[str]:
+    """The DNS names and addresses that a certificate is for."""
+    from cryptography import x509
+
+    try:
+        found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return frozenset()
+    names = (*found.get_values_for_type(x509.DNSName), *map(str, found.get_values_for_type(x509.IPAddress)))
+    return frozenset(name.lower() for name in names)

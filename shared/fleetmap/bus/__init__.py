@@ -3,6 +3,7 @@
 from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback
 from fleetmap.bus.memory import MemoryBus, MemoryHub
 from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen
+from fleetmap.bus.robot_questions import RobotQuestions
 from fleetmap.bus.tls import TlsFiles, handshake_fault
 from fleetmap.bus.zenoh_bus import ZenohBus
 
@@ -15,6 +16,7 @@ __all__ = [
     "Listen",
     "MemoryBus",
     "MemoryHub",
+    "RobotQuestions",
     "TlsFiles",
     "ZenohBus",
     "check_endpoint",

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
@@ -18,30 +18,42 @@ from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message,
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus
+    from fleetmap.bus import Bus, RobotQuestions
 
 Ask = Callable[[str], bytes | None]
 """The bytes of a file of the signed lists, None where the server says that it has none; UnreachableError where nobody answers."""
 
 FIRST_ROOT = "1.root.json"
 _MAX_ROOT_BYTES = 64_000
+_TIMESTAMP_S = 86_400.0  # how long a timestamp lasts from the moment in which it is signed
 _CLOCK_EVERY_S = 600.0  # how old the clock on the disk may become: it is not written at every question
 _log = logging.getLogger(__name__)
 
 
-class _Expiry(msgspec.Struct, frozen=True):
+class _Signed(msgspec.Struct, frozen=True):
+    version: int
     expires: datetime
 
 
-class _Expires(msgspec.Struct, frozen=True):
-    signed: _Expiry
+class _File(msgspec.Struct, frozen=True):
+    signed: _Signed
+
+
+class _Clock(NamedTuple):
+    """heard_s: when the last word came, by the robot's clock; signed_s: when timestamp `number` was signed. Seconds since 1970."""
+
+    heard_s: float
+    signed_s: float
+    number: int
 
 
 class TrustedMap:
     """Which versions of a site may be run. `refresh` asks; without a fresh word nothing new may be run, and what runs goes on.
 
-    The folder belongs to one robot and site: files of python-tuf's client, and `clock`, the latest wall clock that was believed.
-    A clock before it cannot make expired lists valid again; one far ahead makes all lists expired, until it is right again.
+    The folder belongs to one robot and site: files of python-tuf's client, and `clock`: when the last word came, by the robot's clock,
+    and which timestamp it was and when that was signed. A robot's clock before that moment cannot make expired lists valid again; one
+    far ahead makes all lists expired, until it is right again. Where a later timestamp was signed at an earlier moment, the server's
+    clock was wrong and is not any more: numbers decide what is later, not clocks.
     """
 
     def __init__(
@@ -55,7 +67,7 @@ class TrustedMap:
         self._pinned_root, self._is_first_use = root, root is None
         self._list: SiteList | None = None
         self._fault: LinkError | StoreError | None = None
-        self._kept_clock_s = self._clock_s = 0.0
+        self._clock, self._kept_clock_s = _Clock(0.0, 0.0, 0), 0.0
         self._is_open = False
         try:
             self._open()
@@ -68,7 +80,8 @@ class TrustedMap:
             f"the folder {self._folder} for signed lists cannot be used", "check the disk and whose it is"
         ):
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._kept_clock_s = self._clock_s = self._read_clock()
+            self._clock = self._read_clock()
+            self._kept_clock_s = self._clock.heard_s
         self._is_open = True
 
     def refresh(self) -> None:
@@ -120,7 +133,7 @@ class TrustedMap:
     @property
     def word_hours(self) -> float | None:
         """Hours since the server last proved what may be run; None if it never did."""
-        return None if self._clock_s == 0 else max(0.0, self._wall_s() - self._clock_s) / 3600
+        return None if self._clock.heard_s == 0 else max(0.0, self._wall_s() - self._clock.heard_s) / 3600
 
     def _with_next_step(self, error: UntrustedError) -> UntrustedError:
         step = "look at `mapserver trust status` on the server, and at both clocks"
@@ -133,18 +146,32 @@ class TrustedMap:
 
         before = self._files()
         update_lists(self._folder, self._site, self._root(), self._ask)
-        now_s = max(self._wall_s(), self._clock_s)
+        wall_s, clock = self._wall_s(), self._clock
         files = ("root", "timestamp", "snapshot", "targets", site_role(self._site))
         self._check_delegated()
+        signed = {
+            name: msgspec.json.decode((self._folder / f"{name}.json").read_bytes(), type=_File).signed for name in files
+        }
+        if signed["timestamp"].version >= clock.number:
+            moment_s = signed["timestamp"].expires.timestamp() - _TIMESTAMP_S
+            if moment_s < clock.signed_s - _CLOCK_EVERY_S:
+                _log.warning(
+                    "the server's clock said %s when it signed timestamp %d, and %s when it signed %d: the latter is believed",
+                    *(_time(clock.signed_s), clock.number, _time(moment_s), signed["timestamp"].version),
+                )
+            clock = _Clock(clock.heard_s, moment_s, signed["timestamp"].version)
         for name in files:
-            expires = msgspec.json.decode((self._folder / f"{name}.json").read_bytes(), type=_Expires).signed.expires
-            if expires <= datetime.fromtimestamp(now_s, UTC):
-                raise UntrustedError("freeze", f"{name} expired at {expires:%Y-%m-%d %H:%M} UTC by the robot's clock")
+            expires_s = signed[name].expires.timestamp()
+            if expires_s <= max(wall_s, clock.signed_s):
+                by = f"this robot's clock says {_time(wall_s)}"
+                if clock.signed_s > wall_s:
+                    by += f", and the server signed its last lists at {_time(clock.signed_s)}"
+                raise UntrustedError("freeze", f"{name} expired at {_time(expires_s)}; {by}")
         self._list = read_site_list((self._folder / f"{files[-1]}.json").read_bytes(), self._site)
-        self._clock_s = now_s
-        if self._files() != before or now_s > self._kept_clock_s + _CLOCK_EVERY_S:
-            self._write("clock", str(now_s).encode())
-            self._kept_clock_s = now_s
+        self._clock = _Clock(wall_s, clock.signed_s, clock.number)
+        if self._files() != before or abs(wall_s - self._kept_clock_s) > _CLOCK_EVERY_S:
+            self._write("clock", " ".join(map(str, self._clock)).encode())
+            self._kept_clock_s = wall_s
             self._sync(before)
 
     def _check_delegated(self) -> None:
@@ -173,11 +200,13 @@ class TrustedMap:
         names = [*self._folder.glob("*.json"), *self._folder.glob("root_history/*.json"), *self._folder.glob("clock")]
         return {path: path.read_bytes() for path in names if not path.is_symlink()}
 
-    def _read_clock(self) -> float:
+    def _read_clock(self) -> _Clock:
         try:
-            return max(0.0, float((self._folder / "clock").read_text("ascii")))
+            # Before, the file had the first value alone, and robots whose clock had been ahead waited for that moment.
+            heard, signed, number = [*(self._folder / "clock").read_text("ascii").split(), "0", "0"][:3]
+            return _Clock(max(0.0, float(heard)), max(0.0, float(signed)), int(number))
         except (FileNotFoundError, ValueError):
-            return 0.0
+            return _Clock(0.0, 0.0, 0)
 
     def _write(self, name: str, data: bytes) -> None:
         temporary = self._folder / f".{name}.tmp"
@@ -205,7 +234,11 @@ class TrustedMap:
             yield
 
 
-def ask_over(bus: "Bus", site: str, timeout_s: float = 5.0) -> Ask:
+def _time(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def ask_over(bus: "Bus | RobotQuestions", site: str, timeout_s: float = 5.0) -> Ask:
     """Asks the server on a bus. A file must come in one answer, so that nobody can make a robot wait for it byte by byte."""
 
     def ask(name: str) -> bytes | None:

@@ -23,7 +23,7 @@ import zenoh
 
 from benchmarks.fleet.bench_bus_access import SITE, open_register, robot_files
 from benchmarks.fleet.bench_service import resident_mb, serving
-from fleetmap.access import ROBOT_KEYS, Holder
+from fleetmap.access import ALIVE, ORDERS, QUESTIONS, REPORTS, Holder
 from fleetmap.bus import TlsFiles, ZenohBus
 from fleetmap.messages import (
     FailureAck,
@@ -66,7 +66,7 @@ def _sender(session: Any, robot: str, kind: str) -> Callable[[int], None]:
         key = robot_key(SITE, robot, what)
         session.get(key, lambda _: None, payload=payload, timeout=10.0, congestion_control=_BLOCK)
 
-    whats, small, text = cycle(ROBOT_KEYS), _health(robot), "x" * 1_000_000
+    whats, small, text = cycle((*REPORTS, *QUESTIONS, *ORDERS, *ALIVE)), _health(robot), "x" * 1_000_000
     large, long = _health(robot, text), _failure(robot, 0, cause=text)
     huge = _failure(robot, 0, pictures=1, picture_bytes=20_000_000)
     strings = cycle([(put, "health", large), (ask, "failures", long), (ask, "wanted", text.encode())])

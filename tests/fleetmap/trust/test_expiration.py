@@ -55,10 +55,38 @@ def test_a_clock_far_ahead_makes_all_expired_until_it_is_right(publisher: ListPu
     robot.ahead_s = 0.0
     robot.start()
     assert robot.refused(1) == ""
-    # The control: if a clock were kept that no fresh word went with, the robot would be out for a month.
-    (robot.folder / "clock").write_text(str(time.time() + 30 * DAY_S))
+    # The control: a moment that no timestamp went with would keep the robot out for a month.
+    (robot.folder / "clock").write_text(f"{time.time()} {time.time() + 30 * DAY_S} 99")
     robot.start()
     assert robot.refused(1).startswith("freeze: ")
+
+
+def test_a_site_whose_clocks_were_a_year_ahead_goes_on_once_they_are_right(
+    publisher: ListPublisher, robot: ListReader, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Server and robot; a robot of before had noted that clock alone, and was frozen for a year."""
+    lists = (ROLE, "snapshot", "timestamp")
+
+    def sign(ahead_days: float) -> None:
+        for role, lasts in (("snapshot", 7), ("timestamp", 1), (ROLE, 14)):
+            publisher.signed(role).expires = days(ahead_days + lasts)
+        publisher.publish(*lists)
+
+    signed: list[dict[str, bytes]] = []
+    for ahead_days in (0, 200, 0):  # 200: root and targets still last, by either clock
+        sign(ahead_days)
+        robot.ahead_s = ahead_days * DAY_S
+        robot.start()
+        assert robot.refused(1) == ""
+        signed.append(dict(publisher.files))
+    assert "the latter is believed" in caplog.text
+    # What was signed by the wrong clock is worth nothing any more, however long it says to last.
+    publisher.files = signed[1]
+    assert robot.refused(1).startswith("rollback: ")
+    publisher.publish(*lists)
+    (robot.folder / "clock").write_text(str(time.time() + 200 * DAY_S))
+    robot.start()
+    assert robot.refused(1) == "", "a robot that noted its clock before it knew of signed moments"
 
 
 def test_a_clock_set_back_revives_nothing(publisher: ListPublisher, robot: ListReader) -> None:

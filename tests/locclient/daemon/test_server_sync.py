@@ -206,7 +206,7 @@ def test_a_manifest_of_another_site_is_refused(world: World) -> None:
         # In front of the real server's answers: a server that lies, or whose store was mixed up.
         world.hub.queryables.insert(0, (robot_key("lab", "r1", "wanted"), lambda *_: encode_message(told), None))
         world.hub.queryables.insert(
-            0, ("fleetmap/lab/manifests/7", _parts(world.store.blob(foreign.manifest_sha256)), None)
+            0, ("fleetmap/lab/robots/r1/manifests/7", _parts(world.store.blob(foreign.manifest_sha256)), None)
         )
         assert not server.closed()
     world.step(61.0)

@@ -216,7 +216,7 @@ def status(**changed: object) -> RobotStatus:
     sent = {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"}
     usual = {"site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None}
     usual |= {"state_since_ns": None, "clock_ahead_s": None, "seconds_since": 0.5, "last_ack": None, "last_pose": sent}
-    usual |= {"last_health": {"status": "TRACKING"}}
+    usual |= {"last_health": {"status": "TRACKING"}, "is_copied": False}
     return RobotStatus(**(usual | changed))  # type: ignore[arg-type]
 
 

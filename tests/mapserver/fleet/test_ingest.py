@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_struct
 
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
@@ -61,6 +62,28 @@ def site(tmp_path: Path) -> Iterator[Site]:
 def made(site: Site, count: int, **options: object) -> list[MadeRobot]:
     rng = np.random.default_rng(5)
     return [MadeRobot("lab", f"r{n}", rng, site.known, **options) for n in range(count)]
+
+
+def test_a_clock_that_is_set_back_freezes_no_robot(site: Site) -> None:
+    """A year ahead, then right: what is silent is soon known, what reports is traced, and who is lost is lost since now."""
+    year = 365 * 24 * HOUR_NS
+    health = RobotHealth(site="lab", robot="r1", stamp_ns=1, version=1, status="LOST")
+    site.set_ns(START_NS + year)
+    for robot in ("r1", "r2"):
+        site.fleet.take_health("lab", robot, replace_struct(health, robot=robot))
+    for second in (0, 90):
+        site.set_ns(START_NS + second * NS)
+        for stamp_ns in range(2, 4):
+            site.set_ns(START_NS + second * NS + stamp_ns * NS)
+            site.fleet.take_health("lab", "r1", replace_struct(health, stamp_ns=stamp_ns * NS + second * NS))
+        first, second_robot = site.fleet.robots("lab")
+        if second == 0:
+            since_ns = first.state_since_ns
+    site.fleet.flush()
+    assert since_ns == START_NS + 2 * NS
+    assert first.seconds_since == 0
+    assert second_robot.seconds_since > 60
+    assert site.store.fleet.trace("lab", "r1", since_hour=START_NS // HOUR_NS)
 
 
 def test_the_store_counts_what_the_robots_know(site: Site) -> None:

@@ -182,6 +182,13 @@ def test_skew_is_that_of_the_fastest_message_and_follows() -> None:
     for second in range(10, 200):  # the robot's clock was set
         skew.take(second * NS, second * NS + 5_000_000)
     assert skew.ahead_s == pytest.approx(-0.005)
+    year = 365 * 86_400 * NS
+    skew.take(200 * NS, 200 * NS - year)  # the server's clock is set back; the robot's follows
+    skew.take(201 * NS - year, 201 * NS - year)
+    assert skew.ahead_s == pytest.approx(year / NS)
+    for second in range(300, 500):
+        skew.take(second * NS - year, second * NS - year)
+    assert skew.ahead_s == 0.0
 
 
 def test_impossible_times_become_now() -> None:

@@ -51,6 +51,20 @@ def lines(operators: Operators) -> list[str]:
     return [f"{line.kind}: {line.detail}" for line in operators._store.audit_lines()]
 
 
+def test_a_clock_that_was_ahead_leaves_neither_long_sessions_nor_lost_tokens(
+    operators: Operators, clock: Clock
+) -> None:
+    token = operators.make_token("ci", ["read"], 90, ADMIN)
+    clock.s += 365 * 86_400
+    session = operators.sign_in("ada", PASSWORD, "10.0.0.1").session
+    assert operators.identify(session, "", "") is not None
+    assert operators.identify("", f"Bearer {token}", "") is None
+    clock.s -= 365 * 86_400
+    assert operators.identify(session, "", "") is None
+    assert operators.identify("", f"Bearer {token}", "") is not None
+    assert operators.sign_in("ada", PASSWORD, "10.0.0.1").session, "nor are people kept out"
+
+
 def test_a_session_names_its_operator_and_ends(operators: Operators, clock: Clock) -> None:
     session = operators.sign_in("ada", PASSWORD, "10.0.0.1").session
     who = operators.identify(session, "", "10.0.0.1")

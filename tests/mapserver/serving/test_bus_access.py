@@ -1,24 +1,33 @@
 """Admission to the bus: the policy of endpoints, names that are not enrolled (row 9), and rules that follow the register."""
 
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509 import load_pem_x509_certificate
 
-from fleetmap.access import Access, Holder
-from fleetmap.bus import MemoryBus, MemoryHub
+from fleetmap.access import Access, Holder, Purpose
+from fleetmap.bus import MemoryBus, MemoryHub, TlsFiles, ZenohBus
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
-from fleetmap.messages import RobotHealth, encode_message, robot_key
+from fleetmap.messages import RobotHealth, decode_message, encode_message, robot_key
 from fleetmap.trust import enrolment
 from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
+from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_access import BusGuard, check_binding, prepare_bus
+from mapserver.serving.bus_access import COPIED_AFTER_S, BusGuard, check_binding, prepare_bus
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import init_here
-from mapserver.trust.enrolment import RobotRegister
+from mapserver.trust.authorities import Authorities, Authority
+from mapserver.trust.enrolment import Enrolled, RobotRegister
 from support.storage.map_samples import save_sample_draft
+
+DAY_NS = 86_400_000_000_000
 
 
 @pytest.mark.parametrize(
@@ -65,6 +74,48 @@ def test_tls_needs_certificates_and_loopback_nothing(tmp_path: Path, register: R
         prepare_bus(other, "tls/0.0.0.0:0", insecure=False)
 
 
+@pytest.mark.parametrize(
+    ("file", "days", "words"),
+    [
+        ("server.pem", 398, "server.pem ended at .* trust rotate server"),
+        ("robots-ca.crt", 1826, "rotate robots-ca"),
+        ("server.pem", -1, "server.pem begins at .*timedatectl"),
+        ("server.pem", 390, ""),
+    ],
+)
+def test_a_certificate_that_nobody_would_believe_is_an_error_at_start(
+    register: RobotRegister, caplog: pytest.LogCaptureFixture, file: str, days: int, words: str
+) -> None:
+    at = Authorities(register._keys, datetime.now(UTC) + timedelta(days=days))
+    if file == "robots-ca.crt":  # the server's own was renewed meanwhile
+        path, key = at._path("server.pem"), at._read("servers-ca.pem")
+        servers = Authority(load_pem_private_key(key, None), load_pem_x509_certificate(at._read("servers-ca.crt")))
+        path.write_bytes(servers.sign(servers.key.public_key(), "s", 3000, hosts=["127.0.0.1"]))
+        path.write_bytes(key + path.read_bytes())
+    if words:
+        with pytest.raises(UsageError, match=words):
+            at.check()
+    else:
+        at.check()
+        assert "ends in 6 days" in caplog.text
+
+
+def test_a_key_that_is_not_the_certificates_is_an_error_at_start(register: RobotRegister) -> None:
+    path = register._keys / "server.pem"
+    certificate = path.read_text().partition("-----END PRIVATE KEY-----\n")[2]
+    path.write_text(enrolment.new_key().decode() + certificate)
+    with pytest.raises(UsageError, match="rotate server"):
+        prepare_bus(register._store, "tls/127.0.0.1:0", insecure=False)
+
+
+def test_what_was_signed_while_the_clock_was_ahead_counts_once_it_is_right(register: RobotRegister) -> None:
+    """A certificate begins with its authority; a session, bundle or old certificate of the future lives no longer for it."""
+    made = register.authorities.make_own("r1.1", "robot")
+    assert load_pem_x509_certificate(made).not_valid_before_utc <= datetime.now(UTC) - timedelta(minutes=10)
+    entry = Enrolled(site="lab", robot="r1", mark="2", mark_before="1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS)
+    assert {holder.purpose for holder in entry.holders(35 * DAY_NS) if holder.certificate == "r1.1"} == {Purpose.ENROL}
+
+
 def health(robot: str) -> bytes:
     return encode_message(RobotHealth(site="lab", robot=robot, stamp_ns=1, version=1, status="TRACKING"))
 
@@ -95,9 +146,10 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
     hub = MemoryHub()
     with MemoryBus(hub) as bus:
         register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")
-        guard = BusGuard(register, bus)
+        clock, fleet = {"s": 0.0}, Fleet(register._store)
+        guard = BusGuard(register, bus, lambda: clock["s"])
         bus.reopen(guard.access)
-        service = BusService(register._store, Fleet(register._store), bus, lambda *_: None, guard)
+        service = BusService(register._store, fleet, bus, lambda *_: None, guard)
         assert not guard.follow()
         bundle = enrolment.decode_bundle(register.enrol("lab", ["r2"], "tls/127.0.0.1:7447")["r2"])
         register.revoke("lab", ["r1"])
@@ -120,11 +172,70 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
             assert [words for words in guard.look() if "not enrolled" in words]
             guard.look()
             with MemoryBus(hub, entry.certificate):
+                # So it is also where a robot connects again before its old session is known to be lost.
+                assert not [words for words in guard.look() if "connected" in words and "r2" in words]
+                clock["s"] += COPIED_AFTER_S
                 assert [words for words in guard.look() if "connected 2 times" in words]
+                guard.look()
+                fleet.take_copied(guard.copied)
+            assert [event.kind for event in register._store.events("lab")].count("robot connected twice") == 1
+            (status,) = fleet.robots("lab")
+            assert status.is_copied
+            found = active_alerts(register._store, fleet, AlertSettings(), register._store.now_ns())
+            assert [(alert.name, alert.about) for alert in found] == [("FleetmapRobotCopied", "r2")]
+            clock["s"] += COPIED_AFTER_S
+            guard.look()
+            assert not guard.copied
         assert caplog.text.count("'old.00000000'") == 1
         register.authorities.rotate_server(None, None)
         assert guard.follow()
         service.close()
+
+
+def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path: Path) -> None:
+    """Over TLS: who copied the key before is silenced, and the robot's session takes the new files by itself."""
+    clock = {"ns": int(time.time() * 1e9)}
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, ExitStack() as stack:
+        save_sample_draft(store)
+        releases.publish(store, "lab")
+        init_here(store)
+        register = RobotRegister(store)
+        register.authorities.init(["127.0.0.1"], None, None)
+        bundle = enrolment.decode_bundle(register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")["r1"]).own.encode()
+        servers = tmp_path / "servers.ca"
+        servers.write_text(register.authorities.servers)
+
+        def renewed(old: bytes) -> bytes:
+            key = enrolment.new_key()
+            answer = decode_message(
+                register.renew("lab", "r1", enrolment.renewal_request(old, key)), enrolment.RenewalAnswer
+            )
+            return key + answer.certificate.encode()
+
+        own, stolen = tmp_path / "own.pem", tmp_path / "stolen.pem"
+        own.write_bytes(renewed(bundle))
+        clock["ns"] += 2 * DAY_NS
+        bus, guard = prepare_bus(store, "tls/127.0.0.1:0", insecure=False)
+        service = BusService(store, Fleet(store), bus, lambda *_: None, guard)
+        stack.callback(service.close)
+        stack.enter_context(bus)
+        bus.open()
+        robot = stack.enter_context(ZenohBus.connect(bus.endpoint, tls=TlsFiles(servers, own)))
+        wanted, renew = robot_key("lab", "r1", "wanted"), robot_key("lab", "r1", "renew")
+        assert robot.get(wanted, timeout_s=20)
+        stolen.write_bytes(own.read_bytes())
+        own.write_bytes(renewed(own.read_bytes()))
+        assert not guard.follow()
+        thief = stack.enter_context(ZenohBus.connect(bus.endpoint, tls=TlsFiles(servers, stolen)))
+        assert thief.get(wanted, timeout_s=20), "the control: at once both certificates are let in"
+        clock["ns"] += DAY_NS
+        guard._due_s = 0.0
+        assert guard.follow()
+        assert robot.get(wanted, timeout_s=20)
+        with pytest.raises(UnreachableError, match="lets this certificate say nothing"):
+            thief.get(wanted, timeout_s=2)
+        with pytest.raises(LinkError, match="may not renew"):
+            thief.get(renew, enrolment.renewal_request(stolen.read_bytes(), enrolment.new_key()), timeout_s=10)
 
 
 def test_a_guard_without_robots(register: RobotRegister) -> None:

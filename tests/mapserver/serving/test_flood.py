@@ -16,18 +16,21 @@ import httpx
 import msgspec
 import pytest
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import RobotQuestions, ZenohBus
 from fleetmap.errors import LinkError
 from fleetmap.mapformat import sha256_hex
 from fleetmap.messages import (
     FailureAck,
     FailureReport,
+    Part,
     RobotAck,
     RobotHealth,
     Thumbnail,
     WantedVersion,
     decode_message,
     encode_message,
+    manifest_key,
+    own_map_key,
     robot_key,
 )
 from mapserver import releases
@@ -79,7 +82,9 @@ def health(robot: str, status: str = "TRACKING", words: str = "") -> bytes:
     )
 
 
-@pytest.mark.parametrize("kind", ["puts", "large strings", "acks", "no messages", "questions", "failures"])
+@pytest.mark.parametrize(
+    "kind", ["puts", "large strings", "acks", "no messages", "questions", "failures", "maps", "maps as before"]
+)
 def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
     key = {"acks": "ack", "questions": "wanted", "failures": "failures"}.get(kind, "health")
     payload = {
@@ -89,7 +94,7 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
         "no messages": b"nonsense",
         "questions": b"",
         "failures": b"",
-    }[kind]
+    }.get(kind, b"")
     calm = f"calm-{kind.replace(' ', '-')}"
     before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
     ended, sent, waits, numbers = threading.Event(), [0], [], count()
@@ -103,12 +108,15 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
                 payload = encode_message(another)
             evil._session.get(key, lambda _: None, payload=payload, timeout=10.0)
 
-        send = ask if key in ("wanted", "failures") else evil.publish
+        send = ask if key in ("wanted", "failures") or kind.startswith("maps") else evil.publish
+        maps = manifest_key("lab", 1)
+        flooded = {"maps": own_map_key(maps, "flood"), "maps as before": maps}.get(kind, robot_key("lab", "flood", key))
+        own = RobotQuestions(bus, calm)
 
         def flood() -> None:
             while not ended.is_set():
                 for _ in range(20):
-                    send(robot_key("lab", "flood", key), payload)
+                    send(flooded, payload)
                 sent[0] += 20
                 time.sleep(0.002)
 
@@ -124,6 +132,7 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
                     bus.get(robot_key("lab", calm, "failures"), encode_message(report), timeout_s=5.0), FailureAck
                 )
                 assert ack.refused == ""
+                decode_message(own.get(maps, timeout_s=5.0), Part)
                 waits.append(time.monotonic() - begun_s)
                 time.sleep(max(0.4, SECONDS / 40))
         finally:

@@ -255,7 +255,8 @@ def test_the_rules_of_prometheus_are_rules_and_name_metrics_that_are_there(store
         assert checked.returncode == 0, checked.stdout + checked.stderr
     (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
     told = {rule["alert"] for rule in group["rules"]}
-    assert told == {"FleetmapFailureRate", "FleetmapRobotLost", "FleetmapNightFailed", "FleetmapCanaryRolledBack"}
+    expected = {"FailureRate", "RobotLost", "RobotCopied", "NightFailed", "CanaryRolledBack"}
+    assert told == {f"Fleetmap{name}" for name in expected}
     assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in group["rules"])
     fleet = Fleet(store)
     fleet.take_health("lab", "r1", health("LOST"))
@@ -263,5 +264,5 @@ def test_the_rules_of_prometheus_are_rules_and_name_metrics_that_are_there(store
     text = Metrics(store, fleet).text().decode()
     there = {sample.name for family in text_string_to_metric_families(text) for sample in family.samples}
     named = {name for rule in group["rules"] for name in re.findall(r"\bfleetmap_\w+", rule["expr"])}
-    assert len(named) == 5
+    assert len(named) == 6
     assert named <= there

@@ -55,12 +55,19 @@ def test_a_robot_gets_a_certificate_and_renews_it(world: World) -> None:
     assert about.name.startswith("r1.")
     assert about.fingerprint == enrolment.key_fingerprint(first)
     assert timedelta(days=364) < about.ends - datetime.now(UTC) < timedelta(days=366)
-    assert world.ask(first, second).name == about.name
     (entry,) = world.register.robots("lab")
-    holder = world.register.access().holder(about.name)
-    assert (entry.certificate, holder.robot) == (about.name, "r1")
-    assert [event.kind for event in world.store.events("lab")][-3:] == [
+    assert (entry.certificate, world.register.access().holder(about.name).robot) == (about.name, "r1")
+    world.clock["ns"] += DAY_NS
+    before = world.register.access()
+    renewed = world.ask(first, second)
+    assert world.register.access() == before, "a renewal interrupts nobody"
+    assert world.ask(first, second).name == renewed.name != about.name
+    world.clock["ns"] += DAY_NS  # from here on the certificate before may only ask again, for an answer that was lost
+    purposes = [world.register.access().holder(name).purpose for name in (renewed.name, about.name)]
+    assert purposes == [Purpose.ROBOT, Purpose.ENROL]
+    assert [event.kind for event in world.store.events("lab")][-4:] == [
         "robot enrolled",
+        "robot renewed",
         "robot renewed",
         "robot renewed",
     ]

@@ -129,6 +129,7 @@ def _attention(context: PageContext, live: LiveSite, areas: Areas) -> Markup:
 def _troubles(robot: LiveRobot) -> list[str]:
     """What is wrong beside the state."""
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
+    found += ["was connected twice: was its certificate copied?"] if robot.is_copied else []
     return found + [f"{PARAMETERS[f.name]} drifts" for f in robot.calibration if f.is_drifted]
 
 

@@ -7,6 +7,8 @@ from fleetmap.errors import UsageError
 from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry
 
+_TOKENS_KEPT_NS = 400 * 86_400_000_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class OperatorRow:
@@ -157,12 +159,13 @@ class OperatorQueries:
             self._transactions.log(connection, "", LogEntry("signed out", actor.name, None, actor))
 
     def remove_ended(self, *, begun_before_ns: int, used_before_ns: int) -> None:
-        """Removes sessions that are too old, and tokens that have ended."""
+        """Removes sessions that are too old, and tokens that ended long ago: not those that only a clock far ahead has ended."""
         with self._transactions.write(durable=False) as connection:
             connection.execute(
                 "DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", (begun_before_ns, used_before_ns)
             )
-            connection.execute("DELETE FROM tokens WHERE ends_ns < ?", (self._transactions.now_ns(),))
+            long_ago_ns = self._transactions.now_ns() - _TOKENS_KEPT_NS
+            connection.execute("DELETE FROM tokens WHERE ends_ns < ?", (long_ago_ns,))
 
     def add_token(self, sha256: str, token: TokenRow, actor: Actor) -> None:
         """A new token; a name that is not known yet becomes that of a program."""
