@@ -79,6 +79,6 @@ def summary(findings: Sequence[Finding], decisive: Container[str]) -> str:
         return f"{shown}: a map of it would be wrong, `mapserver build` refuses it: {', '.join(refused)}"
     if failed:
         return f"{shown}: not good enough: {', '.join(failed)}"
-    if not counts[Verdict.OK]:
-        return f"{shown}: nothing was found to be right"
+    if counts[Verdict.OK] < counts[Verdict.NOT_JUDGED]:
+        return f"{shown}: nothing is known to be wrong, but most could not be judged"
     return f"{shown}: good enough to build" + (", with the warnings below" if counts[Verdict.WARN] else "")

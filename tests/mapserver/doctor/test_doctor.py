@@ -274,8 +274,11 @@ def test_findings_in_one_line_and_those_that_lack_the_same_in_one_row() -> None:
     good, bad = Finding("images", Verdict.OK, 0.0, "", "whole"), Finding("depth", Verdict.FAIL, 1.0, "", "none")
     lacking = [not_judged(name, "0 inertial samples", "record an IMU") for name in ("imu rate", "gyro axes")]
     known = replace(not_judged("baseline", "+1 %", "record an IMU"), value=0.01)
-    assert summary([good, *lacking], {"depth"}) == "1 ok, 2 not judged: good enough to build"
-    assert summary(lacking, {"depth"}) == "2 not judged: nothing was found to be right"
+    assert summary([good, good, *lacking], {"depth"}) == "2 ok, 2 not judged: good enough to build"
+    assert (
+        summary([good, *lacking], set())
+        == "1 ok, 2 not judged: nothing is known to be wrong, but most could not be judged"
+    )
     assert "`mapserver build` refuses it: depth" in summary([good, bad], {"depth"})
     assert summary([good, bad], set()) == "1 ok, 1 fail: not good enough: depth"
     assert [([f.name for f in same], words) for same, words in grouped([good, *lacking, known])] == [
