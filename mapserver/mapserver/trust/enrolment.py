@@ -70,7 +70,7 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         if self.mark_before:
             purpose = Purpose.ROBOT if is_new else Purpose.ENROL
             yield Holder(self._named(self.mark_before), self.site, self.robot, purpose)
-        if not is_new:
+        if not is_new or not self.mark_before:
             yield Holder(self._named(self.next_mark), self.site, self.robot)
 
     def _named(self, mark: str) -> str:
