@@ -19,6 +19,8 @@ _NOT_LOST = (
     "not sound",
     "stamps of zero",
     "stamps repeated",
+    "bits in 16",
+    "not optical",
 )
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 RECORD_IMU = "record an IMU"

@@ -102,7 +102,7 @@ def _unpack(path: Path, folder: Path) -> None:
     except RecordingError:
         raise
     except _DAMAGED as error:
-        raise RecordingError(f"{path} cannot be unpacked ({str(error)[:200]}); {repair}") from error
+        raise RecordingError(f"{path} cannot be unpacked (cut off, or a CRC that does not match); {repair}") from error
 
 
 def _judge(path: Path, members: list[zipfile.ZipInfo]) -> None:

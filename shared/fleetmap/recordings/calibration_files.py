@@ -371,7 +371,11 @@ def _parse_yaml(text: str, where: str) -> Values:
         values = yaml.load(plain, Loader=_LOADER)
     # The loader's own constructors raise ValueError for 2026-02-30.
     except (yaml.YAMLError, ValueError) as error:
-        raise CalibrationError(f"{where} is not YAML ({' '.join(str(error).split())[:200]}); check the file") from error
+        mark = getattr(error, "problem_mark", None)
+        line = (
+            "" if mark is None else f" from line {mark.line + 1} on: {''.join(lines[mark.line : mark.line + 1])[:60]!r}"
+        )
+        raise CalibrationError(f"{where} is not YAML{line}; is it cut off? Correct it, or copy it again") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise CalibrationError(f"{where} holds {_brief(values)}; a calibration is a mapping of names to values")
     return values

@@ -8,13 +8,15 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
-from fleetmap.recordings.images import is_mosaic
+from fleetmap.recordings.image_series import SeriesFrames
+from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic
 from fleetmap.recordings.ordering import ReadLog, check_together
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
 
 _MIN_SAMPLES = 50
+_TRIED_FRAMES = 5
 _ACCEL_IN_G = (0.8, 1.25)
 _FASTEST_GYRO_RADPS = 35.0  # 2000 deg/s, the full scale of the usual sensors
 _WINDOW_S, _SMOOTH_S = 0.5, 0.1
@@ -160,9 +162,35 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         priors=parts.priors,
         ground_truth=parts.ground_truth,
     )
-    if is_mosaic(recording.read_frame(0).left):
+    if isinstance(parts.frames, SeriesFrames) and (bits := _grey_bits(parts.frames, len(recording))) < 16:
+        log.note(f"{bits} bits in 16", f"no value of the images is above {2**bits - 1}; they are used as {bits} bits")
+        parts.frames.grey_bits = bits
+    if is_mosaic(_first_frame(recording).left):
         log.note("Bayer pattern", "a mosaic of colours remains in the left images; record them with its right encoding")
     return replace(recording, issues=tuple(log.issues))
+
+
+def _first_frame(recording: Recording) -> CameraFrame:
+    """The first frame that can be decoded, of a few; RecordingError of the first where none can."""
+    fault: RecordingError | None = None
+    for index in range(min(_TRIED_FRAMES, len(recording))):
+        try:
+            return recording.read_frame(index)
+        except RecordingError as error:
+            fault = fault or error
+    assert fault is not None
+    raise fault
+
+
+def _grey_bits(frames: FrameSource, count: int) -> int:
+    """How many bits of images of 16 the sensor uses, by a few of them: drivers put 10 and 12 bits into the lower ones."""
+    peaks = []
+    for index in sorted({round(share * (count - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
+        try:
+            peaks.append(grey_peak(frames.stored(index).left))
+        except RecordingError:
+            continue
+    return grey_bits(max(peaks, default=0))
 
 
 def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:

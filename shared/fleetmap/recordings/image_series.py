@@ -1,7 +1,7 @@
 """Images of each camera by their stamps, paired to frames and read one frame at a time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
 _DAY_NS = 86_400_000_000_000
+F = TypeVar("F", bound="SeriesFrames")  # type: ignore[type-arg]
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,10 @@ def _apart(first_ns: Stamps, second_ns: Stamps, tolerance_ns: int) -> str:
 
 
 class SeriesFrames(Generic[T]):
-    """Frames of paired series of equal length; `load` reads the image of a source with its stamp in ns."""
+    """Frames of paired series of equal length; `load` reads the image of a source with its stamp in ns.
+
+    grey_bits: of left and right images of 16 bits, how many are used.
+    """
 
     def __init__(
         self,
@@ -75,11 +79,17 @@ class SeriesFrames(Generic[T]):
     ) -> None:
         self._load = load
         self.left, self.right, self.depth = left, right, depth
+        self.grey_bits = 16
 
     def taken(self, indices: NDArray[np.int64]) -> tuple[ImageSeries[T], ImageSeries[T] | None, ImageSeries[T] | None]:
         """left, right, depth of the frames at indices (K,)."""
         right, depth = (None if series is None else series.take(indices) for series in (self.right, self.depth))
         return self.left.take(indices), right, depth
+
+    def like(self, part: F) -> F:
+        """`part`, whose grey images use as many bits as these."""
+        part.grey_bits = self.grey_bits
+        return part
 
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` with its images as they are stored."""
@@ -88,6 +98,9 @@ class SeriesFrames(Generic[T]):
             for series in (self.left, self.right, self.depth)
         )
         assert left is not None
+        if self.grey_bits < 16:
+            left = replace(left, bits=self.grey_bits)
+            right = None if right is None else replace(right, bits=self.grey_bits)
         return StoredFrame(int(self.left.stamps_ns[index]), left, right, depth)
 
     def frame(self, index: int) -> CameraFrame:

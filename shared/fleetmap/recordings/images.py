@@ -153,6 +153,7 @@ class StoredImage:
 
     encoding: "file" for the bytes of an image file (JPEG, PNG, ...), INVERSE_DEPTH for those of a PNG behind the head of
     compressed_depth_image_transport, else a key of RAW_ENCODINGS with rows of step_bytes. form: the `format` of a CompressedImage.
+    bits: of grey images of 16, how many are used, the lower ones.
     """
 
     encoding: str
@@ -163,6 +164,7 @@ class StoredImage:
     step_bytes: int = 0
     big_endian: bool = False
     form: str = ""
+    bits: int = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,10 +200,24 @@ def decode_grey(stored: StoredImage) -> Image:
         usual = cv2.COLOR_BGRA2GRAY if pixels.shape[2] == 4 else cv2.COLOR_BGR2GRAY
         pixels = cv2.cvtColor(pixels, _GREY_FROM.get(stored.encoding, usual))
     if pixels.dtype == np.uint16:
-        return np.asarray(pixels >> 8, np.uint8)
+        return np.asarray(np.minimum(pixels >> (stored.bits - 8), 255), np.uint8)
     if pixels.dtype != np.uint8:
         raise RecordingError(f"{stored.where}: {pixels.dtype} pixels are no camera image; known are 8 and 16 bits")
     return np.ascontiguousarray(pixels, np.uint8)
+
+
+def grey_peak(stored: StoredImage) -> int:
+    """The largest value of an image of 16 bits; 0 for others, which are not decoded; RecordingError where it cannot be decoded."""
+    dtype, _ = RAW_ENCODINGS.get(stored.encoding, (None, 0))
+    is_wide = (
+        dtype == np.uint16 if dtype is not None else stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
+    )
+    return int(_decode(stored).max()) if is_wide else 0
+
+
+def grey_bits(peak: int) -> int:
+    """10 or 12 where the largest value of images of 16 bits says that their sensor has no more; else 16."""
+    return next((bits for bits in (10, 12) if 0 < peak < 1 << bits), 16)
 
 
 def is_mosaic(image: Image) -> bool:

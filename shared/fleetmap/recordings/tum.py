@@ -42,7 +42,12 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
     for line in stamped_lines(text, what):
         values = line.values
         if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 0.01:
-            raise RecordingError(f"{line.where}: {line.text!r} is not 't x y z qx qy qz qw' with a unit quaternion")
+            fault = "is not 't x y z qx qy qz qw' with a unit quaternion"
+            if len(values) == 11:
+                fault = "has KITTI's twelve numbers of a matrix and no stamp: write 't x y z qx qy qz qw'"
+            elif not np.isfinite(values).all():
+                fault = "holds NaN or infinity: leave out lines without a pose"
+            raise RecordingError(f"{line.where}: {line.text!r} {fault}")
         stamps.append(line.stamp_ns)
         frame_from_body.append(se3(rotation_from_quat_wxyz(values[[6, 3, 4, 5]]), values[:3]))
     return Trajectory(np.array(stamps, np.int64), np.array(frame_from_body).reshape(-1, 4, 4))
@@ -73,17 +78,31 @@ class StampedLine(NamedTuple):
 def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
     """The lines of a table with rising stamps, comments and empty lines skipped; RecordingError for other lines."""
     last_ns: int | None = None
+    has_names = False
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
             continue
         where = f"{what}, line {number}"
         try:
-            stamp_ns, values = parse_stamp_ns(fields[0]), np.array([float(field) for field in fields[1:]])
+            values = np.array([float(field) for field in fields])[1:]
         except ValueError as error:
-            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers ({error})") from error
+            if last_ns is None and not has_names and not any(_is_number(field) for field in fields):
+                has_names = True  # of columns
+                continue
+            odd = next(field for field in fields if not _is_number(field))
+            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers, {odd[:40]!r} is none") from error
+        try:
+            stamp_ns = parse_stamp_ns(fields[0])
+        except ValueError as error:
+            raise RecordingError(f"{where}: {error}; write seconds") from error
         yield StampedLine(where, line[:80], stamp_ns, values)
-        if last_ns is not None and stamp_ns <= last_ns:
+        if stamp_ns == last_ns:
+            raise RecordingError(
+                f"{where}: stamp {fields[0]} does not rise, it is that of the line before; write stamps with all their "
+                "digits (nine decimals), or leave out doubled lines"
+            )
+        if last_ns is not None and stamp_ns < last_ns:
             raise RecordingError(f"{where}: stamp {fields[0]} does not rise; sort the lines by time")
         last_ns = stamp_ns
 
@@ -118,14 +137,25 @@ def format_stamp(stamp_ns: int) -> str:
     return f"{sign}{whole}.{rest:09d}"
 
 
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
 def parse_stamp_ns(field: str) -> int:
     """Nanoseconds of a decimal number of seconds; what is finer is cut off. ValueError for anything else."""
     try:
         seconds = Decimal(field)
     except InvalidOperation as error:
         raise ValueError(f"stamp {field!r}") from error
-    if not seconds.is_finite() or abs(seconds) > _MOST_S:
-        raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds")
+    if not seconds.is_finite():
+        raise ValueError(f"stamp {field!r} is no time")
+    if abs(seconds) > _MOST_S:
+        unit = next((name for name, most in (("ms", 10**13), ("us", 10**16)) if abs(seconds) < most), "ns")
+        raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds, it looks like {unit}")
     return int(seconds * _NS)
 
 

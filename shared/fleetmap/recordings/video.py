@@ -140,7 +140,7 @@ class VideoFrames:
                 self._last = self._decode(wanted)
             except _errors() as error:
                 self._last = None
-                raise RecordingError(f"{where} cannot be decoded ({error}); leave it out with --frames") from error
+                raise RecordingError(f"{where} cannot be decoded, it is damaged; leave it out with --frames") from error
         if self._last is None:
             raise RecordingError(f"{where} is not in the video's data; leave it out with --frames")
         return self._last
@@ -190,7 +190,9 @@ def _opened(path: Path) -> _Video:
         raise
     except _errors() as error:
         file.close()
-        raise RecordingError(f"{path} cannot be read as a video ({error}); {_conversion(path)}") from error
+        raise RecordingError(
+            f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}"
+        ) from error
     streams = container.streams.video
     codec = streams[0].codec_context if streams else None
     if codec is not None and codec.width * codec.height <= MAX_PIXELS:
@@ -251,7 +253,9 @@ def _index(path: Path, log: ReadLog) -> _Index:
         packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
         told, unit = stream.frames, stream.time_base
     except _errors() as error:
-        raise RecordingError(f"{path} cannot be read as a video ({error}); {_conversion(path)}") from error
+        raise RecordingError(
+            f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}"
+        ) from error
     finally:
         video.close()
     if not packets:

@@ -1,12 +1,14 @@
 """Sensors as ROS 2 topics over zenoh: CDR under the keys of rmw_zenoh, or of a bridge to DDS."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.bags.topics import transports
+from fleetmap.recordings.images import grey_bits, grey_peak
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
@@ -38,6 +40,7 @@ class Ros2Source:
         self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
+        self._grey_peak = 0  # of images of 16 bits, until one shows that they have more than 12
         self._topics: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
         if calibration.imu is not None:
             self._topics.append((topics.imu, _take_imu))
@@ -86,6 +89,9 @@ class Ros2Source:
         stamp_ns, _ = messages.header_of(payload)
         decode = messages.decode_compressed_image if is_compressed else messages.decode_image
         image = decode(payload, f"{side} at {stamp_ns}")
+        if side == "left" or not self.has_depth:
+            self._grey_peak = max(self._grey_peak, grey_peak(image) if self._grey_peak < 1 << 12 else 0)
+            image = replace(image, bits=grey_bits(self._grey_peak))
         if not self.has_depth and len(self.calibration.cameras) == 1:
             intake.put_frame(StoredFrame(stamp_ns, image))
             return

@@ -137,6 +137,46 @@ def test_one_bad_value_costs_one_value(
             assert np.abs(recording.imu.stamps_ns - IMU.stamps_ns[-len(recording.imu) :]).max() < 20_000_000
 
 
+def test_cameras_of_two_clocks_are_told_by_how_much(tmp_path: Path) -> None:
+    messages = [m for m in drive() if m[0] != "/cam1/image_raw"]
+    for topic, kind, stamp_ns, data in (m for m in drive() if m[0] == "/cam1/image_raw"):
+        image = ros_messages.decode_image(data, "")
+        late = ros_messages.encode_image(stamp_ns + 12_000_000, "cam1_optical", image)
+        messages.append((topic, kind, stamp_ns, late))
+    with pytest.raises(
+        RecordingError, match=r"the second is \+12\.000 ms from the first in the median, 5 ms are allowed: trigger"
+    ):
+        open_recording(write_foreign(tmp_path / "a.mcap", messages))
+
+
+def test_repeated_stamps_do_not_go_backwards(tmp_path: Path) -> None:
+    few, many = drive(), drive()
+    repeated = [message for message in few if message[0] == "/imu0"][7]
+    with open_recording(
+        write_foreign(tmp_path / "a.mcap", [*few[: few.index(repeated)], repeated, *few[few.index(repeated) :]])
+    ) as one:
+        assert says_so(one, "imu: stamps repeated 1 of .* the first is")
+        assert len(one.imu) == SAMPLES
+    many = [message for message in drive() for _ in range(3 if message[0] == "/imu0" else 1)]
+    with pytest.raises(RecordingError, match=r"imu: .* stamps repeat the one before.*let it stamp each one"):
+        open_recording(write_foreign(tmp_path / "a.mcap", many))
+
+
+def test_a_camera_frame_with_the_axes_of_a_body_is_noted(tmp_path: Path) -> None:
+    """As of a driver that stamps images with camera_link in place of camera_color_optical_frame."""
+    lens = ros_messages.encode_camera_info(1, "cam_link", calibration().cameras[0])
+    turned = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    for base_from_cam, is_noted in ((np.eye(4), True), (turned, False)):
+        links = ros_messages.encode_frame_links(1, [ros_messages.FrameLink("base_link", "cam_link", base_from_cam)])
+        messages = [m for m in camera(LEFT) if "info" not in m[0]]
+        messages += [("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, lens), (TF, "tf2_msgs/TFMessage", 1, links)]
+        with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
+            noted = says_so(
+                recording, "camera frame not optical cam_link .* z axis up in base_link.*x right, y down, z forward"
+            )
+        assert noted == is_noted
+
+
 def says_so(recording: Recording, says: str) -> bool:
     lines = [f"{issue.what} {issue.detail}" for issue in recording.issues]
     return any(re.search(says, line) for line in lines) if says else not lines

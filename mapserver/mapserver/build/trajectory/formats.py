@@ -134,7 +134,7 @@ def array_in(path: Path) -> AnyArray:
     try:
         found = np.load(sized(path, 4 << 30), mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TokenError, TypeError, MemoryError) as error:
-        raise RecordingError(f"{path} is no .npy file of numbers ({error})") from error
+        raise RecordingError(f"{path} is no .npy file of numbers; save it again with numpy.save") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu" or found.ndim == 0:
         raise RecordingError(f"{path} is no .npy file of numbers")
     if found.ndim < 3 and found.size > 16 * _MOST_ROWS:

@@ -12,6 +12,7 @@ from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
+_UPRIGHT = 0.9  # the cosine of 26 degrees
 _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
@@ -50,6 +51,20 @@ def calibration_of_messages(
     bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
     base_from_body = next((base for base in bases if base is not None), np.eye(4))
     return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base_from_body)
+
+
+def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:
+    """Words on cameras whose frame has the axes of the robot (x forward, z up), where images need one with z forward and y down."""
+    found = []
+    for frame in dict.fromkeys(camera.frame for camera in cameras if "optical" not in camera.frame):
+        bases = ((name, _target_from_source(links, name, frame)) for name in _BASE_FRAMES)
+        base, base_from_cam = next(((name, base) for name, base in bases if base is not None), ("", np.eye(4)))
+        if base and frame != base and base_from_cam[2, 2] > _UPRIGHT:
+            found.append(
+                f"{frame} of a CameraInfo has its z axis up in {base}, as a body's frame; if the camera does not look up, stamp images and "
+                "CameraInfo with the optical frame (x right, y down, z forward), or pass a calibration with --calibration FILE"
+            )
+    return found
 
 
 def _lens(camera: InfoCamera, where: str) -> CameraCalibration:

@@ -96,11 +96,11 @@ class Ros1Codec(RosCodec):
             # By ROS 2's definitions: of those that are decoded here the header alone is another, which rosbags knows
             return bytes(_store("ROS2_JAZZY").ros1_to_cdr(data, type_name(channel).replace("/", "/msg/")))
         except (struct.error, ArithmeticError, LookupError, MemoryError) as error:
-            raise ValueError(str(error)) from error
+            raise ValueError(f"the {len(data)} bytes are no {type_name(channel)}") from error
         except Exception as error:
             # SerdeError cannot be named before rosbags is imported
             if type(error).__name__ == "SerdeError":
-                raise ValueError(str(error)) from error
+                raise ValueError(f"the {len(data)} bytes are no {type_name(channel)}") from error
             raise
 
     def stamp_ns(self, channel: Channel, data: memoryview) -> int:

@@ -104,7 +104,7 @@ class FoxgloveCodec:
         except Exception as error:
             # DecodeError cannot be named before protobuf is imported
             if type(error).__name__ == "DecodeError":
-                raise ValueError(str(error)) from error
+                raise ValueError(f"the {len(data)} bytes are no {channel.schema.name}") from error
             raise
         return message
 
@@ -126,7 +126,7 @@ def _message_class(channel: Channel) -> Any:
             pool.Add(file)
         return GetMessageClass(pool.FindMessageTypeByName(channel.schema.name))
     except (DecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"the schema of {channel.topic} is damaged: {error}") from error
+        raise ValueError(f"the schema of {channel.topic} is damaged") from error
 
 
 def _stamp_ns(message: Message) -> int:

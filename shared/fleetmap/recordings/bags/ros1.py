@@ -190,7 +190,10 @@ def _bounded_reader() -> Any:
 
 
 def _reason(error: BaseException, path: Path) -> str:
-    words = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+    is_told = (
+        type(error) is ValueError or type(error).__name__ == "ReaderError"
+    )  # others are of Python, about bytes that make no sense
+    words = " ".join(str(error).split())[:200].rstrip(".") if is_told else "a record makes no sense"
     for sign, advice in _ADVICE.items():
         if sign in words:
             return f"{words}; `{advice} {path}` makes one that can be read"

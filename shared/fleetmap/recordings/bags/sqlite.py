@@ -79,8 +79,12 @@ class SqliteFiles(KeptBytes):
                     new = Channel(len(channels), topic, encoding, Schema(kind))
                     topics[key] = channels.setdefault((topic, kind, encoding), new)
                 yield from self._rows(number, topics)
-            except sqlite3.Error as error:
-                self._issues.append(DataIssue(f"{file.name} is damaged", f"{error}; {_recovery(file)}"))
+            except (sqlite3.Error, UnicodeDecodeError) as error:
+                fault = (
+                    f"a value is too big, {MAX_MESSAGE_BYTES} bytes are the limit; " if "too big" in str(error) else ""
+                )
+                detail = f"{fault}what follows is not read; {_recovery(file)}"
+                self._issues.append(DataIssue(f"{file.name} is damaged", detail))
 
     def _rows(self, number: int, topics: Mapping[object, Channel]) -> Iterator[Message]:
         odd = 0
@@ -111,7 +115,10 @@ class SqliteFiles(KeptBytes):
         try:
             found = self._databases[number].execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         except sqlite3.Error as error:
-            raise RecordingError(f"{self.files[number]}: {error}; was it changed while it was read?") from error
+            raise RecordingError(
+                f"{self.files[number]}: row {row} cannot be read; it is damaged, or was changed while it was read. "
+                f"{_recovery(self.files[number])}"
+            ) from error
         if found is None or not isinstance(found[0], bytes):
             raise RecordingError(f"{self.files[number]}: row {row} is gone; is it still being written?")
         return _unpacked(found[0])
@@ -143,9 +150,11 @@ def _opened(file: Path) -> sqlite3.Connection:
             "SELECT rowid, topic_id, timestamp, data FROM messages LIMIT 0",
         ):
             database.execute(question)
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.Error, UnicodeDecodeError) as error:
         database.close()
-        raise RecordingError(f"{file} cannot be read ({error}); {_recovery(file)}") from error
+        lacks = "no such column" in str(error)
+        fault = "no such columns as rosbag2's in its tables" if lacks else "damaged or cut off"
+        raise RecordingError(f"{file} cannot be read ({fault}); {_recovery(file)}") from error
     except BaseException:
         database.close()
         raise
@@ -164,7 +173,7 @@ def _unpacked(data: bytes) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=MAX_MESSAGE_BYTES).stream_reader(data) as reader:
             unpacked = bytes(reader.read(MAX_MESSAGE_BYTES + 1))
     except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from error
+        raise ValueError("it cannot be unpacked") from error
     if len(unpacked) > MAX_MESSAGE_BYTES:
         raise ValueError(f"it unpacks to more than {MAX_MESSAGE_BYTES} bytes")
     return unpacked

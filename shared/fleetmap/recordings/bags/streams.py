@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings.bags.calibration import InfoCamera, calibration_of_messages
+from fleetmap.recordings.bags.calibration import InfoCamera, calibration_of_messages, frames_not_optical
 from fleetmap.recordings.bags.codecs import CODECS, Codec
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT, Channel, Container, Place
 from fleetmap.recordings.bags.topics import (
@@ -124,7 +124,7 @@ class MessageFrames(SeriesFrames[tuple[_Stream, Place]]):
 
     def part(self, indices: NDArray[np.int64]) -> "MessageFrames":
         """See FrameSource."""
-        return MessageFrames(self._opener, None, self._read_files, *self.taken(indices))
+        return self.like(MessageFrames(self._opener, None, self._read_files, *self.taken(indices)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """The bytes of the recording's files, then those of the calibration file where one was given."""
@@ -386,4 +386,6 @@ def _calibration(
     links = [link for stream in streams for _, found in stream.values(stream.codec.links) for link in found]
     for issue in dict.fromkeys(link_issue for link in links if (link_issue := link.issue)):
         log.note("transform not sound", issue)
+    for words in frames_not_optical(cameras, links):
+        log.note("camera frame not optical", words)
     return calibration_of_messages(cameras, links, imu_frame, str(container.path))

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
-from fleetmap.recordings.images import MAX_PIXELS, StoredImage, image_size, is_cut
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage, file_kind, image_size, is_cut
 from fleetmap.recordings.ordering import ReadLog, usual_size
 from fleetmap.recordings.strange_files import what_instead
 
 _BLOCK_BYTES, _HEAD_BYTES, _TAIL_BYTES = 1 << 20, 4096, 8192
+_TIFF = (b"II*\0", b"MM\0*")
 _MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 ImageFiles = ImageSeries[Path]
 
@@ -65,7 +66,10 @@ def _whole_image_size(path: Path, file_bytes: int) -> tuple[int, int] | None:
         raise RecordingError(f"that are {fault}")
     if is_cut(head, tail):
         raise RecordingError("cut off")
-    return image_size(head)
+    size_px = image_size(head)
+    if size_px is None and file_kind(head) == "other" and not head.startswith(_TIFF):  # whose header may be at its end
+        raise RecordingError("of no format that is read")
+    return size_px
 
 
 def paired_cameras(cameras: Sequence[ImageFiles], log: ReadLog) -> tuple[ImageFiles, ImageFiles | None]:
@@ -89,7 +93,7 @@ class FileFrames(SeriesFrames[Path]):
 
     def part(self, indices: NDArray[np.int64]) -> "FileFrames":
         """See FrameSource."""
-        return FileFrames(self.root, self.read_files, *self.taken(indices))
+        return self.like(FileFrames(self.root, self.read_files, *self.taken(indices)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
         """Names, sizes and bytes of all files read, in the order of their names."""

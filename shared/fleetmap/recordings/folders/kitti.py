@@ -8,12 +8,11 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, read_image
-from fleetmap.recordings.folders.table_files import natural_key
+from fleetmap.recordings.folders.table_files import natural_key, read_table_text
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
 from fleetmap.sensors.samples import Stamps, Trajectory
 
@@ -107,8 +106,7 @@ def _calibration(file: Path, first_image: Path, left_row: int, right_row: int) -
 def _projections(file: Path) -> dict[int, Array]:
     """The 3x4 matrices by number, of lines with or without `P0:` before twelve numbers."""
     rows: dict[int, Array] = {}
-    check_table(file)
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_table_text(file).splitlines():
         label, colon, numbers = line.partition(":") if ":" in line else ("", "", line)
         try:
             values = [float(word) for word in numbers.split()]
@@ -125,7 +123,11 @@ def _ground_truth(path: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
     if not file.is_file():
         return None
     log.files.append(file)
-    rows = _table(file, (12, 16))
+    try:
+        rows = _table(file, (12, 16))
+    except RecordingError as error:
+        log.note("ground truth not used", str(error))
+        return None
     if stamps_of_number is not None and len(stamps_of_number) != len(rows):
         log.note("ground truth not used", f"poses.txt has {len(rows)} rows, times.txt {len(stamps_of_number)}")
         return None
@@ -136,11 +138,20 @@ def _ground_truth(path: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
 
 
 def _table(file: Path, widths: tuple[int, ...]) -> Array:
-    check_table(file)
-    try:
-        table = np.loadtxt(file, ndmin=2)
-    except ValueError as error:
-        raise RecordingError(f"{file} is no table of numbers ({error}); copy the recording again") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_table_text(file).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if words and len(row) not in ((len(rows[0]),) if rows else widths):
+            expected = " or ".join(str(width) for width in widths)
+            raise RecordingError(
+                f"{file}, line {number}: {line[:60]!r} are not {expected} numbers; copy the recording again"
+            )
+        rows += [row] if words else []
+    table = np.array(rows) if rows else np.zeros((0, 0))
     if table.shape[1] not in widths or not np.isfinite(table).all():
         raise RecordingError(
             f"{file} has {table.shape[1]} columns, {' or '.join(map(str, widths))} finite numbers are expected"

@@ -15,6 +15,10 @@ from fleetmap.recordings.tum import check_table
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
 _LAST_NS = 2**63 - 1
+_IMU_NAMES = {
+    "gyro": ("w_", "wx", "wy", "wz", "gyr", "gx", "gy", "gz", "omega", "ang"),
+    "accel": ("a_", "ax", "ay", "az", "acc", "lin"),
+}
 
 
 def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
@@ -24,7 +28,7 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
     row (a file cut off in the middle of one) are noted in `log`; RecordingError where no line is, and for stamps with
     decimals.
     """
-    text = _read_text(path).replace(",", " ")
+    text = _without_names(read_table_text(path)).replace(",", " ").replace(";", " ")
     dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (columns,))])
     try:
         with warnings.catch_warnings():
@@ -33,9 +37,12 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
     except ValueError:
         table = _read_rows_singly(path, text, dtype, log)
     if len(table) == 0:
-        first = next((words[0] for line in text.splitlines() if (words := line.partition("#")[0].split())), "")
-        _check_whole(first, str(path))
-        raise RecordingError(f"{path} holds no row of a stamp in ns and {columns} numbers; the recording is incomplete")
+        first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
+        _check_whole(first.split()[0] if first else "", str(path))
+        there = f"its first is {first[:80]!r}" if first else "it is empty"
+        raise RecordingError(
+            f"{path} holds no row of a stamp in ns and {columns} numbers, {there}; the recording is incomplete, copy it again"
+        )
     log.files.append(path)
     return table["stamp_ns"], table["values"]
 
@@ -45,7 +52,20 @@ def read_imu(path: Path, log: ReadLog) -> ImuSamples:
     if not path.is_file():
         return ImuSamples.empty()
     stamps_ns, rows = read_stamped_rows(path, 6, log)
-    return clean_imu(stamps_ns, rows[:, :3], rows[:, 3:], log)
+    order = _imu_columns(read_table_text(path).lstrip().partition("\n")[0])
+    return clean_imu(stamps_ns, rows[:, order[:3]], rows[:, order[3:]], log)
+
+
+def _imu_columns(header: str) -> list[int]:
+    """Of six columns behind the stamp those of gyro and accelerometer x y z: by their names, EuRoC's order where these say nothing."""
+    found: dict[str, int] = {}
+    for number, name in enumerate(re.split(r"[,;\t]", header.lower())[1:7]):
+        word = re.sub(r"[\[(].*", "", name).strip()
+        kind = next((kind for kind, starts in _IMU_NAMES.items() if word.startswith(starts)), "")
+        if kind and word[-1:] in "xyz":
+            found[kind + word[-1]] = number
+    order = [found.get(kind + axis, -1) for kind in _IMU_NAMES for axis in "xyz"]
+    return order if -1 not in order else list(range(6))
 
 
 def read_ground_truth(path: Path, log: ReadLog) -> Trajectory | None:
@@ -54,17 +74,23 @@ def read_ground_truth(path: Path, log: ReadLog) -> Trajectory | None:
 
 
 def read_name_table(path: Path) -> tuple[Stamps, list[str]]:
-    """Stamps (N,) and file names of a EuRoC camera's data.csv; RecordingError for a line that is neither."""
+    """Stamps (N,) and file names of a EuRoC camera's data.csv, whose further columns are not read.
+
+    RecordingError for a line that has none, but for names of columns in the first.
+    """
     stamps, names = [], []
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_table_text(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        stamp, _, name = line.partition(",")
-        _check_whole(stamp.strip(), f"{path}, line {number}")
-        if not stamp.strip().isdecimal() or not name.strip() or int(stamp) > _LAST_NS:
+        columns = re.split(r"[,;\t]" if re.search(r"[,;\t]", line) else r"\s+", line)
+        stamp, name, *_ = [*(column.strip(' \t"') for column in columns), ""]
+        _check_whole(stamp, f"{path}, line {number}")
+        if not stamp.isdecimal() or not name or int(stamp) > _LAST_NS:
+            if number == 1 and name and not stamp[:1].isdecimal():
+                continue  # names of columns
             raise RecordingError(f"{path}, line {number}: {line[:60]!r} is no stamp in ns, a comma and a file name")
         stamps.append(int(stamp))
-        names.append(check_inside(name.strip(), f"{path}, line {number}"))
+        names.append(check_inside(name, f"{path}, line {number}"))
     return np.array(stamps, np.int64), names
 
 
@@ -93,7 +119,14 @@ def natural_key(name: str) -> tuple[object, ...]:
     return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name))
 
 
-def _read_text(path: Path) -> str:
+def _without_names(text: str) -> str:
+    """The text without a first line that names its columns, as tables of other programs have one without #."""
+    first, _, rest = text.lstrip().partition("\n")
+    return rest if first[:1].isalpha() and re.search(r"[,;\s]", first.strip()) and re.match(r"\s*\d", rest) else text
+
+
+def read_table_text(path: Path) -> str:
+    """The text of a table, without a byte order mark; RecordingError for what cannot be read or stands in for the file."""
     if fault := what_file_instead(path):
         raise RecordingError(f"{path} is {fault}")
     try:

@@ -8,10 +8,9 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.calibration_files import load_calibration
 from fleetmap.recordings.finalize import RecordingParts, finalize
 from fleetmap.recordings.folders.image_files import FileFrames, ImageFiles, existing_images, paired_cameras
-from fleetmap.recordings.folders.table_files import natural_key, read_ground_truth, read_imu
+from fleetmap.recordings.folders.table_files import natural_key, read_ground_truth, read_imu, read_table_text
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.recordings.tum import check_table
 
 _CAMERAS = ("cam0", "cam1")
 
@@ -51,8 +50,7 @@ def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
     times = folder / "times.txt"
     if times.is_file():
         log.files.append(times)
-        check_table(times)
-        rows = [line.split() for line in times.read_text(errors="replace").splitlines() if not line.startswith("#")]
+        rows = [line.split() for line in read_table_text(times).splitlines() if not line.startswith("#")]
         stamp_of = {row[0]: _stamp_ns(row[1], times) for row in rows if len(row) >= 2}
     else:
         stamp_of = {stem: int(stem) for stem in sorted(files, key=natural_key) if stem.isdigit()}

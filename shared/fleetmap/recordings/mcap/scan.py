@@ -196,7 +196,8 @@ class McapScan(KeptBytes):
                 self.keep(4 * len(content))
                 self.metadata[name] = _text_map(content, at)
         except (struct.error, ValueError) as error:
-            self._note("a damaged record", f"kind {opcode} at byte {location.at}: {error}")
+            fault = "it ends too early" if isinstance(error, struct.error) else str(error)
+            self._note("a damaged record", f"kind {opcode} at byte {location.at}: {fault}")
 
     def _read_schema(self, content: memoryview) -> None:
         (schema_id,) = struct.unpack_from("<H", content)

@@ -1,0 +1,162 @@
+"""Files of every format that are cut, empty, flipped or something else: a message with the file's name, of no library, and no traceback."""
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from contracts.test_recordings import WITHOUT_CALIBRATION, WRITERS
+from fleetmap.errors import FleetmapError, RecordingError
+from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings.ros2 import messages as ros_messages
+from fleetmap.recordings.tum import parse_tum, read_tum
+from mapserver import cli
+from support.recordings.bag_samples import write_rosbag1
+from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
+from support.recordings.recording_samples import HEIGHT, WIDTH, kalibr_text, make_sample, write_euroc
+
+RNG = np.random.default_rng(0)
+
+
+def flipped(data: bytes) -> bytes:
+    spoiled = bytearray(data)
+    for at in RNG.integers(0, len(data), max(3, len(data) // 500)):
+        spoiled[at] = RNG.integers(256)
+    return bytes(spoiled)
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda data: b"",
+    "half": lambda data: data[: len(data) // 2],
+    "cut": lambda data: data[:-7],
+    "text": lambda data: b"hello, this is a note\nand more\n",
+    "utf-16": lambda data: "hello".encode("utf-16"),
+    "page": lambda data: b"\n<!DOCTYPE html><html><body>Sign in</body></html>",
+    "pointer": lambda data: b"version https://git-lfs.github.com/spec/v1\noid sha256:aa\nsize 3\n",
+    "flipped": flipped,
+    "flipped again": flipped,
+}
+OF_A_LIBRARY = re.compile(
+    r"Traceback|could not convert|requires a buffer|NoneType|codec can't|not enough values|invalid literal|out of bounds|while parsing|"
+    r"while scanning|unicode string|malformed|reshape|list index|Errno|invalid start byte|Error parsing|Invalid data found|usecols",
+    re.IGNORECASE,
+)
+
+
+@pytest.mark.parametrize("name", list(WRITERS))
+def test_damaged_files_of_every_format(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.yaml").write_text(kalibr_text().partition("cam1:")[0])
+    rig = tmp_path / "rig.yaml" if name in WITHOUT_CALIBRATION else None
+    options, calibration = OpenOptions(rig), [] if rig is None else ["--calibration", str(rig)]
+    path = WRITERS[name](tmp_path / "recording")
+    files = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
+    # The first of many images, and of one camera
+    kinds = {
+        re.sub(r"\d+", "", str(file.relative_to(tmp_path))): file
+        for file in reversed(files)
+        if "source" not in file.parts
+    }
+    for file in kinds.values():
+        sound = file.read_bytes()
+        for damage, spoil in DAMAGES.items():
+            file.write_bytes(spoil(sound))
+            try:
+                with open_recording(path, options) as recording:
+                    told = " ".join(f"{issue.what} {issue.detail}" for issue in recording.issues)
+            except FleetmapError as error:
+                told = str(error)
+                assert path.name in told, (file.name, damage, told)
+                if damage == "text":  # as the command tells it
+                    monkeypatch.setattr(sys, "argv", ["mapserver", "doctor", str(path), *calibration])
+                    with pytest.raises(SystemExit):
+                        cli.main()
+                    assert capsys.readouterr().err == f"error: {told}\n"
+            assert not OF_A_LIBRARY.search(told), (file.name, damage, told)
+            if damage in ("page", "pointer") and file.name not in ("metadata.yaml", "frame-000000.pose.txt"):
+                assert "git lfs pull" in told, (file.name, damage, told)
+        file.write_bytes(sound)
+
+
+LINES = ["1.0 0 0 0 0 0 0 1", "1.1 1 0 0 0 0 0 1"]
+
+
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        (["1400000000000000000 0 0 0 0 0 0 1"], "it looks like ns; write seconds"),
+        (["1400000000000 0 0 0 0 0 0 1"], "it looks like ms; write seconds"),
+        (["1400000000000000 0 0 0 0 0 0 1"], "it looks like us; write seconds"),
+        (["1 0 0 0 0 1 0 0 0 0 1 0"], "KITTI's twelve numbers of a matrix and no stamp"),
+        ([LINES[0], "1.1 nan 0 0 0 0 0 1"], "line 2: .* holds NaN or infinity"),
+        (
+            ["1.4e9 0 0 0 0 0 0 1", "1.4e9 1 0 0 0 0 0 1"],
+            "line 2: stamp 1.4e9 does not rise, it is that of the line before; .*nine decimals",
+        ),
+        (LINES[::-1], "stamp 1.0 does not rise; sort"),
+        ([LINES[0], "1.1 x 0 0 0 0 0 1"], "not all numbers, 'x' is none"),
+    ],
+)
+def test_trajectories_that_are_no_tum(lines: list[str], says: str) -> None:
+    with pytest.raises(RecordingError, match=says):
+        parse_tum("\n".join(lines))
+
+
+def test_a_header_and_windows_line_ends_are_no_lines_of_a_trajectory(tmp_path: Path) -> None:
+    file = tmp_path / "a.tum"
+    file.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(["timestamp tx ty tz qx qy qz qw", *LINES]).encode())
+    assert len(read_tum(file)) == 2
+
+
+def rewritten(file: Path, change: Callable[[list[list[str]]], list[list[str]]], joint: str = ",") -> None:
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    file.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(joint.join(row) for row in change(rows)).encode())
+
+
+@pytest.mark.parametrize("joint", [",", ";", "\t", ", "])
+def test_tables_of_euroc_as_other_programs_write_them(tmp_path: Path, joint: str) -> None:
+    sample = make_sample(4)
+    wanted, folder = write_euroc(tmp_path / "a", sample), write_euroc(tmp_path / "b", sample)
+    images, imu = folder / "mav0/cam0/data.csv", folder / "mav0/imu0/data.csv"
+    rewritten(images, lambda rows: [["stamp", "file", "exposure"], *([*row, "0.01"] for row in rows[1:])], joint)
+    header = [
+        "timestamp",
+        "a_RS_S_x [m s^-2]",
+        "a_RS_S_y",
+        "a_RS_S_z",
+        "w_RS_S_x [rad s^-1]",
+        "w_RS_S_y",
+        "w_RS_S_z",
+        "temperature",
+    ]
+    rewritten(
+        imu, lambda rows: [header, *([row[0], *row[4:7], *row[1:4], "21"] for row in rows if row[0].isdecimal())], joint
+    )
+    with open_recording(folder) as found, open_recording(wanted) as right:
+        assert found.issues == ()
+        assert found.frame_stamps_ns.tolist() == right.frame_stamps_ns.tolist()
+        np.testing.assert_array_equal(found.imu.gyro_radps, right.imu.gyro_radps)
+        np.testing.assert_array_equal(found.imu.accel_mps2, right.imu.accel_mps2)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_bits_of_grey_images_of_16(tmp_path: Path, bits: int) -> None:
+    """As drivers of machine vision cameras send them: the sensor's 10 or 12 bits in the lower ones."""
+    messages = []
+    for topic, kind, stamp_ns, data in foreign_messages():
+        if kind == "sensor_msgs/Image":
+            grey = ros_messages.decode_image(data, "").data
+            wide = np.frombuffer(grey, np.uint8).astype("<u2") << (bits - 8)
+            image = ros_messages.StoredImage("mono16", wide.tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH)
+            messages.append((topic, kind, stamp_ns, ros_messages.encode_image(stamp_ns, "cam0_optical", image)))
+        else:
+            messages.append((topic, kind, stamp_ns, data))
+    for path in (write_foreign(tmp_path / "a.mcap", messages), write_rosbag1(tmp_path / "a.bag", messages)):
+        with open_recording(path) as recording:
+            np.testing.assert_array_equal(recording.read_frame(1).left, SAMPLE.left[1])
+            np.testing.assert_array_equal(recording.part(np.array([2])).read_frame(0).right, SAMPLE.right[2])
+            assert [issue.what for issue in recording.issues] == ([] if bits == 16 else [f"{bits} bits in 16"])
