@@ -57,6 +57,32 @@ _HISTORY_DTYPES = {
 _ALL_DTYPES = {1: _DTYPES, 2: _DTYPES | _HISTORY_DTYPES}
 
 
+# Shapes by docs of SurveyMap: letters are lengths that arrays share. Patches are square, of any side.
+_SHAPES: dict[str, tuple[int | str, ...]] = {
+    "body_from_cam": (4, 4),
+    "keyframe_stamps_ns": ("K",),
+    "map_from_body": ("K", 4, 4),
+    "landmark_ids": ("N",),
+    "points_map": ("N", 3),
+    "descriptors": ("N", 32),
+    "point_sigma_m": ("N",),
+    "obs_keyframe": ("M",),
+    "obs_landmark": ("M",),
+    "obs_pixels": ("M", 3),
+    "obs_octave": ("M",),
+    "obs_sigma_px": ("M", 2),
+    "trajectory_estimated": ("F",),
+    "trajectory_stamps_ns": ("F",),
+    "trajectory_frame_from_body": ("F", 4, 4),
+    "patches": ("N", "P", "P"),
+    "keyframe_ids": ("K",),
+    "is_place": ("K",),
+    "landmark_expected": ("N",),
+    "landmark_seen": ("N",),
+    "landmark_missed": ("N",),
+}
+
+
 class _ArrayHead(msgspec.Struct, frozen=True):
     name: str
     dtype: str
@@ -118,9 +144,10 @@ def decode_archive(data: bytes) -> SurveyMap:
         missing = sorted(set(dtypes) - set(arrays))
         reason = f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
         raise MapFormatError(reason)
-    trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
     if number == 1:
-        arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"][:, None], 2, axis=1)
+        arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"].reshape(-1, 1), 2, axis=1)
+    _check(arrays)
+    trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
     fields: dict[str, Any] = {"camera": head.camera, "scale_known": head.scale_known, "trajectory": trajectory}
     fields |= {name: values for name, values in arrays.items() if name not in _HISTORY_DTYPES}
     remembered: dict[str, Any] = {name: values for name, values in arrays.items() if name in _HISTORY_DTYPES}
@@ -129,6 +156,24 @@ def decode_archive(data: bytes) -> SurveyMap:
             **remembered, next_keyframe_id=head.next_keyframe_id, next_landmark_id=head.next_landmark_id
         )
     return SurveyMap(**fields)
+
+
+def _check(arrays: dict[str, AnyArray]) -> None:
+    """Raises MapFormatError for arrays that do not fit each other: an archive may come from elsewhere, and builds index by it."""
+    lengths: dict[int | str, int] = {}
+    for name, array in arrays.items():
+        shape = _SHAPES[name]
+        expected = tuple(
+            size if isinstance(size, int) else lengths.setdefault(size, length)
+            for size, length in zip(shape, array.shape, strict=False)
+        )
+        if len(array.shape) != len(shape) or array.shape != expected:
+            raise MapFormatError(
+                f"archive: {name} has the shape {array.shape}, {expected} fits the others; it is damaged"
+            )
+    for name, most in (("obs_keyframe", lengths["K"]), ("obs_landmark", lengths["N"]), ("obs_octave", 32)):
+        if np.any((arrays[name] < 0) | (arrays[name] >= most)):
+            raise MapFormatError(f"archive: {name} is beyond 0 to {most - 1}; it is damaged")
 
 
 def _arrays(survey: SurveyMap, history: History) -> dict[str, AnyArray]:

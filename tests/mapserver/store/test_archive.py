@@ -1,7 +1,9 @@
 """Archives keep a survey to the bit."""
 
 import json
-from dataclasses import fields
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +35,22 @@ def test_round_trip_is_exact_and_deterministic() -> None:
     np.testing.assert_array_equal(back.history.keyframe_ids, np.arange(6))
     assert back.history.is_place.all()
     assert (back.history.next_keyframe_id, back.history.next_landmark_id) == (6, survey.landmark_ids.max() + 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("obs_keyframe", lambda values: np.full_like(values, 1 << 30)),
+        ("obs_landmark", lambda values: np.full_like(values, -1)),
+        ("obs_octave", lambda values: np.full_like(values, -128)),
+        ("points_map", lambda values: values[:5]),
+        ("descriptors", lambda values: values[:, :1]),
+    ],
+)
+def test_arrays_that_do_not_fit_each_other_are_refused(name: str, change: Callable[[Any], Any]) -> None:
+    survey = random_survey(np.random.default_rng(0))
+    with pytest.raises(MapFormatError, match=r"archive: .*; it is damaged"):
+        decode_archive(encode_archive(replace(survey, **{name: change(getattr(survey, name))})))
 
 
 def test_archives_of_format_1_are_read() -> None:
