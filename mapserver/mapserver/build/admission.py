@@ -9,16 +9,24 @@ from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.recordings import Follow
-from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.doctor import Finding, Verdict, accelerometer_images, fixed_pattern, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
+from mapserver.doctor.metres import METRES, WHEELS
 from mapserver.doctor.run_checks import run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
 # Wrong units, axes or cameras: a survey would not fail on them but be wrong. Gaps, blur and damage it can cope with.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
-DECISIVE |= {"gyro scale", "gyro axes", *(parameter.value for parameter in TOLERANCES)}
+DECISIVE |= {
+    "gyro scale",
+    "gyro axes",
+    accelerometer_images.NAME,
+    METRES,
+    fixed_pattern.NAME,
+    *(parameter.value for parameter in TOLERANCES),
+}
 # What nothing but the calibration tells a map, and the checks that judge it.
 SUBJECTS = {
     "metric scale": ("baseline", "focal length"),
@@ -42,6 +50,11 @@ class CheckedRecording:
     calibration: RigEvidence
     corrections: dict[str, float]
 
+    @property
+    def leaves_wheels_out(self) -> bool:
+        """True if everything else contradicts the wheels."""
+        return leaves_wheels_out(self.findings)
+
     def statements(self) -> list[str]:
         """Each finding that is not good or could not be judged, in words, and what was done about them."""
         return self._with_corrections(f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK)
@@ -60,6 +73,11 @@ class CheckedRecording:
         done = ", ".join(f"{name} by {in_words(name, value)}" for name, value in self.corrections.items())
         said = f"corrected: {done}, as measured; robots that use this calibration file keep its error"
         return [*words, said] if done else list(words)
+
+
+def leaves_wheels_out(findings: Sequence[Finding]) -> bool:
+    """True if everything else contradicts the wheels."""
+    return any(f.name == WHEELS and f.verdict is Verdict.FAIL for f in findings)
 
 
 def fingerprint(calibration: RigCalibration) -> str:
@@ -97,11 +115,12 @@ def checked(
     limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
     checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow)
     _refuse(recording, checks.findings)
+    used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
     rig, corrections = corrected(recording.calibration, checks.calibration)
     again: list[Finding] = []
     if corrections:
-        measured = measure_calibration(replace(recording, calibration=rig), on_frame, executor, follow)
+        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor, follow)
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
     elif checks.measured_offset_s is not None and abs(checks.measured_offset_s) >= _CORRECTED_FROM_S:
         corrections = {CalibrationParameter.TIME_OFFSET.value: round(checks.measured_offset_s, 7)}

@@ -105,11 +105,11 @@ class SurveyBeginnings:
         if config is None or is_given or seconds > _SHARED_STRETCHES * LONGEST_S:
             return None
 
-        def followed(rig: RigCalibration) -> Work[CalibrationEstimate]:
-            self.last = None
-            inputs = survey_inputs_of(replace(recording, calibration=rig), indices, Rectifier(rig), None)
+        def followed(given: Recording) -> Work[CalibrationEstimate]:
+            self.last, rig = None, given.calibration
+            inputs = survey_inputs_of(given, indices, Rectifier(rig), None)
             chain = begin_survey(inputs, config.settings, tools)
-            stretch = stretch_of_chain(chain, recording, (rig, inputs.rectifier))
+            stretch = stretch_of_chain(chain, given, (rig, inputs.rectifier))
             beside = tools.executor.beside(estimate_from, [stretch])
             self.last = BegunSurvey(rig, inputs.rectifier, chain)
             if beside is None:

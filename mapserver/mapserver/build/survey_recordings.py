@@ -97,6 +97,7 @@ class Admission:
     corrections: dict[str, float]
     begun: BegunSurvey | None = None
     given: Trajectory | None = None
+    leaves_wheels_out: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +243,10 @@ def _admission(
             console.print(f"{recording.name}: {remark}", markup=False)
         begun = None if beginnings is None else beginnings.last
         begun = begun if begun is not None and begun.rig is result.rig else None
-        admission = Admission(tuple(result.statements()), result.rig, result.calibration, result.corrections, begun)
+        statements, found = tuple(result.statements()), result.calibration
+        admission = Admission(
+            statements, result.rig, found, result.corrections, begun, leaves_wheels_out=result.leaves_wheels_out
+        )
         if other is None:
             return admission
         given = given_poses(replace(recording, calibration=result.rig), indices, other)
@@ -261,6 +265,8 @@ def survey_recording(
     """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
     with reading.open(path) as (opened, indices):
         recording = replace(opened, calibration=admission.rig)
+        if admission.leaves_wheels_out:
+            recording = replace(recording, wheel=())
         if (begun := admission.begun) is not None:
             rectifier, done = begun.rectifier, begun.finished(options, tools)
             known = [] if begun.held_out is None else begun.held_out.result()

@@ -23,7 +23,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter
-Follow = Callable[[RigCalibration], Work[CalibrationEstimate]]
+Follow = Callable[[Recording], Work[CalibrationEstimate]]
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
@@ -51,7 +51,7 @@ def estimate_calibration(
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
-    follow: the estimate from the only recording under a calibration, instead of the first pass here. is_enough: whether an estimate need
+    follow: the estimate from the only recording, instead of the first pass here. is_enough: whether an estimate need
     not be any better, however far the parameters that are named are from the given calibration.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
@@ -70,7 +70,7 @@ def estimate_calibration(
         axes = RigAxes.of(rig, Rectifier(rig))
         current = corrected_rig(rig, axes, before) if before.any() else rig
         if follow is not None and current is rig:
-            estimate = follow(rig).result()
+            estimate = follow(recordings[0]).result()
         else:
             found = estimate_from([followed(r, current, settings, tools or SurveyTools()) for r in recordings])
             estimate = continued_from(before, found)

@@ -1,6 +1,7 @@
 """The gyro against the images: time offset, scale and axes of their rotation rates."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import permutations, product
 
 import numpy as np
 
@@ -13,27 +14,42 @@ _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
 _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
+_AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
+# The orders and signs of three axes, as matrices body_from_sensor.
+SIGNED_AXES = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+]
 _NAMES = ("camera-imu time offset", "gyro scale", "gyro axes")
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTurns:
-    """Rotation rates seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes."""
+    """Motion seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
+
+    ways_m (K, 3): where the body was at the end, in its axes at the start and the calibration's metres; NaN with one camera, or empty.
+    """
 
     starts_ns: Stamps
     ends_ns: Stamps
     rates_body_radps: Array
+    ways_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True)
 class GyroFit:
-    """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images."""
+    """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images.
+
+    signed: the order and signs of the axes (3, 3) that explain them about as well and change least, None where none does.
+    """
 
     offset_s: float
     body_from_gyro: Array
     scale: float
     correlation: float
     axes_seen: int
+    signed: Array | None
 
 
 def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None]:
@@ -74,7 +90,14 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     body_from_gyro, axes_seen = _axes(seen, gyro[offset])
     turned = (gyro[offset] - gyro[offset].mean(axis=0)) @ body_from_gyro.T
     scale = float((turned * turned).sum() / max((turned * seen).sum(), 1e-12))
-    return GyroFit(_peak(offsets_s, scores, offset), body_from_gyro, scale, float(scores[offset]), axes_seen)
+    signed = _signed_axes(seen, (gyro[offset] - gyro[offset].mean(axis=0)) / scale, turned / scale)
+    return GyroFit(_peak(offsets_s, scores, offset), body_from_gyro, scale, float(scores[offset]), axes_seen, signed)
+
+
+def _signed_axes(seen: Array, gyro: Array, best: Array) -> Array | None:
+    least = float(((best - seen) ** 2).sum()) + _AS_WELL * float((seen**2).sum())
+    good = [axes for axes in SIGNED_AXES if float(((gyro @ axes.T - seen) ** 2).sum()) <= 2.0 * least]
+    return max(good, key=lambda axes: float(np.trace(axes)), default=None)
 
 
 def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[str, str] | None:
@@ -152,19 +175,33 @@ def _scale_finding(fit: GyroFit) -> Finding:
 
 def _axes_finding(fit: GyroFit) -> Finding:
     limit = "warn above 4 degrees, fail above 15 degrees"
+    about = f"judged about {fit.axes_seen} of 3 axes"
+    if fit.signed is not None and np.trace(fit.signed) < 3.0:
+        words = f"the gyro {axes_in_words(fit.signed)}: so the images turn, {about}"
+        advice = "mend its driver's signs, or how the calibration mounts it (T_cam_imu)"
+        return Finding(_NAMES[2], Verdict.FAIL, None, limit, f"{words}; {advice}")
     if np.linalg.det(fit.body_from_gyro) < 0:
-        nearest = _in_axes(fit.body_from_gyro)
-        words = f"the gyro's axes are mirrored ({nearest}); one axis has the wrong sign or two are exchanged"
+        words = (
+            f"the gyro's axes are mirrored ({in_axes(fit.body_from_gyro)}); one has the wrong sign or two are exchanged"
+        )
         return Finding(_NAMES[2], Verdict.FAIL, None, limit, words)
     angle_deg = float(np.degrees(rotation_angle_rad(fit.body_from_gyro)))
-    about = f"judged about {fit.axes_seen} of 3 axes"
     words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
     advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
-    bad = f"{words} ({_in_axes(fit.body_from_gyro)}); {advice}"
+    bad = f"{words} ({in_axes(fit.body_from_gyro)}); {advice}"
     return judge(_NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, bad)
 
 
-def _in_axes(body_from_gyro: Array) -> str:
+def axes_in_words(body_from_sensor: Array) -> str:
+    """What is wrong with a sensor that a signed permutation (3, 3) turns to the body's axes."""
+    signs = np.diag(body_from_sensor)
+    if not (np.abs(signs) == 1.0).all():
+        return f"has its axes exchanged ({in_axes(body_from_sensor)})"
+    wrong = [name for name, sign in zip("xyz", signs, strict=True) if sign < 0]
+    return "has the wrong sign" if len(wrong) == 3 else f"has the wrong sign on its {' and '.join(wrong)} axis"
+
+
+def in_axes(body_from_gyro: Array) -> str:
     """The nearest axis for each body axis, such as `x is -y`."""
     words = []
     for name, row in zip("xyz", body_from_gyro, strict=True):

@@ -6,15 +6,23 @@ from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.timing import RECORD_IMU
 
+NAME = "gravity magnitude"
 GRAVITY_MPS2 = 9.81
+# What a calm accelerometer shows instead, by a tenth: what that is
+_ODD = {
+    0.0: "gravity has been taken out of it: record the raw accelerometer, not the linear acceleration",
+    1.0: "it is in g: multiply it by 9.80665",
+    981.0: "it is in cm/s^2: divide it by 100",
+    9810.0: "it is in mm/s^2: divide it by 1000",
+    1000.0: "it is in thousandths of g: multiply it by 0.00980665",
+}
 _WINDOW_S = 0.5
 
 
 def gravity_magnitude(imu: ImuSamples) -> Finding:
     """The magnitude of the specific force in the calmest tenth of half-second windows."""
-    name = "gravity magnitude"
     if len(imu) < 100:
-        return not_judged(name, f"{len(imu)} inertial samples are too few", RECORD_IMU)
+        return not_judged(NAME, f"{len(imu)} inertial samples are too few", RECORD_IMU)
     period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     width = max(10, round(_WINDOW_S / period_s))
     count = len(imu) // width
@@ -26,5 +34,7 @@ def gravity_magnitude(imu: ImuSamples) -> Finding:
     verdict = Verdict.OK if error < 0.25 else Verdict.WARN if error < 0.8 else Verdict.FAIL
     sentence = f"{magnitude:.2f} m/s^2 when calm"
     if verdict is not Verdict.OK:
-        sentence += f" instead of {GRAVITY_MPS2}; check the accelerometer's unit, scale and calibration"
-    return Finding(name, verdict, magnitude, "warn 0.25, fail 0.8 m/s^2 from 9.81", sentence)
+        known = (words for value, words in _ODD.items() if abs(magnitude - value) < max(0.1 * value, 0.3))
+        advice = next(known, "check the accelerometer's unit, scale and calibration")
+        sentence += f" instead of {GRAVITY_MPS2}; {advice}"
+    return Finding(NAME, verdict, magnitude, "warn 0.25, fail 0.8 m/s^2 from 9.81", sentence)

@@ -1,31 +1,35 @@
 """Reads the frames that the checks need and runs all of them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, so3_log
+from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.recordings import Recording
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.calibration import CalibrationEstimate
 from mapserver.calibration.recordings import Follow
-from mapserver.doctor import inertial, timing
+from mapserver.doctor import accelerometer_images, inertial, timing
+from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accelerometer
 from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
-from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.depth import depth_share, measured_depth
-from mapserver.doctor.findings import Finding, Verdict
+from mapserver.doctor.findings import Finding, Verdict, not_judged
+from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
+from mapserver.doctor.metres import ImageMetres, Metres
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
 from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo, swapped_cameras
+from mapserver.doctor.wheel_images import WheelFit, fit_wheels
 from mapserver.survey.executor import SERIAL, Executor, Work
 
 _Turns = tuple[CameraTurns, int, list[str]]  # how many frames were tried, and what was wrong with some
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
+_STEP_S = 0.045  # between two frames that show a speed: a step of 20 Hz
 TURN_FRAMES = 200
 
 
@@ -95,24 +99,44 @@ def run_checks(
     calibration = MeasuredCalibration([], None)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
     findings += _soon_seen(recording, rectifier, seen)
+    turns: CameraTurns | None = None
     beside: list[Work[_Turns]] = []
 
-    def followed(rig: RigCalibration) -> Work[CalibrationEstimate]:
+    def judged(turns: CameraTurns) -> tuple[Finding, Metres]:
+        """The accelerometer's axes, and who is right about metres."""
+        fits = fit_accelerometer(turns, imu, shift_s) if has_gravity else []
+        axes = not_judged(accelerometer_images.NAME, "there is no IMU", timing.RECORD_IMU)
+        if len(imu):
+            axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
+        given = next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
+        return axes, Metres.of(seen.wheels, given, seen.images, seen.image_mps)
+
+    has_gravity = not any(f.name == inertial.NAME and f.verdict is Verdict.FAIL for f in findings)
+    metres = Metres.of(seen.wheels, None, seen.images, seen.image_mps)
+    used = recording
+    if metres.wheels_finding().verdict is Verdict.FAIL or metres.metres_finding().verdict is Verdict.FAIL:
+        turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
+        if judged(turns)[1].wheels_finding().verdict is Verdict.FAIL:
+            used = replace(recording, wheel=())
+
+    def followed(given: Recording) -> Work[CalibrationEstimate]:
         """Turns are looked at once the estimate is on its way."""
         assert follow is not None
-        work = follow(rig)
-        turns = executor.beside(_turns_alone, _bare(recording), turn_frames) if not beside else None
-        beside.extend([] if turns is None else [turns])
+        work = follow(given)
+        looking = executor.beside(_turns_alone, _bare(recording), turn_frames) if turns is None and not beside else None
+        beside.extend([] if looking is None else [looking])
         return work
 
     if recording.sensor_set in _PAIRS:
-        calibration = measure_calibration(recording, on_frame, executor, None if follow is None else followed)
+        calibration = measure_calibration(used, on_frame, executor, None if follow is None else followed)
     if beside:
         turns = frames.taken(*beside[0].result())
-    else:
+    elif turns is None:
         turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
-    findings += [*checked, *calibration.findings, sharpness(seen.variances), _readable(frames)]
+    axes, metres = judged(turns)
+    findings += [*checked, axes, metres.wheels_finding(), metres.metres_finding()]
+    findings += [*calibration.findings, sharpness(seen.variances), _readable(frames)]
     return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
 
 
@@ -125,17 +149,24 @@ def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What frames all over the recording show. depth_shares: of pixels that have a depth."""
+    """What frames all over the recording show.
+
+    depth_shares: of pixels that have a depth. wheels: against the images, None without wheels. image_mps: median speed by the images.
+    """
 
     pairs: list[StereoMatches]
     variances: list[float]
     depth_shares: list[float]
+    structures: list[tuple[Array, Array]]
+    images: ImageMetres | None
+    wheels: WheelFit | None
+    image_mps: float
 
 
 def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen) -> list[Finding]:
     imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
     overlap = timing.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
-    findings = [overlap, inertial.gravity_magnitude(imu)]
+    findings = [overlap, inertial.gravity_magnitude(imu), fixed_pattern(seen.structures)]
     if recording.sensor_set in _PAIRS:
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
     if recording.sensor_set is SensorSet.RGBD:
@@ -144,43 +175,83 @@ def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen) -> list[
 
 
 def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
-    seen = _Seen([], [], [])
-    for variance, pair, share in executor.map(_look, None, _moments(recording, frames, rectifier, count)):
-        seen.variances.append(variance)
-        seen.pairs.extend([] if pair is None else [pair])
-        seen.depth_shares.extend([] if share is None else [share])
-    return seen
+    looks = list(
+        executor.map(_look, (rectifier.camera, rectifier.body_from_cam), _moments(recording, frames, rectifier, count))
+    )
+    pairs = [look.pair for look in looks if look.pair is not None]
+    depths = [look.depth_m for look in looks if np.isfinite(look.depth_m)]
+    turns = _turns(look.motion for look in looks if look.motion is not None)
+    speeds = np.linalg.norm(turns.ways_m, axis=1) / ((turns.ends_ns - turns.starts_ns) * 1e-9)
+    wheels, rig = None, recording.calibration
+    if recording.wheel:
+        wheels = fit_wheels(turns, recording.wheel, rig.base_from_body, rig.cameras[0].imu_minus_cam_s)
+    baseline_m = rectifier.camera.baseline_m if recording.sensor_set in _PAIRS else None
+    shows_metres = recording.sensor_set in _PAIRS or recording.sensor_set is SensorSet.RGBD
+    return _Seen(
+        pairs,
+        [look.variance for look in looks],
+        [look.depth_share for look in looks if look.depth_share is not None],
+        [look.structure for look in looks],
+        ImageMetres(baseline_m, float(np.median(depths))) if shows_metres and depths else None,
+        wheels,
+        float(np.nanmedian(speeds)) if np.isfinite(speeds).any() else 0.0,
+    )
 
 
-def _moments(
-    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
-) -> Iterator[tuple[CameraFrame, RectifiedFrame | None]]:
-    """Frames spread over the recording: as recorded, and the pair where there is a right picture."""
+_Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None]
+
+
+def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
+    """Frames spread over the recording, as recorded and rectified, and the next ones where they are near and a speed is wanted."""
+    stamps_ns, needs_speed = recording.frame_stamps_ns, bool(recording.wheel) or not len(recording.imu)
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
+        after = int(np.searchsorted(stamps_ns, stamps_ns[index] + int(_STEP_S * 1e9)))
+        is_near = needs_speed and after < len(recording) and stamps_ns[after] - stamps_ns[index] < timing.SPARSE_S * 1e9
+        other = frames.read(after) if is_near else None
         if frame is not None:
-            yield frame, None if frame.right is None else rectifier.rectify(frame)
+            yield frame, rectifier.rectify(frame), None if other is None else rectifier.rectify(other)
 
 
-def _look(
-    _: None, moment: tuple[CameraFrame, RectifiedFrame | None]
-) -> tuple[float, StereoMatches | None, float | None]:
-    frame, pair = moment
-    share = None if frame.depth_m is None else depth_share(frame.depth_m)
-    return laplacian_variance(frame.left), None if pair is None else match_stereo(pair), share
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What one moment shows. depth_m: median, NaN if unknown."""
+
+    variance: float
+    pair: StereoMatches | None
+    depth_share: float | None
+    depth_m: float
+    structure: tuple[Array, Array]
+    motion: tuple[int, int, Array | None] | None
+
+
+def _look(shared: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
+    (camera, _), (frame, rectified, after) = shared, moment
+    pair = None if frame.right is None else match_stereo(rectified)
+    share, depth_m = None, np.nan
+    if frame.depth_m is not None:
+        share, known = depth_share(frame.depth_m), frame.depth_m[frame.depth_m > 0]
+        depth_m = float(np.median(known)) if len(known) else np.nan
+    elif pair is not None and len(pair.disparities_px):
+        depth_m = camera.focal_px * camera.baseline_m / max(float(np.median(pair.disparities_px)), 0.1)
+    motion = None if after is None else _motion(shared, (rectified, after))
+    return _Look(laplacian_variance(frame.left), pair, share, depth_m, fine_structure(frame.left), motion)
 
 
 def _camera_turns(
     recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor
 ) -> CameraTurns:
-    starts, ends, rates = [], [], []
     pairs = _consecutive(recording, frames, rectifier, count)
-    for start_ns, end_ns, rate in executor.map(_turn, (rectifier.camera, rectifier.body_from_cam[:3, :3]), pairs):
-        if rate is not None:
-            starts.append(start_ns)
-            ends.append(end_ns)
-            rates.append(rate)
-    return CameraTurns(np.array(starts, np.int64), np.array(ends, np.int64), np.array(rates).reshape(-1, 3))
+    return _turns(executor.map(_motion, (rectifier.camera, rectifier.body_from_cam), pairs))
+
+
+def _turns(motions: Iterable[tuple[int, int, Array | None]]) -> CameraTurns:
+    """Of what `_motion` found."""
+    found = [each for each in motions if each[2] is not None]
+    spans = np.array([[start_ns, end_ns] for start_ns, end_ns, _ in found], np.int64).reshape(-1, 2)
+    moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
+    rates = np.array([so3_log(motion[:3, :3]) for motion in moved]).reshape(-1, 3) / (np.diff(spans) * 1e-9)
+    return CameraTurns(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
 
 
 def _bare(recording: Recording) -> Recording:
@@ -197,16 +268,14 @@ def _turns_alone(recording: Recording, count: int) -> _Turns:
         return _camera_turns(recording, frames, rectifier, count, SERIAL), frames.tried, frames.errors
 
 
-def _turn(
+def _motion(
     shared: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
 ) -> tuple[int, int, Array | None]:
-    """Stamps of two frames and the body's angular rate (3,) between them."""
-    (camera, rotation), (before, after) = shared, pair
-    before_from_after = rotation_between(before, after, camera)
-    if before_from_after is None:
-        return before.stamp_ns, after.stamp_ns, None
-    dt_s = (after.stamp_ns - before.stamp_ns) * 1e-9
-    return before.stamp_ns, after.stamp_ns, so3_log(rotation @ before_from_after @ rotation.T) / dt_s
+    """Stamps of two frames and the body's motion (4, 4) between them, earlier_from_later."""
+    (camera, body_from_cam), (before, after) = shared, pair
+    motion = motion_between(before, after, camera)
+    moved = None if motion is None else body_from_cam @ motion @ se3_inverse(body_from_cam)
+    return before.stamp_ns, after.stamp_ns, moved
 
 
 def _consecutive(

@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, so3_log
 from fleetmap.live_survey import COVERAGE_CELL_M, LiveFinding, LiveMissing
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.doctor import Finding, Verdict, timing
-from mapserver.doctor.camera_rotation import rotation_between
+from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.inertial import gravity_magnitude
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
@@ -70,9 +70,9 @@ class DriveDoctor:
         if before is None or self._rig.imu_noise is None:
             return
         duration_s, rotation = (frame.stamp_ns - before.stamp_ns) * 1e-9, self._rig.body_from_cam[:3, :3]
-        turn = rotation_between(before, frame, self._rig.camera) if duration_s < _NEXT_S else None
-        if turn is not None:
-            rate = so3_log(rotation @ turn @ rotation.T) / duration_s
+        motion = motion_between(before, frame, self._rig.camera) if duration_s < _NEXT_S else None
+        if motion is not None:
+            rate = so3_log(rotation @ motion[:3, :3] @ rotation.T) / duration_s
             self._stretch.turns.append((before.stamp_ns, frame.stamp_ns, rate))
 
     def _judge(self, stretch: "_Stretch", stamp_ns: int) -> None:

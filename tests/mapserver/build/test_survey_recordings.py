@@ -193,7 +193,7 @@ def test_a_survey_under_another_calibration_does_not_go_on(tmp_path: Path, monke
     followed: list[int] = []
 
     def corrected(recording: Recording, *, follow: Follow, **_: object) -> CheckedRecording:
-        followed.append(follow(recording.calibration).result().keyframes)
+        followed.append(follow(recording).result().keyframes)
         other = replace(recording.calibration, base_from_body=np.eye(4))
         return CheckedRecording(other, [], rig_evidence("", []), {})
 

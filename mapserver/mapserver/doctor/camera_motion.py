@@ -1,4 +1,4 @@
-"""Rotation of the camera between two frames, by the images alone."""
+"""Motion of the camera between two frames, by the images alone."""
 
 import cv2
 import numpy as np
@@ -14,11 +14,11 @@ _WINDOW_PX, _LEVELS, _RETURNED_PX = 15, 4, 0.5
 _STEREO = StereoSettings()
 
 
-def rotation_between(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> Array | None:
-    """(3, 3) before_from_after in camera axes, None where too little can be tracked.
+def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> Array | None:
+    """(4, 4) before_from_after in camera axes, None where too little can be tracked.
 
     With a second camera or depth by perspective-n-point from the first frame's points, which is exact in pure rotation
-    too, else by the essential matrix.
+    too, else the rotation of the essential matrix, and a translation of NaN.
     """
     corners = cv2.goodFeaturesToTrack(before.left, _CORNERS, 0.01, 12)
     if corners is None or len(corners) < _MIN_POINTS:
@@ -31,13 +31,13 @@ def rotation_between(before: RectifiedFrame, after: RectifiedFrame, camera: Ster
     has_depth = is_tracked & np.isfinite(found)
     if camera.baseline_m > 0 and has_depth.sum() >= _MIN_POINTS:
         points_cam = camera.point_from_pixel(pixels[has_depth], found[has_depth])
-        return _rotation_of_points(points_cam, flow.places[has_depth], camera)
+        return _motion_of_points(points_cam, flow.places[has_depth], camera)
     if is_tracked.sum() < _MIN_POINTS:
         return None
-    return _rotation_of_rays(pixels[is_tracked], flow.places[is_tracked], camera)
+    return _turn_of_rays(pixels[is_tracked], flow.places[is_tracked], camera)
 
 
-def _rotation_of_points(points_cam: Array, pixels: Array, camera: StereoCamera) -> Array | None:
+def _motion_of_points(points_cam: Array, pixels: Array, camera: StereoCamera) -> Array | None:
     found, rotvec, shift, inliers = cv2.solvePnPRansac(
         points_cam, pixels, camera.matrix, None, iterationsCount=100, reprojectionError=1.5
     )
@@ -46,11 +46,12 @@ def _rotation_of_points(points_cam: Array, pixels: Array, camera: StereoCamera) 
     kept = inliers.ravel()
     rotvec, shift = cv2.solvePnPRefineLM(points_cam[kept], pixels[kept], camera.matrix, np.zeros(0), rotvec, shift)
     turn, move = np.asarray(rotvec, np.float64).ravel(), np.asarray(shift, np.float64).ravel()
-    after_from_before = se3(so3_exp(turn), move)
-    return np.asarray(se3_inverse(after_from_before)[:3, :3])
+    if not (np.isfinite(turn).all() and np.isfinite(move).all()):
+        return None
+    return se3_inverse(se3(so3_exp(turn), move))
 
 
-def _rotation_of_rays(before: Array, after: Array, camera: StereoCamera) -> Array | None:
+def _turn_of_rays(before: Array, after: Array, camera: StereoCamera) -> Array | None:
     essential, inliers = cv2.findEssentialMat(before, after, camera.matrix, cv2.RANSAC, 0.999, 1.0)
     if essential is None or essential.shape != (3, 3) or int(inliers.sum()) < _MIN_POINTS:
         return None
@@ -58,4 +59,4 @@ def _rotation_of_rays(before: Array, after: Array, camera: StereoCamera) -> Arra
     # camera hardly moves; from one frame to the next it does not turn round.
     first, second, _ = cv2.decomposeEssentialMat(essential)
     after_from_before = first if np.trace(first) > np.trace(second) else second
-    return np.asarray(after_from_before.T, np.float64)
+    return se3(np.asarray(after_from_before.T, np.float64), np.full(3, np.nan))

@@ -1,0 +1,153 @@
+"""Signs, axes and scales that everything else contradicts are found by name, from one good ride and a change of it."""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array
+from fleetmap.preparation.painted_room import Ride, write_ride
+from fleetmap.recordings import Recording, open_recording
+from fleetmap.sensors.samples import ImuSamples, SensorSet
+from mapserver.doctor import Verdict
+from mapserver.doctor.calibration import MeasuredCalibration
+from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
+from support.recordings.calibration_faults import baseline
+
+run_checks = importlib.import_module("mapserver.doctor.run_checks")
+Change = Callable[[Recording], Recording]
+
+
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Four seconds along a wall and back, on wheels, with an IMU."""
+    path = tmp_path_factory.mktemp("ride") / "ride.mcap"
+    write_ride(path, Ride(4.0, 2.4), SensorSet.STEREO_INERTIAL)
+    return open_recording(path)
+
+
+@pytest.fixture
+def _quick(monkeypatch: pytest.MonkeyPatch, seen: dict[object, object]) -> None:
+    """Without the adjustment of the calibration, and with what was seen in the same images before."""
+    monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))
+    for name in ("motion_between", "match_stereo"):
+        monkeypatch.setattr(run_checks, name, remembered(getattr(run_checks, name), seen))
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[object, object]:
+    return {}
+
+
+def remembered(look: Callable[..., object], seen: dict[object, object]) -> Callable[..., object]:
+    def remember(*given: object) -> object:
+        key = (look.__name__, *(getattr(each, "stamp_ns", each) for each in given))
+        if key not in seen:
+            seen[key] = look(*given)
+        return seen[key]
+
+    return remember
+
+
+def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Change:
+    """Samples multiplied by matrices (3, 3) or numbers."""
+    by_accel, by_gyro = (
+        np.eye(3) * accel if np.ndim(accel) < 2 else accel,
+        np.eye(3) * gyro if np.ndim(gyro) < 2 else gyro,
+    )
+    return lambda r: replace(
+        r, imu=ImuSamples(r.imu.stamps_ns, r.imu.gyro_radps @ by_gyro.T, r.imu.accel_mps2 @ by_accel.T)
+    )
+
+
+def wheels(speed: float = 1.0, yaw: float = 1.0) -> Change:
+    return lambda r: replace(
+        r,
+        wheel=tuple(
+            replace(s, velocity_base_mps=speed * s.velocity_base_mps, yaw_rate_radps=yaw * s.yaw_rate_radps)
+            for s in r.wheel
+        ),
+    )
+
+
+def without_wheels(recording: Recording) -> Recording:
+    return replace(recording, wheel=())
+
+
+def without_imu(recording: Recording) -> Recording:
+    rig = replace(recording.calibration, imu=None)
+    return replace(recording, imu=ImuSamples.empty(), calibration=rig, sensor_set=SensorSet.STEREO)
+
+
+def longer(times: float, *before: Change) -> Change:
+    """The baseline is said to be so many times longer than it is."""
+
+    def change(recording: Recording) -> Recording:
+        for each in before:
+            recording = each(recording)
+        return baseline(100.0 * (times - 1.0)).recording(recording)
+
+    return change
+
+
+X, Y, Z = (np.diag(1.0 - 2.0 * np.eye(3)[axis]) for axis in range(3))
+YAW = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+CYCLE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+CASES = {
+    "good": (lambda r: r, {}),
+    "good without wheels": (without_wheels, {}),
+    "good without IMU": (without_imu, {}),
+    "accelerometer negated": (imu(-1.0), {"accelerometer axes": "has the wrong sign:"}),
+    "its x negated": (imu(X), {"accelerometer axes": "wrong sign on its x axis"}),
+    "its y negated": (imu(Y), {"accelerometer axes": "wrong sign on its y axis"}),
+    "its z negated": (imu(Z), {"accelerometer axes": "wrong sign on its z axis"}),
+    "its axes exchanged": (imu(CYCLE), {"accelerometer axes": "x is z, y is x, z is y"}),
+    "accelerometer in g": (imu(1 / 9.80665), {"gravity magnitude": "it is in g"}),
+    "gyro negated": (imu(1.0, -1.0), {"gyro axes": "has the wrong sign:"}),
+    "its yaw negated": (imu(1.0, Z), {"gyro axes": "wrong sign on its z axis"}),
+    "gyro exchanged": (imu(1.0, CYCLE), {"gyro axes": "x is z, y is x, z is y"}),
+    "gyro in degrees": (imu(1.0, 180 / np.pi), {"gyro scale": "degrees per second"}),
+    "IMU turned by 90 degrees": (imu(YAW, YAW), {"accelerometer axes": "x is -y", "gyro axes": "x is -y"}),
+    "wheels backwards": (wheels(-1.0), {"wheels": "backwards"}),
+    "wheels backwards without IMU": (lambda r: wheels(-1.0)(without_imu(r)), {"wheels": "backwards"}),
+    "wheels at rest": (wheels(0.0, 0.0), {"wheels": "rest while the images move"}),
+    "wheels in mm/s": (wheels(1000.0), {"wheels": "they are in mm/s"}),
+    "wheels in mm/s without IMU": (lambda r: wheels(1000.0)(without_imu(r)), {"wheels": "they are in mm/s"}),
+    "wheels half as fast": (wheels(0.5), {"wheels": "times as fast as the images move; check"}),
+    "yaw in degrees": (wheels(1.0, 180 / np.pi), {"wheels": "yaw rate is in degrees per second"}),
+    "yaw negated": (wheels(1.0, -1.0), {"wheels": "yaw rate is -1 times"}),
+    "baseline doubled": (longer(2.0), {"metric scale": "0.5 m by the wheels and 0.5"}),
+    "baseline a tenth without wheels": (longer(0.1, without_wheels), {"metric scale": "m by the accelerometer"}),
+    "baseline ten times without IMU": (longer(10.0, without_imu), {"metric scale": "0.1 m by the wheels"}),
+    "baseline in mm, alone": (longer(100.0, without_imu, without_wheels), {"metric scale": "a baseline of 20 m"}),
+    "baseline of a hundredth, alone": (
+        longer(0.01, without_imu, without_wheels),
+        {"metric scale": "a baseline of 0.002 m"},
+    ),
+}
+
+
+@pytest.mark.usefixtures("_quick")
+@pytest.mark.parametrize("case", CASES)
+def test_what_everything_contradicts_is_named(ride: Recording, case: str) -> None:
+    change, faults = CASES[case]
+    findings = run_checks.run_checks(change(ride), sampled=20).findings
+    failed = {f.name: f.sentence for f in findings if f.verdict is Verdict.FAIL}
+    assert failed.keys() == faults.keys(), failed
+    for name, words in faults.items():
+        assert words in failed[name]
+
+
+@pytest.mark.parametrize(("brightness", "verdict"), [(0, Verdict.OK), (90, Verdict.FAIL)])
+def test_dots_of_a_projector_that_moves_with_the_camera(ride: Recording, brightness: int, verdict: Verdict) -> None:
+    """And nothing is found in the same pictures without them."""
+    rng = np.random.default_rng(0)
+    dots = np.zeros((240, 320), np.uint8)
+    dots[rng.integers(0, 240, 800), rng.integers(0, 320, 800)] = brightness
+    dots = cv2.dilate(dots, np.ones((2, 2)))
+    images = [cv2.add(ride.read_frame(index).left, dots) for index in range(22, 72, 4)]
+    assert fixed_pattern([fine_structure(image) for image in images]).verdict is verdict
+    assert fixed_pattern([fine_structure(image) for image in images[:1] * 12]).verdict is Verdict.NOT_JUDGED
