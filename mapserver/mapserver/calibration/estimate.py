@@ -120,6 +120,8 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
     theta = covariance @ pull
     covariance += np.diag(_common_errors(stretches) ** 2)
     first = stretches[0]
+    if not first.is_inertial:  # a gyro tells the focal length whatever the lens is; depths alone do not
+        covariance[INDEX[P.FOCAL], INDEX[P.FOCAL]] += max(each.focal_by_lens for each in adjusted) ** 2
     keyframes = sum(len(data.stamps_ns) for data in stretches)
     has_wheels = any(len(data.wheel) > 0 for data in stretches)
     sensors = Sensors(len(first.calibration.cameras) > 1, first.is_inertial, has_wheels, keyframes)
@@ -190,6 +192,8 @@ def _reason(name: CalibrationParameter, sensors: Sensors) -> str:
         return "there is no IMU"
     if name is P.WHEEL_SCALE and not sensors.has_wheels:
         return "there is no wheel odometry"
+    if name is P.FOCAL and not sensors.has_imu:
+        return "without the turns of an IMU an error of the lens looks the same: record one"
     if name is P.BASELINE and not (sensors.has_imu or sensors.has_wheels):
         return "neither an IMU nor wheels measure metres: record one of them"
     if name.startswith("camera position") and not (sensors.has_imu or sensors.has_wheels):

@@ -70,7 +70,8 @@ class ErrorScales:
 @dataclass(frozen=True)
 class Adjusted:
     """The optimum: theta (C,) with information (C, C), priors included; the state; the scales of the errors, and
-    their sigmas' shares; lens (UNKNOWNS - C,): corrections of the distortion."""
+    their sigmas' shares; lens (UNKNOWNS - C,): corrections of the distortion. focal_by_lens: by how much radial distortion beyond what the
+    given lens may be off by moves the focal length."""
 
     theta: Array
     information: Array
@@ -80,6 +81,7 @@ class Adjusted:
     accel_sigma: float
     observations: int
     lens: Array
+    focal_by_lens: float
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,10 @@ def adjust(data: CalibrationData) -> Adjusted:
     own = len(COLUMNS)
     lens = np.linalg.solve(information[own:, own:], information[own:, :own])
     reported = information[:own, :own] - information[:own, own:] @ lens
-    return Adjusted(theta[:own], reported, state, scales, *sigmas, seen, theta[own:])
+    excess = np.maximum(np.abs(theta[own:]) - data.lens_sigmas, 0.0)[:2]
+    by_lens = np.linalg.solve(information[:own, :own], information[:own, own : own + 2])
+    focal_by_lens = float(np.linalg.norm(by_lens[INDEX[CalibrationParameter.FOCAL]] * excess))
+    return Adjusted(theta[:own], reported, state, scales, *sigmas, seen, theta[own:], focal_by_lens)
 
 
 def prior_information() -> Array:
