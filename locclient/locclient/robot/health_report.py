@@ -117,6 +117,7 @@ class HealthFigures:
             flags += [NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
             flags += [Cause.NO_MAP] if last.map_version is None else []
             figures["not_localised_m"] = self.search.metres
+            flags += [] if self.last is None else self.last.left_out
         return RobotHealth(
             site=site,
             robot=robot,

@@ -16,6 +16,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
+from locclient.localization.perception import SensorPerception
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
@@ -23,6 +24,7 @@ from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
+from locclient.robot.sensor_agreement import IMU_REFUSED, WHEELS_REFUSED, WheelAgreement
 from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
@@ -68,7 +70,7 @@ class Outcome:
 
     cpu_s: from the images as they came to the estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
     an arrival. speed_mps: by the wheels, else by the odometry, None where neither knows it. may_be_mapped: False where the robot is not
-    localised and the map has no tile near.
+    localised and the map has no tile near. left_out: flags of sensors that everything else contradicts.
     """
 
     estimate: Estimate
@@ -79,6 +81,7 @@ class Outcome:
     dock_error_m: float | None = None
     speed_mps: float | None = None
     may_be_mapped: bool = True
+    left_out: tuple[str, ...] = ()
 
     def pose_message(self) -> PoseMessage | None:
         """The pose for the server; None while there is no single one with a covariance."""
@@ -130,6 +133,7 @@ class Robot:
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
+        self._wheels = WheelAgreement(calibration.base_from_body)
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
         self._building_from_map: Array | None = None
@@ -178,7 +182,8 @@ class Robot:
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
-        self.localizer.handle_wheel(bundle.wheel)
+        wheel = [] if self._wheels.is_refused else bundle.wheel
+        self.localizer.handle_wheel(wheel)
         if self.ring is not None:
             self.ring.handle_commands(bundle)
         if bundle.forget:
@@ -197,7 +202,8 @@ class Robot:
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._try(estimate, frame)
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map)
-        speed_mps = self._speed.handle(bundle.wheel, estimate.odometry, published.odom_from_base)
+        speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
+        self._wheels.handle(bundle.wheel, estimate.odometry)
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         if self.ring is not None:
@@ -206,7 +212,14 @@ class Robot:
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
         dock_error_m = self._docks.handle(bundle.priors, estimate)
-        return Outcome(estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered)
+        return Outcome(
+            estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out()
+        )
+
+    def _left_out(self) -> tuple[str, ...]:
+        perception = self.localizer.perception
+        refuses_imu = isinstance(perception, SensorPerception) and perception.odometry.refuses_imu
+        return (*([IMU_REFUSED] if refuses_imu else []), *([WHEELS_REFUSED] if self._wheels.is_refused else []))
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""

@@ -70,6 +70,11 @@ class Odometry:
         self._mode, self._frame_index = step.mode, frame_index + 1
         return self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
 
+    @property
+    def refuses_imu(self) -> bool:
+        """True if the images contradicted the IMU's turns, so that it is used no more."""
+        return self._rig.imu is not None and type(self._mode) is VisualMode
+
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 

@@ -260,6 +260,7 @@ def test_an_imu_that_is_given_up_moves_the_body_once(monkeypatch: pytest.MonkeyP
     last, now = estimates[given_up - 1], estimates[given_up]
     assert last.inertial
     assert not now.inertial
+    assert odometry.refuses_imu
     assert np.linalg.norm(relative_error(last, replace(now, odom_from_body=begun[given_up]))[3:]) < 0.02
     assert odometry.motion_since(given_up - 1) is not None, "the window goes on"
 

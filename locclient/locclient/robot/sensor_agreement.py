@@ -1,0 +1,54 @@
+"""Sensors that everything else contradicts while the robot drives: left out, and said. Pure."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.sensors.samples import WheelSample
+
+IMU_REFUSED, WHEELS_REFUSED = "imu_refused", "wheels_refused"
+"""Flags of RobotHealth: the camera's motion contradicts the sensor, which is not used."""
+WORDS = {
+    IMU_REFUSED: "the IMU is left out: it turns otherwise than the images; record a drive and ask `mapserver doctor` which axis is wrong",
+    WHEELS_REFUSED: "the wheels are left out: their speed contradicts the images and the IMU; `mapserver doctor` on a recording says how",
+}
+_OFF_SHARE, _OFF_MPS = 0.5, 0.3  # of the speed, and of slow ones: slip of a tyre is far less
+_LIMIT_M = 3.0  # of driving against the images: a spinning wheel or a person before the camera takes less
+_REST_SHARE = 0.2  # wheels that rest may be those of a robot that is carried: that counts for so much
+
+
+class WheelAgreement:
+    """Follows wheels and odometry frame by frame.
+
+    is_refused: they have contradicted each other for metres, and not agreed for as long since.
+    """
+
+    def __init__(self, base_from_body: Array) -> None:
+        self._base_from_body = base_from_body
+        self._last_ns: int | None = None
+        self._against_m = 0.0
+        self.is_refused = False
+
+    def handle(self, wheel: Sequence[WheelSample], odometry: OdometryEstimate) -> None:
+        """A frame; wheel: the samples since the one before."""
+        last_ns, self._last_ns = self._last_ns, odometry.stamp_ns
+        moved = odometry.previous_from_body
+        is_known = odometry.status is OdometryStatus.TRACKING and odometry.scale_known and moved is not None
+        if last_ns is None or not wheel or not is_known or moved is None:
+            return
+        duration_s = (odometry.stamp_ns - last_ns) * 1e-9
+        seen_mps = (self._base_from_body @ moved @ se3_inverse(self._base_from_body))[:2, 3] / duration_s
+        rolled_mps = np.mean([sample.velocity_base_mps[:2] for sample in wheel], axis=0)
+        seen, rolled = float(np.linalg.norm(seen_mps)), float(np.linalg.norm(rolled_mps))
+        step_m = min(max(seen, min(rolled, 1.0)), 10.0) * duration_s
+        if np.linalg.norm(rolled_mps - seen_mps) > max(_OFF_MPS, _OFF_SHARE * min(seen, rolled)):
+            self._against_m += step_m * (_REST_SHARE if rolled < 0.01 else 1.0)
+        else:
+            self._against_m -= step_m
+        self._against_m = min(max(self._against_m, 0.0), 2.0 * _LIMIT_M)
+        if self._against_m >= _LIMIT_M:
+            self.is_refused = True
+        elif self._against_m == 0.0:
+            self.is_refused = False

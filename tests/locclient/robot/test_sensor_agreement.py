@@ -1,0 +1,44 @@
+"""Wheels that the robot's other sensors contradict are left out until they agree again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import se3
+from fleetmap.sensors.samples import WheelSample
+from locclient.robot.sensor_agreement import WheelAgreement
+from support.fleet.estimates import estimate
+
+
+def drive(agreement: WheelAgreement, mps: float, wheel_mps: float, metres: float, first: int = 0) -> bool:
+    """Frames at 10 Hz; whether the wheels are refused at their end."""
+    for n in range(first, first + round(metres / (0.1 * max(mps, wheel_mps)))):
+        moved = se3(np.eye(3), np.array([0.1 * mps, 0.0, 0.0]))
+        odometry = replace(estimate(0.1 * n).odometry, previous_from_body=moved)
+        wheel = WheelSample(odometry.stamp_ns, np.array([wheel_mps, 0.0, 0.0]), 0.0, 0.01, 0.01)
+        agreement.handle([wheel], odometry)
+    return agreement.is_refused
+
+
+@pytest.mark.parametrize(
+    ("factor", "metres", "is_refused"),
+    [
+        (1.0, 30.0, False),
+        (1.2, 30.0, False),
+        (-1.0, 5.0, True),
+        (0.5, 5.0, True),
+        (1000.0, 50000.0, True),
+        (0.0, 5.0, False),  # of a robot that is carried the wheels rest, too, and not for as long
+        (0.0, 20.0, True),
+    ],
+)
+def test_wheels_that_contradict_are_refused(factor: float, metres: float, *, is_refused: bool) -> None:
+    assert drive(WheelAgreement(np.eye(4)), 1.5, 1.5 * factor, metres) is is_refused
+
+
+def test_wheels_that_agree_again_are_used_again() -> None:
+    agreement = WheelAgreement(np.eye(4))
+    assert drive(agreement, 1.0, -1.0, 5.0)
+    assert drive(agreement, 1.0, 1.0, 4.0, first=50)
+    assert not drive(agreement, 1.0, 1.0, 4.0, first=90)
