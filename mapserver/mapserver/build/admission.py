@@ -24,6 +24,7 @@ DECISIVE |= {
     "gyro axes",
     accelerometer_images.NAME,
     METRES,
+    "repeated images",
     fixed_pattern.NAME,
     *(parameter.value for parameter in TOLERANCES),
 }

@@ -129,8 +129,11 @@ class _Window:
 
 def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[_Window]:
     """The windows of all runs of frames that follow each other, in the axes of the body where their run begins."""
-    if len(imu) < 10 or len(turns.starts_ns) < 2 or not np.isfinite(turns.ways_m).all():
+    known = np.isfinite(turns.ways_m).all(axis=1)
+    if len(imu) < 10 or known.sum() < 2:
         return []
+    starts_ns, ends_ns = turns.starts_ns[known], turns.ends_ns[known]
+    turns = CameraTurns(starts_ns, ends_ns, turns.rates_body_radps[known], turns.ways_m[known])
     origin_ns = int(turns.starts_ns[0])
     starts_s, ends_s = (turns.starts_ns - origin_ns) * 1e-9, (turns.ends_ns - origin_ns) * 1e-9
     times_s = (imu.stamps_ns - origin_ns) * 1e-9 - imu_minus_cam_s

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, se3_inverse, so3_log
+from fleetmap.geometry import Array, se3, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -17,7 +17,7 @@ from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accele
 from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
 from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.depth import depth_share, measured_depth
-from mapserver.doctor.findings import Finding, Verdict, not_judged
+from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
 from mapserver.doctor.gyro_images import CameraTurns, gyro_check
 from mapserver.doctor.metres import ImageMetres, Metres
@@ -26,7 +26,9 @@ from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo,
 from mapserver.doctor.wheel_images import WheelFit, fit_wheels
 from mapserver.survey.executor import SERIAL, Executor, Work
 
-_Turns = tuple[CameraTurns, int, list[str]]  # how many frames were tried, and what was wrong with some
+_Turns = tuple[
+    CameraTurns, int, list[str], int
+]  # how many frames were tried, what was wrong with some, how often one repeats
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
 _STEP_S = 0.045  # between two frames that show a speed: a step of 20 Hz
@@ -50,7 +52,7 @@ class _Frames:
 
     def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
         self._recording, self._on_frame = recording, on_frame
-        self.tried = 0
+        self.tried = self.repeats = 0
         self.errors: list[str] = []
 
     def read(self, index: int) -> CameraFrame | None:
@@ -62,8 +64,9 @@ class _Frames:
             self.errors.append(str(error))
             return None
 
-    def taken(self, turns: CameraTurns, tried: int, errors: list[str]) -> CameraTurns:
+    def taken(self, turns: CameraTurns, tried: int, errors: list[str], repeats: int) -> CameraTurns:
         """The turns of frames that were read elsewhere."""
+        self.repeats += repeats
         self.tried += tried
         self.errors += errors
         for _ in range(tried):
@@ -137,6 +140,7 @@ def run_checks(
     axes, metres = judged(turns)
     findings += [*checked, axes, metres.wheels_finding(), metres.metres_finding()]
     findings += [*calibration.findings, sharpness(seen.variances), _readable(frames)]
+    findings += [repeated_images(frames.repeats, min(turn_frames, len(recording)))] if len(imu) else []
     return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
 
 
@@ -234,7 +238,9 @@ def _look(shared: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
         depth_m = float(np.median(known)) if len(known) else np.nan
     elif pair is not None and len(pair.disparities_px):
         depth_m = camera.focal_px * camera.baseline_m / max(float(np.median(pair.disparities_px)), 0.1)
-    motion = None if after is None else _motion(shared, (rectified, after))
+    motion = (
+        None if after is None or np.array_equal(rectified.left, after.left) else _motion(shared, (rectified, after))
+    )
     return _Look(laplacian_variance(frame.left), pair, share, depth_m, fine_structure(frame.left), motion)
 
 
@@ -265,7 +271,7 @@ def _turns_alone(recording: Recording, count: int) -> _Turns:
     with recording:
         frames = _Frames(recording, lambda: None)
         rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-        return _camera_turns(recording, frames, rectifier, count, SERIAL), frames.tried, frames.errors
+        return _camera_turns(recording, frames, rectifier, count, SERIAL), frames.tried, frames.errors, frames.repeats
 
 
 def _motion(
@@ -274,8 +280,11 @@ def _motion(
     """Stamps of two frames and the body's motion (4, 4) between them, earlier_from_later."""
     (camera, body_from_cam), (before, after) = shared, pair
     motion = motion_between(before, after, camera)
-    moved = None if motion is None else body_from_cam @ motion @ se3_inverse(body_from_cam)
-    return before.stamp_ns, after.stamp_ns, moved
+    if motion is None:
+        return before.stamp_ns, after.stamp_ns, None
+    axes, place = body_from_cam[:3, :3], body_from_cam[:3, 3]
+    turn = axes @ motion[:3, :3] @ axes.T  # known, where the way may not be
+    return before.stamp_ns, after.stamp_ns, se3(turn, axes @ motion[:3, 3] + place - turn @ place)
 
 
 def _consecutive(
@@ -287,6 +296,7 @@ def _consecutive(
     stamps_ns = recording.frame_stamps_ns
     first = _busiest_start(recording, count)
     previous: RectifiedFrame | None = None
+    is_same = False
     for index in range(first, min(first + count, len(recording))):
         is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < timing.SPARSE_S * 1e9
         has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < timing.SPARSE_S * 1e9
@@ -295,6 +305,10 @@ def _consecutive(
         frame = frames.read(index)
         current = None if frame is None else rectifier.rectify(frame)
         if previous is not None and current is not None and is_close:
+            is_same, was_same = np.array_equal(previous.left, current.left), is_same
+            if is_same:  # a camera at rest repeats for long, and no sensor without noise repeats at all
+                frames.repeats += not was_same
+                continue
             yield previous, current
         previous = current
 
@@ -309,6 +323,18 @@ def _busiest_start(recording: Recording, count: int) -> int:
     a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
     b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + count])
     return int(starts[np.argmax(total[b] - total[a])])
+
+
+def repeated_images(repeats: int, count: int) -> Finding:
+    """How often among `count` frames an image is the one before, and the next one is another."""
+    bad = f"an image is that of the frame before, {repeats} times in {count} frames; record each image once, with its own stamp"
+    return judge(
+        "repeated images",
+        repeats / count,
+        Limits(0.02, 0.1, "of the frames"),
+        "every frame has an image of its own",
+        bad,
+    )
 
 
 def _readable(frames: _Frames) -> Finding:

@@ -11,7 +11,8 @@ import pytest
 from fleetmap.geometry import Array
 from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.recordings import Recording, open_recording
-from fleetmap.sensors.samples import ImuSamples, SensorSet
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
+from mapserver.build.sensor_subset import reduced
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
@@ -44,7 +45,8 @@ def seen() -> dict[object, object]:
 
 def remembered(look: Callable[..., object], seen: dict[object, object]) -> Callable[..., object]:
     def remember(*given: object) -> object:
-        key = (look.__name__, *(getattr(each, "stamp_ns", each) for each in given))
+        pair = getattr(given[0], "right", None) is not None
+        key = (look.__name__, pair, *(getattr(each, "stamp_ns", each) for each in given))
         if key not in seen:
             seen[key] = look(*given)
         return seen[key]
@@ -151,3 +153,26 @@ def test_dots_of_a_projector_that_moves_with_the_camera(ride: Recording, brightn
     images = [cv2.add(ride.read_frame(index).left, dots) for index in range(22, 72, 4)]
     assert fixed_pattern([fine_structure(image) for image in images]).verdict is verdict
     assert fixed_pattern([fine_structure(image) for image in images[:1] * 12]).verdict is Verdict.NOT_JUDGED
+
+
+@pytest.mark.usefixtures("_quick")
+def test_one_camera_turns_and_shows_no_metres(ride: Recording) -> None:
+    findings = {f.name: f for f in run_checks.run_checks(reduced(ride, SensorSet.MONO_INERTIAL), sampled=20).findings}
+    assert findings["gyro axes"].verdict is not Verdict.NOT_JUDGED
+    metric = [findings[name].verdict for name in ("wheels", "metric scale", "accelerometer axes")]
+    assert metric == [Verdict.OK, Verdict.NOT_JUDGED, Verdict.NOT_JUDGED]  # of the wheels, the yaw rate
+
+
+@pytest.mark.usefixtures("_quick")
+def test_images_that_repeat_are_told_from_rest(ride: Recording) -> None:
+    """The ride begins with a second at rest, in the same image; every third image that is the one before is a fault."""
+
+    class Repeating:
+        def frame(self, index: int) -> CameraFrame:
+            shown = ride.read_frame(index - (index % 3 == 2))
+            return replace(shown, stamp_ns=int(ride.frame_stamps_ns[index]))
+
+    findings = run_checks.run_checks(replace(ride, frames=Repeating()), sampled=20).findings  # type: ignore[arg-type]
+    failed = {f.name for f in findings if f.verdict is Verdict.FAIL}
+    assert "repeated images" in failed
+    assert "wheels" not in failed

@@ -86,7 +86,7 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
     bad = {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK}
     assert set(bad.values()) == {Verdict.NOT_JUDGED}
     assert "baseline" in bad  # a second of turning on the spot excites no accelerometer
-    assert len({f.name for f in findings}) == len(findings) == 18 + len(CalibrationParameter)
+    assert len({f.name for f in findings}) == len(findings) == 19 + len(CalibrationParameter)
 
 
 @pytest.mark.parametrize(
