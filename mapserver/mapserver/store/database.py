@@ -1,9 +1,10 @@
 """The SQLite file of an open store: numbered migrations, reading, write transactions, the log. All settings of SQLite are here."""
 
+import os
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -12,12 +13,14 @@ from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
 from mapserver.store.access.chain import COLUMNS, AuditLine, last_sha256, line_sha256
+from mapserver.store.files import sync_folder
 from mapserver.store.migrations import MIGRATIONS
 from mapserver.store.rows import LogEntry
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
 _INCREMENTAL = 2
+_HEAD_BYTES, _FORMAT_AT = 100, 60  # of a file of SQLite, and its user_version in it
 
 
 Row = TypeVar("Row")
@@ -138,27 +141,47 @@ def _opened_for_reading(path: Path) -> Database:
     """A connection that leaves the disk as it is.
 
     Where nobody can write beside the database, SQLite reads it alone, which holds everything unless the last process that wrote
-    was killed. Raises StoreError in that case, for an older format, and for what is no database.
+    was killed. An older format is read from a copy in memory, which is migrated. Raises StoreError for a killed one, and for what is no
+    database.
     """
     log = path.with_name(f"{path.name}-wal")
     try:
         try:
-            return _opened(path, _check_current, "mode=ro")
+            return _current(_opened(path, _check_ours_of, "mode=ro"))
         except sqlite3.OperationalError:
             if log.is_file() and log.stat().st_size > 0:
                 raise
-            return _opened(path, _check_current, "mode=ro&immutable=1")
+            return _current(_opened(path, _check_ours_of, "mode=ro&immutable=1"))
     except sqlite3.Error as error:
         raise StoreError(
             f"the store {path.parent} cannot be read without writing ({error}); copy it to where it can be written"
         ) from error
 
 
-def _check_current(database: Database, path: Path) -> None:
+def is_older(path: Path) -> bool:
+    """True if the database would be migrated by whoever opens it to write; looks at nothing but its head."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    return len(head) == _HEAD_BYTES and 0 < int.from_bytes(head[_FORMAT_AT : _FORMAT_AT + 4], "big") < len(MIGRATIONS)
+
+
+def _check_ours_of(database: Database, path: Path) -> None:
     _check_ours(database.conn, path)
-    number = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
-    if number < len(MIGRATIONS):
-        raise StoreError(f"{path} has the older store format {number}; open it once where it can be written")
+
+
+def _current(database: Database) -> Database:
+    if int(database.conn.execute("PRAGMA user_version").fetchone()[0]) == len(MIGRATIONS):
+        return database
+    connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    with closing(database.conn):
+        database.conn.backup(connection)
+    migrated = Database(connection, execute_plugins=False)
+    _migrate(migrated)
+    connection.execute("PRAGMA query_only = ON")
+    return migrated
 
 
 def _prepare(database: Database, path: Path) -> None:
@@ -166,6 +189,9 @@ def _prepare(database: Database, path: Path) -> None:
     database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")  # of a file that is still empty
     database.conn.execute("PRAGMA journal_mode = WAL")
     database.conn.execute("PRAGMA foreign_keys = ON")
+    done = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
+    if 0 < done < len(MIGRATIONS):
+        _copy(database.conn, path, path.with_name(f"{path.stem}-format-{done}{path.suffix}"))
     _migrate(database)
 
 
@@ -210,3 +236,22 @@ def _migrate(database: Database) -> None:
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {number}")
+
+
+def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
+    """The database as the older fleetmap reads it, whole or not at all, before it is migrated. StoreError where the disk refuses."""
+    fresh = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        connection.execute("VACUUM INTO ?", (str(fresh),))
+        fresh.chmod(path.stat().st_mode & 0o777)
+        with fresh.open("rb") as file:
+            os.fsync(file.fileno())
+        fresh.replace(target)
+        sync_folder(target.parent)
+    except (OSError, sqlite3.Error) as error:
+        with suppress(OSError):
+            fresh.unlink()
+        raise StoreError(
+            f"{path} has an older format, and its copy {target.name} cannot be written before it is migrated ({error}); make space: "
+            "the store is as it was"
+        ) from error

@@ -33,6 +33,7 @@ from fleetmap.mapformat import (
 from fleetmap.mapformat.building import BUILDING_KEY
 from fleetmap.mapformat.version_file import ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
+from mapserver.store.database import is_older
 from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
     check_no_link,
@@ -92,12 +93,15 @@ class MapStore(StoreQueries):
     ) -> Self:
         """The store in folder `path`, which is made with `create`. What is derived is repaired here.
 
-        read_only: of a store that cannot be written, by its rights or because the disk is full, what is there is read.
+        read_only: of a store that cannot be written, by its rights or because the disk is full, what is there is read; one of an
+        older format stays as it is.
         Raises StoreError where there is none or it cannot be opened, NewerFormatError for one made by a newer fleetmap.
         """
         is_new = not (path / "store.sqlite3").is_file()
         if is_new and not create:
             raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
+        if read_only and is_older(path / "store.sqlite3"):
+            return cls(path, clock_ns, read_only=True)
         try:
             make_folder(path / "sites")
             if is_new:

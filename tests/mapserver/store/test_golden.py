@@ -1,17 +1,23 @@
 """Files of every released format are read by the code of today; newer ones are refused by naming what reads them."""
 
+import errno
+import importlib
 import json
+import os
 import shutil
 import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.errors import NewerFormatError
+from fleetmap.errors import NewerFormatError, StoreError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
 from fleetmap.mapformat.version_file import EXPORT_FORMAT
+from fleetmap.messages import decode_message, encode_message
 from fleetmap.version_grid import known_grid
 from mapserver import releases
 from mapserver.store import Actor, FailureFilter, MapStore
@@ -50,6 +56,26 @@ def test_tiles(file: Path) -> None:
     assert [bytes(row).hex() for row in tile.descriptors] == wanted["descriptors"]
     assert tile.place_ids.tolist() == wanted["place_ids"]
     np.testing.assert_allclose(tile.map_from_cam, wanted["map_from_cam"], atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "data"), json.loads((GOLDEN / "messages-1.json").read_text()).items())
+def test_messages_of_older_robots_and_servers_are_read_and_what_is_written_has_all_their_fields(
+    name: str, data: str
+) -> None:
+    module, _, kind = name.rpartition(".")
+    message_type = getattr(importlib.import_module(module), kind)
+    older = bytes.fromhex(data)
+    written = encode_message(decode_message(older, message_type))
+    assert_holds(msgspec.msgpack.decode(written), msgspec.msgpack.decode(older))
+
+
+def assert_holds(written: object, older: object) -> None:
+    """Every field of the older one is there with its value; others are beside them, which older programs pass over."""
+    if isinstance(older, dict) and isinstance(written, dict):
+        for key, value in older.items():
+            assert_holds(written[key], value)
+    else:
+        assert written == older
 
 
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("manifest-*.json")), ids=lambda file: file.stem)
@@ -105,6 +131,46 @@ def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> No
             picture = b"jpeg" if number < 7 else b"\xff\xd8jpeg\xff\xd9"  # what is no JPEG is refused since then
             assert (failure.failure_id, store.fleet.picture(failure.number, 0)) == ("f1", picture)
             assert store.fleet.counters("lab", "cause", key="dark")["lab", "dark"].failures == 1
+
+
+def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    older, number = GOLDEN / f"store-{len(MIGRATIONS) - 1}.sqlite3", len(MIGRATIONS) - 1
+    path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{number}.sqlite3"
+    shutil.copy(older, path)
+    before = path.read_bytes()
+    with MapStore.open(tmp_path, read_only=True) as store:
+        assert [info.state for info in store.versions("lab")] == ["current", "retired", "draft"]
+        with pytest.raises(StoreError, match="refuses to be written"):
+            store.record_robot_report("lab", "r1", {}, 1)
+    assert (path.read_bytes(), copy.exists()) == (before, False)
+
+    def is_full(_: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mapserver.store.database.sync_folder", is_full)
+        with pytest.raises(StoreError, match="make space: the store is as it was"):
+            MapStore.open(tmp_path)
+    assert format_of(path) == number
+    copy.unlink()
+    MapStore.open(tmp_path).close()
+    assert (format_of(path), format_of(copy)) == (number + 1, number)
+    assert rows_of(copy) == rows_of(older)
+    copied = copy.read_bytes()
+    MapStore.open(tmp_path).close()
+    assert copy.read_bytes() == copied, "once"
+
+
+def format_of(path: Path) -> int:
+    with closing(sqlite3.connect(path)) as connection:
+        return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
+def rows_of(path: Path) -> list[str]:
+    with closing(sqlite3.connect(path)) as connection:
+        return sorted(connection.iterdump())
 
 
 def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_path: Path) -> None:
