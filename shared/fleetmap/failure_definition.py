@@ -108,7 +108,8 @@ def is_outside_bound(error_map_m: Array, cov_rot_trans: Array) -> bool:
 
 
 def radius_95_m(cov_rot_trans: Array | None) -> float:
-    """Radius that holds the position with 95 %, for a covariance (6, 6), rotation first; infinite without one."""
-    if cov_rot_trans is None:
+    """Radius that holds the position with 95 %, for a covariance (6, 6), rotation first; infinite without one,
+    and for one that is not finite, as odometry leaves it where a robot has lost most of its frames."""
+    if cov_rot_trans is None or not np.isfinite(cov_rot_trans[3:, 3:]).all():
         return float("inf")
     return _RADIUS_95_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))

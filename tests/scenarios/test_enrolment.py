@@ -1,12 +1,9 @@
 """From a store to enrolled robots with the programs, on loopback with TLS: enrolment, a thief among the robots, revocation."""
 
-import os
 import re
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -20,52 +17,16 @@ from locclient.identity import GivenAddress, RobotIdentity
 from locclient.maps.connection import connected
 from mapserver import releases
 from mapserver.store import MapStore
+from support.fleet.tls_site import TlsSite
 from support.storage.map_samples import save_sample_draft
 
 SITE = "lab"
 FORGED = encode_message(WantedVersion(site=SITE, version=99, manifest_sha256="f" * 64))
 
 
-class Site:
-    """A store with one version, and the programs over it."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.store, self.endpoint = folder, folder / "store", ""
-        self.environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "XDG_STATE_HOME": str(folder)}
-
-    def run(self, program: str, *words: object) -> str:
-        """Both outputs of a program; its status is 0 unless they begin with an error."""
-        command = [sys.executable, "-m", f"{program}.cli", *map(str, words)]
-        done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=120, check=False)
-        assert (done.returncode == 0) == (not done.stderr.startswith("error: ")), done.stderr
-        return done.stdout + done.stderr
-
-    @contextmanager
-    def serving(self, endpoint: str) -> Iterator[subprocess.Popen[str]]:
-        words = ["serve", "--store", self.store, "--http", "127.0.0.1:0", "--zenoh", endpoint]
-        command = [sys.executable, "-m", "mapserver.cli", *map(str, words)]
-        process = subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True)
-        try:
-            process.stdout.readline()
-            self.endpoint = process.stdout.readline().split()[1]
-            assert process.stdout.readline() == "ready\n"
-            yield process
-        finally:
-            process.terminate()
-            process.wait(timeout=30)
-            process.stdout.close()
-
-    def enrol(self, robot: str) -> RobotIdentity:
-        where = ("--site", SITE, "--store", self.store, "--endpoint", self.endpoint, "--out", self.folder)
-        self.run("mapserver", "robots", "enrol", robot, *where)
-        told = self.run("locclient", "enrol", self.folder / f"{robot}.fleetmap", "--identity", self.folder / robot)
-        assert f"enrolled as {robot} of site {SITE}" in told
-        return RobotIdentity.load(self.folder / robot)
-
-
 @pytest.fixture
-def site(tmp_path: Path) -> Site:
-    made = Site(tmp_path)
+def site(tmp_path: Path) -> TlsSite:
+    made = TlsSite(tmp_path, SITE)
     with MapStore.open(made.store, create=True) as store:
         save_sample_draft(store)
         releases.publish(store, SITE)
@@ -103,7 +64,7 @@ def attacker(endpoint: str, identity: RobotIdentity | None) -> zenoh.Session:
     return session
 
 
-def test_two_robots_from_an_empty_folder(site: Site) -> None:
+def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
     assert "mapserver trust init --here" in site.run(
         "mapserver", "serve", "--store", site.store, "--zenoh", "tcp/0.0.0.0:0"
     )
@@ -139,7 +100,7 @@ def test_two_robots_from_an_empty_folder(site: Site) -> None:
             thief.close()
 
 
-def test_the_same_thief_without_tls_is_heard(site: Site) -> None:
+def test_the_same_thief_without_tls_is_heard(site: TlsSite) -> None:
     """The control: on an open bus he answers first, most of the time."""
     with (
         site.serving("tcp/127.0.0.1:0"),
@@ -158,7 +119,7 @@ def test_a_bus_that_listens_before_the_server_answers_is_the_thiefs() -> None:
         thief.close()
 
 
-def test_the_demo_needs_no_keys(site: Site) -> None:
+def test_the_demo_needs_no_keys(site: TlsSite) -> None:
     with site.serving("tcp/127.0.0.1:0"), ZenohBus.connect(site.endpoint) as robot:
         assert wanted(robot, "anybody") == 1
     assert re.search(

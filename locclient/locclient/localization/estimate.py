@@ -101,7 +101,8 @@ def assemble(estimate: Estimate, state: LocalizationState, settings: TrackSettin
 
 
 def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: bool, settings: TrackSettings) -> Estimate:
-    radius_m = radius_95_m(confirmed.now_cov)
+    is_known = not np.isnan(confirmed.now_map_from_body).any()
+    radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
     cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
@@ -128,7 +129,12 @@ def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: boo
 
 
 def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSettings) -> Estimate:
-    """With the map's own uncertainty, which is common to all fixes: no number of them averages it away."""
+    """With the map's own uncertainty, which is common to all fixes: no number of them averages it away.
+
+    A pose or covariance with NaN says nothing: the estimate then has none.
+    """
+    if np.isnan(hypothesis.now_map_from_body).any() or np.isnan(hypothesis.now_cov).any():
+        return estimate
     of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
     return replace(estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=hypothesis.now_cov + of_map)
 

@@ -51,6 +51,8 @@ def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
     ready = source.ready()
     manifest = source.manifest(ready.wanted)
     tiles = source.tiles(manifest)
+    if not manifest.tiles:
+        raise LinkError(f"version {manifest.version} of site {manifest.site} has no tile at all; publish another one")
     if not tiles.tiles:
         reason = f"none of the {len(manifest.tiles)} tiles of version {manifest.version} is usable: {tiles.refused}"
         raise LinkError(reason)

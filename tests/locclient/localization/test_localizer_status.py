@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,10 @@ import pytest
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.samples import PositionPrior
+from locclient.localization.estimate import LocalizationState, assemble
+from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.settings import TrackSettings
+from support.fleet.estimates import estimate as estimate_at
 from support.fleet.scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
 
 
@@ -349,3 +354,21 @@ def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(trac
         elsewhere = tracking.go(0.4, [off(9.0)])
     assert elsewhere.innovation is not None
     assert elsewhere.innovation_m is None
+
+
+@pytest.mark.parametrize("broken", ["now_cov", "now_map_from_body"])
+def test_a_pose_of_nan_is_none(broken: str) -> None:
+    """Such as odometry leaves where a robot has lost most of its frames."""
+    values = {
+        "now_cov": 1e-4 * np.eye(6),
+        "now_map_from_body": np.eye(4),
+        "stamp_ns": 0,
+        "has_broken": False,
+        "kidnap_hypotheses": [],
+    }
+    values[broken] = values[broken] * np.nan
+    hypothesis: Any = SimpleNamespace(**values)
+    state = LocalizationState(hypothesis, HypothesisSet(TrackSettings()), None, has_failed=False, was_tracking=True)
+    found = assemble(estimate_at(0.1, known=False), state, TrackSettings())
+    assert (found.map_from_body, found.cov_rot_trans) == (None, None)
+    assert found.status is Status.LOST

@@ -63,7 +63,9 @@ class TlsSite:
         return status
 
     @contextmanager
-    def serving(self) -> Iterator[None]:
+    def serving(self, endpoint: str | None = None) -> Iterator[None]:
+        """A server from now on until the block's end; endpoint: another one than before."""
+        self.endpoint = endpoint or self.endpoint
         self.start()
         try:
             yield
