@@ -15,14 +15,17 @@ import pytest
 
 from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
+from fleetmap.recordings.calibration_files import format_calibration
 from locclient.delivery.outbox import Outbox
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
-from mapserver.store import MapStore
+from mapserver.store import FailureFilter, MapStore
 from mapserver.trust import init_here
 from support.fleet.nav2_client import ACTIVE, LifecycleManager, eventually, rmw_router
+from support.fleet.tls_site import TlsSite
+from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 PATIENCE_S = 240.0  # the first start of all compiles every kernel
@@ -116,6 +119,43 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
         assert fleet.robots("room")[0].version == 1
     assert table == [report.id]
     assert Outbox(spool, max_bytes=10**8).counts()["delivered"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts(tmp_path: Path) -> None:
+    """`locclient run` in real time, over TLS, on a rig with an IMU and a Kalibr file: no thread dies, nothing stands in a log."""
+    site = TlsSite(tmp_path, "room")
+    with MapStore.open(site.store, create=True) as store:
+        robot_world.save(store)
+        site.run("mapserver", "trust", "init", "--here", "--host", "127.0.0.1", "--store", site.store)
+        ride = write_walk(tmp_path / "ride", 1200, range(100, 250))
+        (tmp_path / "rig.yaml").write_text(format_calibration(calibration()))
+        with site.serving():
+            site.enrol("r1")
+            site.configure("r1", f'kind = "recording"\nrecording = "{ride}"\ncalibration = "{tmp_path}/rig.yaml"')
+
+            def told(name: str) -> object:
+                return (site.robot("r1").get("last_health") or {}).get(name)
+
+            with site.daemon("r1") as process:
+                wait_for(lambda: told("status") == "TRACKING", process)
+                wait_for(lambda: "dark" in (told("flags") or ()), process)
+                assert site.stop() == 0
+                site.start()
+                wait_for(lambda: bool(store.fleet.failures(FailureFilter(site="room"))), process)
+                robot_world.save(store)
+                wait_for(lambda: (site.robot("r1").get("last_ack") or {}).get("version") == 2, process)
+                process.send_signal(signal.SIGKILL)
+            with site.daemon("r1") as process:
+                begun_ns = time.time_ns()
+                wait_for(lambda: int(told("wall_ns") or 0) > begun_ns and told("status") == "TRACKING", process)
+                assert told("version") == 2, "it goes on with what its disk holds"
+                process.send_signal(signal.SIGTERM)
+                assert process.wait(30) == 0
+        assert {row.cause for row in store.fleet.failures(FailureFilter(site="room"))} == {"dark"}
+    for log in (site.log("r1"), tmp_path / "server.log"):
+        assert "Traceback" not in log.read_text("utf-8", "replace")
 
 
 @pytest.mark.slow
