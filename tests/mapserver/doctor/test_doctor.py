@@ -270,7 +270,7 @@ def test_the_real_flight_agrees_with_its_calibration() -> None:
     findings = found(open_recording(real_data("euroc_mh01_start")))
     assert {f.verdict for f in findings.values()} == {Verdict.OK, Verdict.NOT_JUDGED}
     unjudged = {name: f for name, f in findings.items() if f.verdict is Verdict.NOT_JUDGED}
-    assert unjudged.keys() == {"wheel scale", "baseline"}
+    assert unjudged.keys() == {"wheels", "wheel scale", "baseline"}
     assert unjudged["wheel scale"].missing == "there is no wheel odometry"
     assert "that may be chance" in unjudged["baseline"].sentence  # fifteen seconds: beyond its limit, and not for sure
     assert unjudged["baseline"].value == pytest.approx(0, abs=0.01)
