@@ -135,7 +135,7 @@ def drive(site: TlsSite, demo: Path, minutes: float, kills: int) -> dict[str, An
         site.enrol(robot)
         lines = f'kind = "ros2"\nendpoint = "{driver.bus.endpoint}"\ncalibration = "{site.folder / robot}.yaml"'
         site.configure(robot, lines)
-    build = ("build", demo / "survey.mcap", "--site", site.name, "--store", site.store, "--frame-from-ground-truth")
+    build = ("build", demo / "survey.mcap", "--site", site.name, "--store", site.store)
     build_log = (site.folder / "build.log").open("wb")
     building = subprocess.Popen(
         site.command("mapserver", *build), env=site.environment, stdout=build_log, stderr=build_log
@@ -159,6 +159,7 @@ def drive(site: TlsSite, demo: Path, minutes: float, kills: int) -> dict[str, An
                 restarts += 1
                 time.sleep(3)
                 site.start()
+            assert not building.poll(), f"the second build failed: see {build_log.name}"
             if not is_published and building.poll() == 0:
                 site.run("mapserver", "publish", "--site", site.name, "--store", site.store)
                 is_published = True
