@@ -16,6 +16,7 @@ WORDS = {
 }
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # of the speed, and of slow ones: slip of a tyre is far less
 _LIMIT_M = 3.0  # of driving against the images: a spinning wheel or a person before the camera takes less
+_FOLLOWED_SHARE = 0.5  # of the tracks
 _REST_SHARE = 0.2  # wheels that rest may be those of a robot that is carried: that counts for so much
 
 
@@ -35,7 +36,9 @@ class WheelAgreement:
         """A frame; wheel: the samples since the one before."""
         last_ns, self._last_ns = self._last_ns, odometry.stamp_ns
         moved = odometry.previous_from_body
-        is_known = odometry.status is OdometryStatus.TRACKING and odometry.scale_known and moved is not None
+        # Pictures too far apart to be followed say nothing: then it is the odometry that may be wrong.
+        is_followed = odometry.inlier_share >= _FOLLOWED_SHARE and not odometry.after_gap
+        is_known = odometry.status is OdometryStatus.TRACKING and odometry.scale_known and is_followed
         if last_ns is None or not wheel or not is_known or moved is None:
             return
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9

@@ -1,6 +1,7 @@
 """Wheels that the robot's other sensors contradict are left out until they agree again."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from locclient.robot.sensor_agreement import WheelAgreement
 from support.fleet.estimates import estimate
 
 
-def drive(agreement: WheelAgreement, mps: float, wheel_mps: float, metres: float, first: int = 0) -> bool:
-    """Frames at 10 Hz; whether the wheels are refused at their end."""
+def drive(
+    agreement: WheelAgreement, mps: float, wheel_mps: float, metres: float, first: int = 0, **changes: Any
+) -> bool:
+    """Frames at 10 Hz, with changes of the odometry's estimates; whether the wheels are refused at their end."""
     for n in range(first, first + round(metres / (0.1 * max(mps, wheel_mps)))):
         moved = se3(np.eye(3), np.array([0.1 * mps, 0.0, 0.0]))
-        odometry = replace(estimate(0.1 * n).odometry, previous_from_body=moved)
+        odometry = replace(estimate(0.1 * n).odometry, previous_from_body=moved, **changes)
         wheel = WheelSample(odometry.stamp_ns, np.array([wheel_mps, 0.0, 0.0]), 0.0, 0.01, 0.01)
         agreement.handle([wheel], odometry)
     return agreement.is_refused
@@ -42,3 +45,9 @@ def test_wheels_that_agree_again_are_used_again() -> None:
     assert drive(agreement, 1.0, -1.0, 5.0)
     assert drive(agreement, 1.0, 1.0, 4.0, first=50)
     assert not drive(agreement, 1.0, 1.0, 4.0, first=90)
+
+
+@pytest.mark.parametrize("changes", [{"inlier_share": 0.1}, {"after_gap": True}])
+def test_images_that_cannot_be_followed_accuse_no_wheels(changes: dict[str, Any]) -> None:
+    """A starved processor leaves images metres apart; then it is the odometry that is wrong."""
+    assert not drive(WheelAgreement(np.eye(4)), 1.5, -1.5, 30.0, **changes)
