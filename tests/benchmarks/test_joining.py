@@ -12,7 +12,7 @@ from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from mapserver.cli import app
 from mapserver.store import MapStore
-from support.storage.known_rig import known_rig
+from support.storage.known_rig import KNOWN_RIG
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 ONCE_JOINED = (
@@ -32,7 +32,7 @@ def test_recordings_of_other_buildings_are_not_joined_by_build_nor_by_night(tmp_
     common = ["--site", "hall", "--store", str(store), "--frames", "0::2"]
     home = recorded(tmp_path, "small-loop", 1, 120)
     assert CliRunner().invoke(app, ["build", str(home), *common]).exit_code == 0
-    publish = ["publish", "--site", "hall", "--store", str(store), *known_rig(tmp_path)]
+    publish = ["publish", "--site", "hall", "--store", str(store), *KNOWN_RIG]
     assert CliRunner().invoke(app, publish).exit_code == 0
     for scenario, seed in ONCE_JOINED:
         foreign = recorded(tmp_path, scenario, seed, 80)

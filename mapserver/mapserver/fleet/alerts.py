@@ -13,7 +13,6 @@ from fleetmap.messages import Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, figure, hour_of, kpis
 from mapserver.store import MapStore
-from mapserver.trust.status import trust_status
 
 _HEARD_WITHIN_S = 60.0
 _RATE_HOURS = 24
@@ -57,6 +56,10 @@ class Alert:
 
 def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
     """All that hold now, by site, and behind them faults of lists and certificates; errors are the store's."""
+    from mapserver.trust.status import (
+        trust_status,
+    )  # late: zenoh comes with it, and builds, which read the settings, need none
+
     found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, (info.site, now_ns))]
     with suppress(StateError):  # a store that is not signed
         found += [

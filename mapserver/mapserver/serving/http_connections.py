@@ -88,11 +88,12 @@ class BoundedListener(socket.socket):
 
     def _look(self, marks: "dict[Any, _Mark]", protocols: set[Any]) -> "dict[Any, _Mark]":
         now_s = time.monotonic()
+        protocols = {protocol for protocol in protocols if _socket_of(protocol) is not None}
         marks = {protocol: _Mark.after(marks.get(protocol), protocol, now_s) for protocol in protocols}
         for protocol, mark in marks.items():
             if mark.is_late(now_s):
                 protocol.transport.abort()
-        known = {protocol.transport.get_extra_info("socket").fileno() for protocol in protocols}
+        known = {held.fileno() for protocol in protocols if (held := _socket_of(protocol)) is not None}
         for connection, _, since_s in self._open:  # the handshake of the others is not done
             if connection.fileno() not in known and now_s - since_s > HEAD_S:
                 _shut(connection)
@@ -120,6 +121,13 @@ class _Mark:
 
     def is_late(self, now_s: float) -> bool:
         return self.state != "answers" and now_s - self.since_s > (_TAKEN_S if self.state == "writes" else HEAD_S)
+
+
+def _socket_of(protocol: Any) -> Any:
+    """The socket of a connection; None once it has ended."""
+    with suppress(AttributeError):  # asyncio's TLS transport loses what lies below it when it is closed twice
+        return protocol.transport.get_extra_info("socket")
+    return None
 
 
 def _shut(connection: socket.socket) -> None:

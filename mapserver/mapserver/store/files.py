@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import StoreError, disk_errors
 
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
@@ -89,7 +89,9 @@ def check_no_link(root: Path, path: Path) -> None:
     for part in (path, *path.parents):
         if part == root:
             return
-        if part.is_symlink():
+        with disk_errors(f"{part} cannot be looked at", "check the disk"):
+            is_link = part.is_symlink()
+        if is_link:
             raise StoreError(
                 f"{part} is a symbolic link, which a store does not follow; put what it names in its place"
             )

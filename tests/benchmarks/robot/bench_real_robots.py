@@ -33,7 +33,7 @@ from fleetmap.recordings import open_recording
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from support.recordings.realdata import DATA
-from support.storage.known_rig import known_rig
+from support.storage.known_rig import KNOWN_RIG
 
 MAPPED, UNSEEN = "0::2", "1::2"
 _STARTS = 20
@@ -115,7 +115,7 @@ def mapped(work: Path, path: Path, frames: str = MAPPED) -> Path:
         options = ["--frames", frames, "--frame-from-ground-truth", "--report", str(work / f"{path.stem}.json")]
         store.parent.mkdir(parents=True, exist_ok=True)
         subprocess.run([*tool("mapserver"), "build", str(path), *to_store, *options], check=True)
-        subprocess.run([*tool("mapserver"), "publish", *to_store, *known_rig(store.parent)], check=True)
+        subprocess.run([*tool("mapserver"), "publish", *to_store, *KNOWN_RIG], check=True)
         (store / "built").touch()
     return store
 

@@ -21,6 +21,7 @@ from fleetmap.messages import (
     decode_message,
     encode_message,
     manifest_key,
+    own_map_key,
     part_of,
     robot_key,
 )
@@ -252,7 +253,9 @@ def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
     info = world.store.version(SITE, 2)
     length = info.manifest_bytes
     data = world.store.blob(info.manifest_sha256) + bytes(3_000_000)
-    world.hub.queryables.insert(0, (manifest_key(SITE, 2), lambda _, question: part_of(data, question), None))
+    world.hub.queryables.insert(
+        0, (own_map_key(manifest_key(SITE, 2), ROBOT), lambda _, question: part_of(data, question), None)
+    )
     with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {length} are expected"):
         client.fetch(client.wanted())
     assert client.received_bytes <= PART_BYTES

@@ -1,13 +1,16 @@
 """`mapserver convert`: complete or not at all."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from fleetmap.errors import CalibrationError, RecordingError, UsageError
+from fleetmap.errors import CalibrationError, UsageError
 from fleetmap.recordings import open_recording
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from mapserver.commands.convert import convert
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -52,14 +55,21 @@ def test_refuses_other_endings_and_itself(euroc: Path, tmp_path: Path) -> None:
     assert "itself" in str(run(out, out, "--force").exception)
 
 
-def test_a_failure_leaves_nothing_and_harms_nothing(euroc: Path, tmp_path: Path) -> None:
-    """The last image is cut: the old output stays, no half file appears."""
-    (euroc / "mav0/cam1/data/image2.jpg").unlink()
-    (euroc / "mav0/cam1/data/image2.jpg").mkdir()
+def test_a_failure_leaves_nothing_and_harms_nothing(
+    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full in the middle: the old output stays, no half file appears."""
+    written = []
+
+    def write_frame(writer: McapRecordingWriter, frame: object) -> None:
+        written.append(frame)
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(McapRecordingWriter, "write_frame", write_frame)
     out = tmp_path / "out.mcap"
     out.write_bytes(b"old")
-    result = run(euroc, out, "--force")
-    assert isinstance(result.exception, RecordingError)
+    assert "No space left" in str(run(euroc, out, "--force").exception)
     assert out.read_bytes() == b"old"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.mcap", "r"]
 
