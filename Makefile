@@ -6,6 +6,7 @@
 #   make check                 format, lint, types, import contracts
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 how fast and how exact, in numbers
+#   make acceptance            figures that no change may make worse (tests/acceptance.toml); an hour
 #   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
@@ -28,7 +29,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test check kernels kernels-server kernels-robot kernels-simulator bench study conformance clean
+.PHONY: help demo demo-recording test check kernels kernels-server kernels-robot kernels-simulator bench acceptance study conformance clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -67,6 +68,9 @@ kernels-simulator: $(DEV_STAMP)
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
+
+acceptance: $(DEV_STAMP)
+	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
 
 study: $(DEV_STAMP)
 	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=square"; exit 2; }

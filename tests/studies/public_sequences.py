@@ -1,5 +1,6 @@
 """All public recordings at hand: surveys after the fact, odometry as it went, robots in a map of the other half; peers beside it."""
 
+import argparse
 import json
 import subprocess
 from collections.abc import Callable
@@ -143,7 +144,12 @@ def draw(rows: list[Row]) -> Figure:
 
 
 def main() -> None:
-    """Rows and picture of docs/studies/public_sequences.md; the table stands in the README, too."""
+    """Rows and picture of docs/studies/public_sequences.md; the table stands in the README, too. `--out FILE`: rows as JSON, no page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path)
+    if (out := parser.parse_args().out) is not None:
+        out.write_text(json.dumps({name: make() for name, make in CASES.items()}))
+        return
     rows = results("public_sequences", CASES)
     shown = table(rows, COLUMNS)
     publish("public_sequences", [shown], draw(rows))

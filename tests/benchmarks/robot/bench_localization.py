@@ -8,6 +8,7 @@ folder) and serve again. CPU times are the process's, as they are and as the mac
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,7 +141,8 @@ def main() -> None:
         }
         title = f"{name} (fleetsim record small-loop {' '.join(CASES[name].record)})"
         show_against(title, found[name], CASES[name].promises)
-    write_results(arguments.out, {"cases": found})
+    survey = json.loads((arguments.work / "survey.json").read_text("utf-8"))
+    write_results(arguments.out, {"cases": found, "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]})
 
 
 if __name__ == "__main__":

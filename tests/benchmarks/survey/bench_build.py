@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.laps import repeated
+from benchmarks.common.yardstick import at_reference, slowness
 from benchmarks.survey import bench_survey
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
@@ -34,13 +35,25 @@ FIVE_AISLES = next(case for case in bench_survey.CASES if case.name == "five-ais
 def build(recording: Path, folder: Path, frames: str, threads: int) -> dict[str, Any]:
     """The report of a build in a process of its own, its figures beside it."""
     report = folder / f"{recording.stem}.json"
+    slow, begin_s = [slowness()], _children_cpu_s()
     bench_survey.run(
         "mapserver.cli", "build", recording, "--site", recording.stem, "--store", folder / "store", "--report", report,
         "--frames", frames, "--threads", str(threads),
     )  # fmt: skip
+    cpu_ms = 1e3 * (_children_cpu_s() - begin_s)
+    slow.append(slowness())
     found: dict[str, Any] = json.loads(report.read_text("utf-8"))
     keys = ("frames", "keyframes", "duration_s", "seconds", "realtime_factor", "ate_rmse_m", "peak_rss_mb", "stage_s")
-    return {key: found[key] for key in keys} | {"times_20_hz": found["frames"] / _RATE_HZ / found["seconds"]}
+    at_reference_ms = at_reference(cpu_ms, slow)
+    return {key: found[key] for key in keys} | {
+        "times_20_hz": found["frames"] / _RATE_HZ / found["seconds"],
+        "cpu_s_at_reference": None if at_reference_ms is None else 1e-3 * at_reference_ms,
+    }
+
+
+def _children_cpu_s() -> float:
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def measure(recording: Path | None, minutes: float, threads: int) -> dict[str, Any]:

@@ -1,0 +1,54 @@
+"""Interfaces that change on purpose only: the HTTP API's description and the help of every command.
+
+`SNAPSHOTS=write python -m pytest tests/contracts/test_snapshots.py` writes them anew; the diff belongs into the same commit.
+"""
+
+import json
+import os
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import typer.core
+
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import MapStore
+from support.fleet.contracts_documents import REPOSITORY, click_command
+
+SNAPSHOTS = Path(__file__).parent / "snapshots"
+
+
+def _is_as_kept(name: str, text: str) -> bool:
+    if os.environ.get("SNAPSHOTS") == "write":
+        (SNAPSHOTS / name).write_text(text, encoding="utf-8")
+    return (SNAPSHOTS / name).read_text(encoding="utf-8") == text
+
+
+def test_openapi(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        fleet = Fleet(store)
+        document = create_app(store, fleet, Metrics(store, fleet), None).openapi()
+    assert _is_as_kept("openapi.json", json.dumps(document, indent=1, sort_keys=True) + "\n")
+
+
+def test_help() -> None:
+    """Arguments and options with their types, defaults and texts, independent of the terminal."""
+    scripts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
+    assert _is_as_kept("help.txt", "\n".join(line for script in sorted(scripts) for line in _help(script)) + "\n")
+
+
+def _help(path: str) -> Iterator[str]:
+    command = click_command(path)
+    yield f"{path}: {' '.join((command.help or '').split())}"
+    if isinstance(command, click.Group | typer.core.TyperGroup):
+        for name in sorted(command.commands):
+            yield from _help(f"{path} {name}")
+        return
+    for parameter in command.params:
+        names = "/".join((*parameter.opts, *parameter.secondary_opts))
+        required = ", required" if parameter.required else ""
+        text = " ".join((getattr(parameter, "help", None) or "").split())
+        yield f"  {names} [default {parameter.default}{required}] {text}"
