@@ -83,8 +83,8 @@ def wait_for_pose(site: TlsSite, robot: str, process: "subprocess.Popen[bytes]",
     begun_s = time.monotonic()
     while time.monotonic() - begun_s < POSE_WITHIN_S:
         assert process.poll() is None, f"{robot} ended with status {process.returncode}: see {site.log(robot)}"
-        pose = site.robot(robot).get("last_pose") or {}
-        if int(pose.get("stamp_ns") or 0) > since_ns:
+        last = site.robot(robot).get("last_pose") or {}
+        if int(last.get("stamp_ns") or 0) > since_ns:
             return time.monotonic() - begun_s
         time.sleep(0.1)
     raise SystemExit(f"{robot} had no pose within {POSE_WITHIN_S:.0f} s")
