@@ -28,7 +28,7 @@ from support.fleet.tls_site import TlsSite
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
-PATIENCE_S = 240.0  # the first start of all compiles every kernel
+PATIENCE_S = 500.0  # compiles every kernel, on a machine that may be busy
 
 
 def write_walk(folder: Path, frames: int, dark: range) -> Path:
@@ -61,12 +61,14 @@ def daemon(config: Path, notify: Path) -> Iterator[subprocess.Popen[str]]:
 def wait_for(found: Callable[[], bool], process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not found():
-        assert time.monotonic() < deadline, "it took too long"
+        if time.monotonic() > deadline:
+            process.kill()
         assert process.poll() is None, process.stderr.read() if process.stderr else ""
         time.sleep(0.05)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell(tmp_path: Path) -> None:
     """Away from its server, on what its disk holds, the robot goes dark: blind, dark. It is killed. A later life delivers."""
     hub, table = MemoryHub(), []
