@@ -1,12 +1,18 @@
 """Exit of the commands `mapserver`, `locclient` and `fleetsim`: errors become messages and statuses."""
 
 import re
+import shlex
 import sys
 from collections.abc import Callable
 from importlib import metadata
+from itertools import pairwise
 
 from fleetmap.errors import FleetmapError, UsageError
 
+# `mapserver COMMAND ...` of the commands that take --store, where it is not named
+_IN_STORE = re.compile(
+    r"`(mapserver (?!(?:doctor|calibrate|convert|evaluate|prepare|train-vocabulary|config)\b)\w(?:(?!--store)[^`])*)`"
+)
 INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
 
@@ -18,7 +24,7 @@ def run_cli(app: Callable[[], object]) -> None:
     try:
         app()
     except FleetmapError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {with_store(str(error), sys.argv)}", file=sys.stderr)
         sys.exit(error.exit_status)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in {"fleetmap", "fleetsim", "mapserver", "locclient"}:
@@ -31,6 +37,15 @@ def run_cli(app: Callable[[], object]) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def with_store(text: str, arguments: list[str]) -> str:
+    """A text whose commands of mapserver name the store that this command line names, so that they run as they are printed."""
+    given = [after for word, after in pairwise(arguments) if word == "--store"]
+    given += [word.partition("=")[2] for word in arguments if word.startswith("--store=")]
+    if not given:
+        return text
+    return _IN_STORE.sub(lambda found: f"`{found[1]} --store {shlex.quote(given[-1])}`", text)
 
 
 def require_extra(extra: str, program: str) -> None:

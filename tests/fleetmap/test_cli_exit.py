@@ -6,7 +6,7 @@ from typing import NoReturn
 
 import pytest
 
-from fleetmap.cli_exit import require_extra, run_cli
+from fleetmap.cli_exit import require_extra, run_cli, with_store
 from fleetmap.errors import GateRefusedError
 
 
@@ -34,6 +34,22 @@ def test_errors_become_messages(
 def test_a_module_of_our_own_that_is_missing_is_a_bug() -> None:
     with pytest.raises(ModuleNotFoundError):
         run_cli(lambda: failing(ModuleNotFoundError("No module named 'mapserver.gone'", name="mapserver.gone")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (
+            ["--store", "my maps"],
+            "`mapserver versions --site a --store 'my maps'`, `mapserver doctor x`, `mapserver gc --store b`",
+        ),
+        (["--store=m"], "`mapserver versions --site a --store m`, `mapserver doctor x`, `mapserver gc --store b`"),
+        ([], "`mapserver versions --site a`, `mapserver doctor x`, `mapserver gc --store b`"),
+    ],
+)
+def test_commands_in_an_error_name_the_store_that_was_named(arguments: list[str], told: str) -> None:
+    text = "`mapserver versions --site a`, `mapserver doctor x`, `mapserver gc --store b`"
+    assert with_store(text, ["mapserver", "publish", *arguments]) == told
 
 
 def distribution(*requires: str) -> SimpleNamespace:

@@ -341,7 +341,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
-    words = sentence(site, version, None if parent is None else parent.manifest.version, report)
+    words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)
     draft = Draft(
         version,
         maps.areas(site).name_tiles(words, TILE_SIZE_M),

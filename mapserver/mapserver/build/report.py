@@ -1,5 +1,6 @@
 """The report of a build. Pure; the keys of `BuildReport` are stable, docs/reports.md lists their meanings."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import metadata
@@ -212,8 +213,8 @@ def report_details(
     }
 
 
-def sentence(site: str, version: int, parent: int | None, report: BuildReport) -> str:
-    """A stored draft in words; parent: the version that it was built on."""
+def sentence(site: str, version: int, parent: int | None, report: BuildReport, store: Path) -> str:
+    """A draft stored in the folder `store`, in words; parent: the version that it was built on."""
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
     built_on = "" if parent is None else f" on version {parent}"
@@ -228,7 +229,8 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport) -
         )
     return (
         f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
-        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with `mapserver publish --site {site}`"
+        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with "
+        f"`mapserver publish --site {site} --store {shlex.quote(str(store))}`"
     )
 
 

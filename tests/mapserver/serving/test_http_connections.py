@@ -1,7 +1,6 @@
 """Strangers at the door of HTTP, by sockets that state what no client library would; a robot is served meanwhile."""
 
 import asyncio
-import os
 import resource
 import socket
 import ssl
@@ -196,7 +195,7 @@ def test_files_are_kept_for_the_store_and_the_bus(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(module, "MAX_OF_ADDRESS", 10_000)
     with a_door() as door:
         assert is_answered(door, "127.0.0.1")
-        top = max(int(name) for name in os.listdir("/proc/self/fd")) + 8  # lower numbers may be free, too
+        top = max(int(file.name) for file in Path("/proc/self/fd").iterdir()) + 8  # lower numbers may be free, too
         monkeypatch.setattr(resource, "getrlimit", lambda _: (top * 4 // 3, top * 4 // 3))
         with ExitStack() as stack:
             for _ in range(top // 2 + 1):  # two files each
