@@ -147,23 +147,29 @@ class InvariantFilter:
         between two clones is a difference of numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
         """
         begin_m = self._positions[-1].copy()
-        self.state.position_m = self.state.position_m - begin_m
-        self._positions = self._positions - begin_m
+        self._move_origin(begin_m)
         for name, first in (("covariance", 0), ("true_error_cov", CONSIDERED)):
             covariance = getattr(self, name)
-            carried = np.eye(len(covariance))
             bodies = [(first, first + 6)]
             bodies += [(first + at, first + at + 3) for at in range(_CLONES, len(covariance) - first, 6)]
-            for turn, place in bodies:  # p - begin changes by Exp(turn) begin - begin besides
-                carried[place : place + 3, turn : turn + 3] = -skew(begin_m)
             since = np.eye(len(covariance))
             newest = bodies[-1]
             for body in bodies:
                 for one, other in zip(body, newest, strict=True):
                     since[range(one, one + 3), range(other, other + 3)] -= 1.0
-            change = since @ carried
-            setattr(self, name, _symmetric(change @ covariance @ change.T))
+            setattr(self, name, _symmetric(since @ covariance @ since.T))
         return se3(np.eye(3), -begin_m)
+
+    def _move_origin(self, by_m: Array) -> None:
+        """Counts positions, and errors of them, from another point (3,) of the frame."""
+        self.state.position_m = self.state.position_m - by_m
+        self._positions = self._positions - by_m
+        for covariance, first in ((self.covariance, 0), (self.true_error_cov, CONSIDERED)):
+            turns = np.append(first, np.arange(first + _CLONES, len(covariance), 6))[:, None] + np.arange(3)
+            places = turns + np.append(6, np.full(len(turns) - 1, 3))[:, None]
+            # p - by changes by Exp(turn) by - by besides
+            covariance[places] -= skew(by_m) @ covariance[turns]
+            covariance[:, places] -= covariance[:, turns] @ skew(by_m).T
 
     def odom_from_clone(self, clone_id: int) -> Array:
         """(4, 4) odom_from_body of a clone."""
@@ -190,11 +196,15 @@ class InvariantFilter:
         clones, anchors = (state_kernels.rows_of(held, wanted) for wanted in (tracks.clone_ids, tracks.anchors))
         rows = Tracks(tracks.starts, clones, tracks.pixels, anchors, tracks.points_cam)
         model = PixelModel(self._camera, self._weights / sigma_scale, self._noise, self._quantile)
+        # Errors count from here: those of a turn about an origin far away would be so large that rounding leaves no covariance.
+        begin_m = self._positions[-1].copy()
+        self._move_origin(begin_m)
         prior = self._kept()
         size = 6 * len(self.clone_ids)
         inner = np.ascontiguousarray(self.covariance[_CLONES:, _CLONES:])
         moved = np.zeros(size)
         if newest_odom_from_body is not None:
+            newest_odom_from_body = se3(np.eye(3), -begin_m) @ newest_odom_from_body
             error = newest_odom_from_body @ se3_inverse(se3(self._rotations[-1], self._positions[-1]))
             moved[-6:] = np.concatenate([so3_log(error[:3, :3]), error[:3, 3]])
             self._rotations[-1] = newest_odom_from_body[:3, :3]
@@ -205,11 +215,13 @@ class InvariantFilter:
             msckf_kernels.accumulate_tracks(bodies, rows, model, inner, moved, equations, used)
             weighing = np.eye(size) + inner @ equations.information[:, _PAIR:].T
             gain = np.asarray(np.linalg.solve(weighing, self.covariance[_CLONES:]).T, np.float64)
+            gain = _without_common_motion(gain, equations.information[:, _PAIR:])
             correction = gain @ equations.vector
             self._restore(prior)
             self._correct(correction)
             moved = correction[_CLONES:]
         self._learn(gain, equations.information, equations.scatter)
+        self._move_origin(-begin_m)
         return used
 
     def _learn(self, gain: Array, information: Array, scatter: Array) -> None:
@@ -340,6 +352,21 @@ def _copied(covariance: Array, at: int, nav: int) -> Array:
     order = np.arange(len(covariance))
     order[nav : nav + 3], order[nav + 6 : nav + 9] = order[at : at + 3], order[at + 3 : at + 6]
     return covariance[np.ix_(order, order)]
+
+
+def _without_common_motion(gain: Array, information: Array) -> Array:
+    """A gain (n, 6 M) without its part on errors that clones which see the same points share: in exact numbers it changes nothing.
+
+    information (6 M, 6 M). After gaps the variance of what such clones share, which no image shows, is 10^8 times that of the motion
+    between them. Rounding of the measurements, times such a gain, would leave negative variances.
+    """
+    count = len(information) // 6
+    linked = (information.reshape(count, 6, count, 6) != 0.0).any(axis=(1, 3)) | np.eye(count, dtype=bool)
+    for _ in range(count.bit_length()):
+        linked = linked @ linked
+    by_clone = gain.reshape(len(gain), count, 6)
+    shared = np.tensordot(by_clone, linked / linked.sum(axis=0), axes=(1, 0)).transpose(0, 2, 1)
+    return np.asarray((by_clone - shared).reshape(gain.shape))
 
 
 def _symmetric(covariance: Array) -> Array:

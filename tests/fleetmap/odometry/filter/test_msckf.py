@@ -325,21 +325,23 @@ def test_a_frame_that_begins_anew_changes_nothing_between_clones() -> None:
         np.testing.assert_allclose(anew_cov, cov, rtol=1e-3, atol=1e-3 * np.abs(cov).max())
 
 
-def test_far_from_where_the_frame_began_rounding_leaves_no_covariance() -> None:
-    """Five kilometres away, unless the frame begins anew: what a robot without IMU drives in a shift, and then two seconds in the dark."""
-    points, least = room(np.random.default_rng(3)), []
-    for is_anew in (False, True):
-        state = true_state(0.0)
-        state.velocity_mps, state.position_m = np.zeros(3), state.position_m + np.array([4000.0, 3000.0, 0.0])
-        estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
-        estimate.add_clone(0, np.zeros(3))
-        if is_anew:
-            estimate.begin_frame_anew()
-        for _ in range(30):
+@pytest.mark.parametrize("away_m", [0.0, 50.0, 5000.0])
+@pytest.mark.parametrize("unseen_steps", [0, 30])
+def test_gaps_and_distance_leave_a_covariance(away_m: float, unseen_steps: int) -> None:
+    """Two pairs of frames that share no points, with seconds between them in which nothing was known, far from where the frame began."""
+    points, rng = room(np.random.default_rng(3)), np.random.default_rng(4)
+    state = true_state(0.0)
+    state.velocity_mps, state.position_m = np.zeros(3), state.position_m + np.array([0.8, 0.6, 0.0]) * away_m
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    for pair in range(4):
+        for k in (2 * pair, 2 * pair + 1):
             estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
-        estimate.add_clone(1, np.zeros(3))
-        seen = {k: observe(points, 0.0, np.random.default_rng(k)) for k in (0, 1)}
+            estimate.add_clone(k, np.zeros(3))
+        seen = {k: observe(points, 0.0, rng) for k in (2 * pair, 2 * pair + 1)}
         estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
-        cov = estimate.motion_since(0)[1]
-        least.append(float(np.linalg.eigvalsh(cov)[0]))
-    assert least[0] < -1e-4 < 0.0 < least[1]
+        for k in range(2 * pair + 1):
+            least, *_, largest = np.linalg.eigvalsh(estimate.motion_since(k)[1])
+            assert least > 0.0, (pair, k)
+            assert largest < 1e-3 or k < 2 * pair
+        for _ in range(unseen_steps):
+            estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
