@@ -13,7 +13,6 @@ fleetmap/{site}/robots/{robot}/renew     asked by the robot with its next key: f
 fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
 fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
 fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
-fleetmap/{site}/patches/{base}-{sha256}  asked by the robot, ChunkRequest: Part of what makes a tile or manifest out of `base`
 fleetmap/{site}/trust/{file}             asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
 """
 
@@ -385,9 +384,9 @@ def blob_key(site: str, sha256: str) -> str:
     return f"{_ROOT}/{site}/blobs/{sha256}"
 
 
-def patch_key(site: str, base_sha256: str, sha256: str) -> str:
-    """Key of the patch that makes one address out of another; '*' for any."""
-    return f"{_ROOT}/{site}/patches/{base_sha256}-{sha256}" if base_sha256 != "*" else f"{_ROOT}/{site}/patches/*"
+def patch_key(site: str, pair: str) -> str:
+    """Key under which robots of before ask for a patch between two addresses; '*' for any."""
+    return f"{_ROOT}/{site}/patches/{pair}"
 
 
 def trust_key(site: str, file: str) -> str:

@@ -10,7 +10,6 @@ import pytest
 
 from benchmarks.fleet import bench_bus_access, bench_delivery, bench_service, bench_trust
 from benchmarks.maps import bench_map_budget, bench_map_fuzz
-from benchmarks.survey import bench_nights
 from support.recordings.realdata import real_data
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -78,12 +77,3 @@ def test_the_default_budget_costs_little(tmp_path: Path) -> None:
     assert float(default["bytes_per_m"]) <= 3000  # type: ignore[arg-type]
     assert int(default["largest_tile_bytes"]) <= 256_000  # type: ignore[call-overload]
     assert float(default["localised_share"]) >= float(full["localised_share"]) - 0.02  # type: ignore[arg-type]
-
-
-def test_a_night_costs_what_changed_in_it(tmp_path: Path) -> None:
-    _, quiet, *moved = bench_nights.measure(tmp_path, "small-loop", "::2", 0.05)
-    assert quiet["share"] <= 0.01
-    assert len(moved) == 2
-    for night in moved:
-        assert night["share"] <= 0.15
-        assert night["landmarks_added"] > quiet["landmarks_added"]

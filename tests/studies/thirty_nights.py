@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from benchmarks.common.recorded_runs import SITE, played, tool
-from benchmarks.survey.bench_nights import fetched
+from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetsim.commands import record_order
@@ -23,10 +23,15 @@ from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors.faults import Fault
 from locclient.localization.settings import LocalizerSettings
+from locclient.maps.map_client import MapClient
+from locclient.maps.tile_cache import TileCache
 from locclient.replay import run_metrics
 from mapserver import open_map
 from mapserver.config import MapserverConfig
+from mapserver.fleet.fleet import Fleet
 from mapserver.nightly import NightRequest, last_report, run_night
+from mapserver.serving.bus_service import BusService
+from mapserver.store import MapStore
 from studies.study import PAGES, Column, Row, publish, results, table
 
 SEED, OTHER_SEED, NIGHTS = 547, 787, 30  # of the site, of the building that the foreign recording is from
@@ -114,10 +119,21 @@ def night(number: int) -> Row:
     held = [r for r in said["recordings"] if r["fate"] != "done"]
     row = {
         "night": number, "version": said["version"], "state": said["state"], "message": said["message"],
-        "held": [f"{r['name']}: {r['reason']}" for r in held], "map_bytes": new["bytes"],
-        "fetched_bytes": fetched(store, WORK / "cache")["bytes"],
+        "held": [f"{r['name']}: {r['reason']}" for r in held], "map_bytes": new,
+        "fetched_bytes": fetched(store, WORK / "cache"),
     }  # fmt: skip
     return row | landmarks() | robot(number)
+
+
+def fetched(folder: Path, cache: Path) -> int:
+    """Bytes that a robot with this cache fetches over the bus until it has the current version."""
+    hub = MemoryHub()
+    with MapStore.open(folder) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot:
+        service = BusService(store, Fleet(store), bus, lambda *_: None)
+        link = MapClient(robot, TileCache(cache), SITE, "r1")
+        link.bring(link.wanted())
+        service.close()
+        return link.received_bytes
 
 
 def updated(number: int) -> Row:

@@ -12,9 +12,7 @@ from fleetmap.mapformat import (
     MAX_MANIFEST_BYTES,
     Manifest,
     TileEntry,
-    apply_patch,
     check_name,
-    decode_manifest,
     sha256_hex,
     verified,
 )
@@ -30,7 +28,6 @@ from fleetmap.messages import (
     decode_message,
     encode_message,
     manifest_key,
-    patch_key,
     robot_key,
 )
 from fleetmap.trust import TrustedMap
@@ -54,8 +51,8 @@ _log = logging.getLogger(__name__)
 class MapClient(MapSource):
     """Fetches maps through a cache, and reports.
 
-    Cached bytes are not fetched again, so that a known version can be read while the server is away. A robot with an active version
-    asks for patches from it; where there is none, or it does not fit, for the whole tile.
+    Cached bytes are not fetched again: a known version can be read while the server is away, and of a new one only the
+    tiles that changed are fetched.
     """
 
     def __init__(
@@ -162,10 +159,9 @@ class MapClient(MapSource):
         manifest = self.manifest(wanted)
         self._cache.reserve(self._site, _addresses(manifest, wanted))
         self.vocabulary(manifest)
-        bases = self._bases()
         for entry in manifest.tiles:
             # Decoded to check it, and not kept: a large site is larger than a robot's memory.
-            checked_tile(entry, manifest.tile_size_m, self._tile_blob(entry, bases))
+            checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
         if self.takes_grids:
             self._fetch_grid(manifest)
         return manifest
@@ -185,13 +181,13 @@ class MapClient(MapSource):
         """
         version, sha256 = address_of(wanted)
         active = self._cache.active(self._site)
-        base = None if active is None else active.blobs[0]
-        max_bytes = MAX_MANIFEST_BYTES if sha256 == base else self._admitted_bytes(wanted, sha256)
-        return checked_manifest(self._blob(manifest_key(self._site, version), sha256, max_bytes, base), wanted)
+        is_active = active is not None and sha256 == active.blobs[0]
+        max_bytes = MAX_MANIFEST_BYTES if is_active else self._admitted_bytes(wanted, sha256)
+        return checked_manifest(self._blob(manifest_key(self._site, version), sha256, max_bytes), wanted)
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address, from the cache or the server; errors as of `manifest`."""
-        return self._blob(blob_key(self._site, sha256), sha256, max_bytes, None)
+        return self._blob(blob_key(self._site, sha256), sha256, max_bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.
@@ -200,13 +196,12 @@ class MapClient(MapSource):
         Once nobody answers, only the cache is asked, so that a robot without a network does not wait for every tile.
         """
         unreachable: list[UnreachableError] = []
-        bases = self._bases()
 
         def blob(entry: TileEntry) -> bytes:
             if unreachable and entry.sha256 not in self._cache:
                 raise unreachable[0]
             try:
-                return self._tile_blob(entry, bases)
+                return self.blob(entry.sha256, entry.bytes)
             except UnreachableError as error:
                 unreachable.append(error)
                 raise
@@ -215,16 +210,9 @@ class MapClient(MapSource):
 
     def _fetch_grid(self, manifest: Manifest) -> None:
         """A version without its grid is as good for the robot as any; what is missing is missing for planners."""
-        bases: dict[tuple[int, int], str] = {}
-        with suppress(LinkError, MapFormatError):
-            active = self._cache.active(self._site)
-            before = None if active is None else self.manifest(active.wanted(self._site))
-            found = [] if before is None else grid_blobs(before, self._cached)
-            bases = {(entry.x, entry.y): entry.sha256 for entry in found}
         try:
             for entry in grid_blobs(manifest, self.blob):
-                key = blob_key(self._site, entry.sha256)
-                self._blob(key, entry.sha256, entry.bytes, bases.get((entry.x, entry.y)))
+                self.blob(entry.sha256, entry.bytes)
         except UnreachableError:
             raise
         except (LinkError, MapFormatError) as error:
@@ -256,43 +244,13 @@ class MapClient(MapSource):
         self._begun = sha256
         return length
 
-    def _bases(self) -> dict[tuple[int, int], str]:
-        """The tiles of the active version, which others can be patched from; empty where its manifest is not to be had."""
-        active = self._cache.active(self._site)
-        data = None if active is None else self._cache.get(active.blobs[0])
-        try:
-            return {} if data is None else {(tile.x, tile.y): tile.sha256 for tile in decode_manifest(data).tiles}
-        except MapFormatError:
-            return {}
-
-    def _tile_blob(self, entry: TileEntry, bases: dict[tuple[int, int], str]) -> bytes:
-        key = blob_key(self._site, entry.sha256)
-        return self._blob(key, entry.sha256, entry.bytes, bases.get((entry.x, entry.y)))
-
-    def _blob(self, key: str, sha256: str, max_bytes: int, base: str | None) -> bytes:
-        """The verified bytes of an address: from the cache, by a patch of `base`, or whole; cached afterwards."""
+    def _blob(self, key: str, sha256: str, max_bytes: int) -> bytes:
+        """The verified bytes of an address, from the cache or the server; cached afterwards."""
         data = self._cache.get(sha256)
-        if data is not None:
-            return data
-        if base is not None and base != sha256:
-            data = self._patched(base, sha256, max_bytes)
         if data is None:
             data = verified(self._chunks.read(key, max_bytes=max_bytes), sha256)
-        self._cache.put(sha256, data)
+            self._cache.put(sha256, data)
         return data
-
-    def _patched(self, base: str, sha256: str, max_bytes: int) -> bytes | None:
-        """The bytes by a patch; None where there is none, or it leads elsewhere."""
-        old = self._cache.get(base)
-        if old is None:
-            return None
-        try:
-            patch = self._chunks.read(patch_key(self._site, base, sha256), max_bytes=max_bytes)
-            return verified(apply_patch(old, patch), sha256)
-        except UnreachableError:
-            raise
-        except (LinkError, MapFormatError):
-            return None
 
     # --- what a site keeps beside its versions ------------------------------------------------------------------------
 

@@ -1,17 +1,13 @@
-"""The server's side of the bus: answers for versions, manifests, bytes and patches; takes the robots' messages; announces versions."""
+"""The server's side of the bus: answers for versions, manifests and bytes; takes the robots' messages; announces versions."""
 
 import logging
-import threading
-import time
-from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import FleetmapError, LinkError, MapFormatError
+from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.live_survey import LiveSurveyState, live_key
 from fleetmap.log_lines import LogLimit
-from fleetmap.mapformat import check_name, decode_manifest, make_patch
+from fleetmap.mapformat import check_name
 from fleetmap.messages import (
     PoseMessage,
     RobotAck,
@@ -45,10 +41,6 @@ MAX_REPORT_BYTES = 16 << 10  # a health report with everything in it has 3 kB, a
 RENEWAL_RATE = (5, 1 / 60)  # of a robot: each is a signature, and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
-_RECENT_PATCHES_BYTES = 32_000_000
-_PATCH_SHARE = 0.7  # of the whole, above which a patch is not worth its work
-_PATCHED_KINDS = {"tile", "manifest", "grid"}
-_PREPARE_S = 10.0  # in all: longer would keep robots and other background tasks waiting
 
 
 class BusService:
@@ -70,8 +62,6 @@ class BusService:
         self._lists = SignedLists(store.folder)
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES)
-        self._patches = ByteCache(_RECENT_PATCHES_BYTES)
-        self._patching = threading.Lock()
         self._kinds = AuthorizationCache(store.served_kind)
         self.surveys = LiveSurveys()
         self._handles: list[Handle] = [
@@ -84,7 +74,7 @@ class BusService:
                 for shared, what, answer in (
                     (manifest_key("*", "*"), "manifest", self._manifest),
                     (blob_key("*", "*"), "blob", self._blob),
-                    (patch_key("*", "*", "*"), "patch", self._patch),
+                    (patch_key("*", "*"), "patch", self._patch),
                     (trust_key("*", "*"), "trust", self._list_file),
                 )
                 for key in (own_map_key(shared, "*"), shared)
@@ -98,18 +88,13 @@ class BusService:
     def announce_changes(self) -> list[str]:
         """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
 
-        The first call tells all of them, because they may have missed what happened while no server ran. Patches are made before
-        the announcement, for at most `_PREPARE_S`, because all robots ask for them at once.
+        The first call tells all of them, because they may have missed what happened while no server ran.
         """
-        changed, known, until_s = [], set(), time.monotonic() + _PREPARE_S
+        changed, known = [], set()
         for info in self._store.sites():
             versions = self._fleet.wanted_versions(info.site)
-            robots = {robot: self._lists.admitted_or_current(wanted) for robot, wanted in versions.items()}
-            moves = Counter((self._announced.get((info.site, robot)), w.manifest_sha256) for robot, w in robots.items())
-            for (base, result), _ in moves.most_common():
-                if base is not None and result is not None and base != result:
-                    self._prepare(info.site, base, result, until_s)
-            for robot, wanted in robots.items():
+            for robot, newest in versions.items():
+                wanted = self._lists.admitted_or_current(newest)
                 key, address = (info.site, robot), wanted.manifest_sha256
                 known.add(key)
                 if key not in self._announced or self._announced[key] != address:
@@ -193,44 +178,8 @@ class BusService:
         return self._read(sha256)
 
     def _patch(self, key: str) -> bytes:
-        """What makes one published thing of a site out of another; refused where it would not be much smaller."""
-        site, _what, addresses = split_key(key)
-        base, _, result = addresses.partition("-")
-        kinds = {self._kinds.get(sha256, site) for sha256 in (base, result)}
-        if len(kinds) != 1 or not kinds <= _PATCHED_KINDS:
-            raise LinkError(f"site {site} has no published pair {addresses[:160]} of one kind; fetch the whole")
-        patch = self._patches.get(addresses, lambda: self._made_patch(base, result))
-        if not patch:
-            raise LinkError(f"a patch from {base} is not much smaller than {result}; fetch the whole")
-        return patch
-
-    def _prepare(self, site: str, base: str, result: str, until_s: float) -> None:
-        """Makes the patches from one version to another, by their manifests' addresses; what fails is made, or refused, when asked."""
-        try:
-            old, new = (decode_manifest(self._read(sha256)) for sha256 in (base, result))
-            known = {(tile.x, tile.y): tile.sha256 for tile in old.tiles}
-        except FleetmapError as error:
-            _log.info("patches from %s to %s are made when they are asked for: %s", base, result, error)
-            return
-        pairs = [(base, result), *((known.get((tile.x, tile.y)), tile.sha256) for tile in new.tiles)]
-        for before, after in pairs:
-            if before is not None and before != after and time.monotonic() < until_s:
-                with suppress(FleetmapError):  # not worth it or not available: the answer to a request says so
-                    self._patch(patch_key(site, before, after))
-
-    def _made_patch(self, base: str, result: str) -> bytes:
-        """The patch; nothing where it is not worth it, which is kept as well.
-
-        One at a time: several threads that work on patches would take turns with an operator's request, and it waits for each.
-        """
-        whole = self._read(result)
-        try:
-            with self._patching:
-                patch = make_patch(self._read(base), whole)
-        except MapFormatError as error:
-            _log.info("no patch from %s to %s: %s", base, result, error)
-            return b""
-        return patch if len(patch) <= _PATCH_SHARE * len(whole) else b""
+        """Robots of before ask for patches first, and for the whole where that is refused."""
+        raise LinkError(f"there are no patches any more ({key[:200]}); fetch the whole")
 
     def _read(self, sha256: str) -> bytes:
         return self._recent.get(sha256, lambda: self._store.blob(sha256))

@@ -60,7 +60,7 @@ class ByteCache:
     def get(self, key: str, make: Callable[[], bytes]) -> bytes:
         """The bytes of `key`, made where they are not held; what `make` raises passes through and is not kept.
 
-        One thread makes them, the others that ask meanwhile wait for it: a whole fleet asks for the same patch at once.
+        One thread makes them, the others that ask meanwhile wait for it: a whole fleet asks for the same tile at once.
         """
         with self._lock:
             data = self._found(key)

@@ -13,7 +13,6 @@ from fleetmap.mapformat.manifest import (
     encode_manifest,
 )
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, sha256_hex, verified
-from fleetmap.mapformat.patch_codec import PATCH_FORMAT, apply_patch, make_patch
 from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, TILE_FORMAT, decode_tile, encode_tile
 
@@ -22,7 +21,6 @@ __all__ = [
     "MANIFEST_FORMAT",
     "MAX_MANIFEST_BYTES",
     "MAX_TILE_PLACES",
-    "PATCH_FORMAT",
     "TILE_FORMAT",
     "BlobEntry",
     "CameraEntry",
@@ -30,7 +28,6 @@ __all__ = [
     "RecordingEntry",
     "Tile",
     "TileEntry",
-    "apply_patch",
     "blob_path",
     "check_name",
     "check_sha256",
@@ -39,7 +36,6 @@ __all__ = [
     "decode_tile",
     "encode_manifest",
     "encode_tile",
-    "make_patch",
     "pack",
     "sha256_hex",
     "unpack",

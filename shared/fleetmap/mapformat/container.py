@@ -22,22 +22,18 @@ _LEVEL = 19  # tiles are written once at night and read by every robot
 _MAX_WINDOW_BYTES = 1 << 27
 
 
-def pack(
-    magic: bytes, format_number: int, payload: bytes | Sequence[bytes], *, level: int = _LEVEL, prefix: bytes = b""
-) -> bytes:
+def pack(magic: bytes, format_number: int, payload: bytes | Sequence[bytes], *, level: int = _LEVEL) -> bytes:
     """`payload` in its envelope. The same input gives the same bytes (for one release of zstd).
 
     A payload in parts is compressed in blocks of its own, each with its own statistics: columns of different kinds then
-    do not spoil each other's. `prefix` is what `unpack` will be given too, and may be referred to.
+    do not spoil each other's.
     """
     parts = [payload] if isinstance(payload, bytes) else payload
     size = sum(len(part) for part in parts)
     parameters = zstandard.ZstdCompressionParameters.from_level(
-        level, source_size=size, dict_size=len(prefix), write_checksum=True, write_content_size=True
+        level, source_size=size, write_checksum=True, write_content_size=True
     )
-    compressor = zstandard.ZstdCompressor(compression_params=parameters, dict_data=_dictionary(prefix)).compressobj(
-        size=size
-    )
+    compressor = zstandard.ZstdCompressor(compression_params=parameters).compressobj(size=size)
     frame = []
     for part in parts:
         frame += [compressor.compress(part), compressor.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
@@ -45,7 +41,7 @@ def pack(
     return _HEADER.pack(magic, format_number, 0, size) + b"".join(frame)
 
 
-def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int, prefix: bytes = b"") -> tuple[int, bytes]:
+def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) -> tuple[int, bytes]:
     """Format number and payload of `data`.
 
     Raises NewerFormatError for a format number above `newest`, MapFormatError for everything else that is not a whole
@@ -66,26 +62,18 @@ def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int, pr
         )
     if size > max_bytes:
         raise MapFormatError(f"{what} declares {size} bytes, the limit is {max_bytes}; it is damaged or not ours")
-    return number, _decompress(data[_HEADER.size :], size, what, prefix)
+    return number, _decompress(data[_HEADER.size :], size, what)
 
 
-def _decompress(frame: bytes, size: int, what: str, prefix: bytes) -> bytes:
+def _decompress(frame: bytes, size: int, what: str) -> bytes:
     try:
         declared = zstandard.get_frame_parameters(frame).content_size
         if declared != size:
             raise MapFormatError(f"{what}: header says {size} bytes, its zstd frame {declared}; the bytes are damaged")
-        decompressor = zstandard.ZstdDecompressor(dict_data=_dictionary(prefix), max_window_size=_MAX_WINDOW_BYTES)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
         payload = decompressor.decompress(frame, max_output_size=max(size, 1), allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise MapFormatError(f"{what}: {error}; the bytes are damaged, fetch them again") from error
     if len(payload) != size:
         raise MapFormatError(f"{what}: {len(payload)} bytes instead of {size}; the bytes are damaged, fetch them again")
     return payload
-
-
-def _dictionary(prefix: bytes) -> zstandard.ZstdCompressionDict | None:
-    """Bytes that both sides hold; zstd finds repetitions of them as if they stood before the payload."""
-    # Shorter ones are refused by zstd and would not help.
-    if len(prefix) < 8:
-        return None
-    return zstandard.ZstdCompressionDict(prefix, dict_type=zstandard.DICT_TYPE_RAWCONTENT)

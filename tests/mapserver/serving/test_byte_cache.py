@@ -47,7 +47,7 @@ def test_what_many_ask_for_at_once_is_made_once() -> None:
         begun.wait(5)
         if len(made) == 1:
             raise LookupError
-        return b"patch"
+        return b"tile"
 
     with ThreadPoolExecutor(8) as pool:
         asked = [pool.submit(held.get, "a", make) for _ in range(8)]
@@ -57,5 +57,5 @@ def test_what_many_ask_for_at_once_is_made_once() -> None:
         failed = sum(answer.exception() is not None for answer in asked)
         answers = [answer.result() for answer in asked if answer.exception() is None]
     assert failed == 1
-    assert answers == [b"patch"] * 7
+    assert answers == [b"tile"] * 7
     assert len(made) == 2
