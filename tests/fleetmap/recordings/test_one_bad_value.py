@@ -19,7 +19,7 @@ from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.samples import WheelSample
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
-from support.recordings.recording_samples import WIDTH, calibration
+from support.recordings.recording_samples import HEIGHT, WIDTH, calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMPS_NS = SAMPLE.stamps_ns.tolist()
@@ -135,6 +135,105 @@ def test_one_bad_value_costs_one_value(
                 recording.read_frame(index)
             assert says_so(recording, says), [*recording.issues]
             assert np.abs(recording.imu.stamps_ns - IMU.stamps_ns[-len(recording.imu) :]).max() < 20_000_000
+
+
+def zoomed(message: Any) -> None:
+    message.k = message.k * np.array([1.3, 1, 1, 1, 1.3, 1, 1, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("rows", "left_out", "focal_scale"), [(slice(1, 2), 1, 1.0), (slice(1, None), 1, 1.3), (slice(2, 4), 2, 1.0)]
+)
+def test_a_lens_that_changes_leaves_its_frames_out(
+    tmp_path: Path, rows: slice, left_out: int, focal_scale: float
+) -> None:
+    """As by zoom or autofocus: the lens of most frames is used, and the first of two that have as many."""
+    messages = edited("/cam0/camera_info", rows, zoomed)
+    paths = [write_foreign(tmp_path / "a.mcap", messages), write_rosbag1(tmp_path / "a.bag", messages)]
+    for path in paths:
+        with open_recording(path) as recording:
+            assert len(recording) == FRAMES - left_out
+            focal_px = calibration().cameras[0].intrinsics_px[0]
+            assert recording.calibration.cameras[0].intrinsics_px[0] == pytest.approx(focal_px * focal_scale)
+            assert says_so(
+                recording, rf"left images: the CameraInfo changes {left_out} of 4 left out.*fx cx cy.*keep zoom"
+            )
+
+
+def test_a_lens_that_always_changes_is_refused(tmp_path: Path) -> None:
+    lens = calibration().cameras[0]
+    infos = [replace(lens, intrinsics_px=lens.intrinsics_px * (1 + 0.01 * n)) for n in range(25)]
+    messages = [m for m in drive() if m[0] != "/cam0/camera_info"]
+    for number, info in enumerate(infos):
+        data = ros_messages.encode_camera_info(number, "cam0_optical", info)
+        messages.append(("/cam0/camera_info", "sensor_msgs/CameraInfo", number, data))
+    with pytest.raises(CalibrationError, match=r"/cam0/camera_info tells more than 20 lenses.*autofocus"):
+        open_recording(write_foreign(tmp_path / "a.mcap", messages))
+
+
+def setting(
+    binning: tuple[int, int], roi: tuple[int, int, int, int], size_px: tuple[int, int] = (0, 0)
+) -> list[Message]:
+    """One camera whose driver tells binning and roi (x, y, width, height), with images of `size_px`; of what they make for (0, 0)."""
+
+    def tell(message: Any) -> None:
+        message.binning_x, message.binning_y = binning
+        message.roi.x_offset, message.roi.y_offset, message.roi.width, message.roi.height = roi
+
+    def cut_out(message: Any) -> None:
+        image = message.data.reshape(message.height, message.width)
+        (x, y, width, height), (bin_x, bin_y) = roi, (max(each, 1) for each in binning)
+        part = image[y : y + (height or message.height), x : x + (width or message.width)]
+        part = cv2.resize(part, size_px if any(size_px) else (part.shape[1] // bin_x, part.shape[0] // bin_y))
+        (message.height, message.width), message.data = part.shape, part.ravel()
+        message.step = message.width
+
+    changed = edited("/cam0/camera_info", ALL, tell), edited(LEFT, ALL, cut_out)
+    return [
+        m for topic, found in zip(("/cam0/camera_info", LEFT), changed, strict=True) for m in found if m[0] == topic
+    ]
+
+
+@pytest.mark.parametrize(
+    ("messages", "scale", "offset", "says"),
+    [
+        (setting((0, 0), (0, 0, 0, 0)), (1, 1), (0, 0), ""),
+        (setting((1, 1), (0, 0, WIDTH, HEIGHT)), (1, 1), (0, 0), ""),
+        (setting((2, 2), (0, 0, 0, 0)), (2, 2), (0, 0), ""),
+        (setting((2, 1), (0, 0, 0, 0)), (2, 1), (0, 0), ""),
+        (setting((0, 0), (116, 68, 120, 100)), (1, 1), (116, 68), ""),
+        (setting((2, 2), (116, 68, 121, 101)), (2, 2), (116, 68), ""),
+        (setting((2, 2), (0, 0, 0, 0), (WIDTH, HEIGHT)), (1, 1), (0, 0), "binning or roi not used .*binning 2 x 2"),
+    ],
+)
+def test_binning_and_roi_are_used(
+    tmp_path: Path, messages: list[Message], scale: tuple[int, int], offset: tuple[int, int], says: str
+) -> None:
+    """The centre of pixel 0 of a binned image lies between the whole picture's pixels that it joins."""
+    with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
+        camera, whole = recording.calibration.cameras[0], calibration().cameras[0]
+        frame = recording.read_frame(0)
+        assert frame.left.shape == (camera.height_px, camera.width_px)
+        for axis in (0, 1):
+            back = (camera.intrinsics_px[2 + axis] + 0.5) * scale[axis] - 0.5 + offset[axis]
+            assert back == pytest.approx(whole.intrinsics_px[2 + axis])
+            assert camera.intrinsics_px[axis] * scale[axis] == pytest.approx(whole.intrinsics_px[axis])
+        assert says_so(recording, says)
+
+
+@pytest.mark.parametrize(
+    ("messages", "says"),
+    [
+        (
+            setting((2, 2), (0, 0, 0, 0), (100, 80)),
+            r"100x80 px, which the CameraInfo \(.*binning 2 x 2\) does not make.*roi",
+        ),
+        (setting((1, 1), (116, 68, 120, 100), (100, 50)), r"100x50 px.*roi 120x100 at \(116, 68\)"),
+    ],
+)
+def test_binning_that_does_not_make_the_images_is_refused(tmp_path: Path, messages: list[Message], says: str) -> None:
+    with pytest.raises(CalibrationError, match=says):
+        open_recording(write_foreign(tmp_path / "a.mcap", messages))
 
 
 def test_cameras_of_two_clocks_are_told_by_how_much(tmp_path: Path) -> None:

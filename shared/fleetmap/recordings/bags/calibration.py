@@ -28,6 +28,52 @@ class InfoCamera(NamedTuple):
         return self.info.frame_id.lstrip("/")
 
 
+def same_lens(one: CameraInfo, other: CameraInfo) -> bool:
+    """True if both are one lens at one setting, to the digits that drivers round to."""
+    sizes, others = ((i.width_px, i.height_px, i.lens, len(i.distortion), i.binning, i.roi) for i in (one, other))
+    values, again = (np.hstack([i.matrix.ravel(), i.projection.ravel(), i.distortion]) for i in (one, other))
+    return sizes == others and np.allclose(values, again, rtol=1e-3, atol=1e-3, equal_nan=True)
+
+
+def setting_of(info: CameraInfo) -> str:
+    """A CameraInfo's figures for messages."""
+    fx, cx, cy = (float(info.matrix[at]) for at in ((0, 0), (0, 2), (1, 2)))
+    x, y, width, height = info.roi
+    binned = "" if info.binning == (1, 1) else f", binning {info.binning[0]} x {info.binning[1]}"
+    roi = f", roi {width}x{height} at ({x}, {y})" if any(info.roi) else ""
+    return f"{info.width_px}x{info.height_px}, fx cx cy {fx:.1f} {cx:.1f} {cy:.1f}{binned}{roi}"
+
+
+def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> CameraInfo:
+    """The CameraInfo for images of `size_px`, which the driver bins or cuts out of the whole picture.
+
+    CalibrationError where binning and region of interest make another size. Source: the definition of sensor_msgs/CameraInfo. A binned
+    pixel's centre is that of the pixels that it joins.
+    """
+    (x, y, width, height), (bin_x, bin_y) = info.roi, info.binning
+    width, height = width or info.width_px - x, height or info.height_px - y
+    whole = info.width_px, info.height_px
+    if size_px == whole or (x, y, width, height, bin_x, bin_y) == (0, 0, *whole, 1, 1):
+        return info
+    if not (0 <= width - size_px[0] * bin_x < bin_x and 0 <= height - size_px[1] * bin_y < bin_y):
+        raise CalibrationError(
+            f"{where}: the images have {size_px[0]}x{size_px[1]} px, which the CameraInfo ({setting_of(info)}) does not make; "
+            "correct binning and roi in the driver, or pass a calibration of these images with --calibration FILE"
+        )
+    image_from_whole = np.array(
+        [[1 / bin_x, 0, (0.5 - x) / bin_x - 0.5], [0, 1 / bin_y, (0.5 - y) / bin_y - 0.5], [0, 0, 1]]
+    )
+    return replace(
+        info,
+        width_px=size_px[0],
+        height_px=size_px[1],
+        matrix=image_from_whole @ info.matrix,
+        projection=image_from_whole @ info.projection,
+        binning=(1, 1),
+        roi=(0, 0, 0, 0),
+    )
+
+
 def calibration_of_messages(
     cameras: Sequence[InfoCamera], links: Sequence[FrameLink], imu_frame: str | None, where: str
 ) -> RigCalibration:

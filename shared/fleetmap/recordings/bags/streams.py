@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings.bags.calibration import InfoCamera, calibration_of_messages, frames_not_optical
+from fleetmap.recordings.bags.calibration import (
+    InfoCamera,
+    calibration_of_messages,
+    frames_not_optical,
+    info_of_images,
+    same_lens,
+    setting_of,
+)
 from fleetmap.recordings.bags.codecs import CODECS, Codec
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT, Channel, Container, Place
 from fleetmap.recordings.bags.topics import (
@@ -38,12 +46,16 @@ from fleetmap.recordings.ordering import (
     with_log_times,
 )
 from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.ros2.messages import CameraInfo
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from fleetmap.sensors.source_settings import Topics
 
 _LAST_NS = 2**63 - 1  # MCAP's times have a bit more
 _SAME_LENS = 0.02  # of the focal length
+_HEADER_BYTES = (
+    12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: what differs in messages that say the same
+)
 V = TypeVar("V")
 _RECTIFIED = re.compile(
     r"(?<![a-z])rect(?![a-z])|(?<![a-z])rectified"
@@ -65,7 +77,7 @@ class _Stream:
     places: list[Place] = field(default_factory=list)
     sizes_px: list[tuple[int, int]] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
-    has_lens: bool = False
+    lens: CameraInfo | None = None
     damaged: int = 0
     bad_images: int = 0
     why_bad: str = ""
@@ -85,6 +97,8 @@ class _Stream:
 
 
 _Images = ImageSeries[tuple[_Stream, Place]]
+_Lenses = tuple[list[CameraInfo], NDArray[np.int64]]
+_MOST_LENSES = 20  # of one camera in a recording
 _Roles = Mapping[str, list[_Stream]]  # the streams by the role that `choose_topics` gives their topic
 
 
@@ -177,14 +191,18 @@ def _parts(
     chosen = choose_topics(channels, topics, str(container.path), log)
     roles = {role: [streams[channel_id] for channel_id in ids] for role, ids in chosen.items()}
     imu, imu_frame = _imu(roles.get("imu", ()), log)
-    left = _images(roles["left"], "left images", log)
-    right = _images(roles["right"], "right images", log) if "right" in roles else None
+    lenses: dict[str, _Lenses] = {}
+    if given is None and CALIBRATION_ATTACHMENT not in container.attachments:
+        sides = [side for side in ("left", "right") if side in roles]
+        lenses = {side: _lenses(roles[side], roles.get(f"{side}_info", ())) for side in sides}
+    left = _images(roles["left"], "left images", log, lenses.get("left"))
+    right = _images(roles["right"], "right images", log, lenses.get("right")) if "right" in roles else None
     depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
     if right is not None:
         (left, right), depth = pair_images(left, right, log), None
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
-    calibration = given.calibration if given else _calibration(container, roles, right is not None, imu_frame, log)
+    calibration = given.calibration if given else _calibration(container, roles, lenses, imu_frame, log)
     if depth is not None:
         _note_unregistered(streams.values(), roles, calibration.cameras[0], log)
     wheel = _samples([v for s in roles.get("wheel", ()) for v in s.values(s.codec.wheel)], "wheel odometry", log)
@@ -234,11 +252,15 @@ def _collect(container: Container, topics: Topics) -> tuple[dict[int, _Stream], 
                 stream.places.append(place)
             continue
         if type_name(channel) in ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"):
-            # Lenses repeat with every image: the first that says something is enough
-            if stream.has_lens:
+            # Lenses repeat with every image: one that says something is kept, and what differs from it
+            if stream.lens is not None and data[_HEADER_BYTES:] == stream.messages[-1][_HEADER_BYTES:]:
                 continue
-            stream.has_lens = _is_lens(stream, bytes(data))
-            stream.messages, stream.log_times_ns = [], []
+            lens, last = _lens(stream, bytes(data)), stream.lens
+            if last is not None and (lens is None or same_lens(lens, last)):
+                continue
+            if last is None:
+                stream.messages, stream.log_times_ns = [], []
+            stream.lens = lens
         container.keep(len(data))
         stream.log_times_ns.append(min(log_time_ns, _LAST_NS))
         stream.messages.append(bytes(data))
@@ -261,12 +283,13 @@ def _takes_image(stream: _Stream, data: memoryview, topic: str) -> bool:
     return True
 
 
-def _is_lens(stream: _Stream, data: bytes) -> bool:
-    """Whether a CameraInfo says what the lens is: uncalibrated drivers send zeros, others at their start."""
+def _lens(stream: _Stream, data: bytes) -> CameraInfo | None:
+    """The lens of a CameraInfo; None where it says nothing: uncalibrated drivers send zeros, others at their start."""
     try:
-        return bool(stream.codec.camera_info(stream.channel, data).matrix[0, 0] > 0)
+        info = stream.codec.camera_info(stream.channel, data)
     except (ValueError, AttributeError):
-        return False
+        return None
+    return info if info.matrix[0, 0] > 0 else None
 
 
 def _may_be_needed(channel: Channel, topics: Topics) -> bool:
@@ -288,7 +311,55 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
     return msgspec.structs.replace(topics, **changes)
 
 
-def _images(streams: Sequence[_Stream], what: str, log: ReadLog) -> _Images:
+def _lenses(images: Sequence[_Stream], streams: Sequence[_Stream]) -> _Lenses:
+    """All lenses that CameraInfo tells, each once, and the number of the one that each image (N,) was taken with.
+
+    CalibrationError where they never end, as of a lens that focuses by itself.
+    """
+    told = [
+        (stream.codec.stamp_ns(stream.channel, memoryview(stream.messages[row])) or log_time_ns, info)
+        for stream in streams
+        for row, (log_time_ns, info) in enumerate(stream.values(stream.codec.camera_info))
+    ]
+    told = sorted((each for each in told if each[1].matrix[0, 0] > 0), key=lambda each: each[0])
+    lenses: list[CameraInfo] = []
+    numbers: list[int] = []
+    for _, info in told:
+        number = next((n for n, lens in enumerate(lenses) if same_lens(lens, info)), len(lenses))
+        numbers.append(number)
+        lenses += [info] if number == len(lenses) else []
+        if len(lenses) > _MOST_LENSES:
+            raise CalibrationError(
+                f"{streams[0].channel.topic} tells more than {_MOST_LENSES} lenses, from {setting_of(lenses[0])} to "
+                f"{setting_of(info)}; a map needs one: switch off zoom and autofocus, or pass a calibration with --calibration FILE"
+            )
+    stamps_ns = [stamp_ns for stream in images for stamp_ns in stream.stamps_ns]
+    if not numbers:
+        return lenses, np.zeros(len(stamps_ns), np.int64)
+    rows = np.searchsorted([stamp_ns for stamp_ns, _ in told], stamps_ns, side="right") - 1
+    return lenses, np.array(numbers)[np.maximum(rows, 0)]
+
+
+def _usual_lens(lenses: _Lenses) -> int:
+    """The number of the lens of most images."""
+    return int(np.bincount(lenses[1]).argmax())
+
+
+def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) mask of the images with the lens of most; the others are noted in `log`."""
+    infos, numbers = lenses
+    kept = np.asarray(numbers == _usual_lens(lenses))
+    if not kept.all():
+        other = infos[int(numbers[~kept][0])]
+        log.note(
+            f"{what}: the CameraInfo changes",
+            f"{int((~kept).sum())} of {len(kept)} left out, which have {setting_of(other)}; {setting_of(infos[_usual_lens(lenses)])} is "
+            "used: keep zoom, focus, binning and roi as they are while you record",
+        )
+    return kept
+
+
+def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses | None = None) -> _Images:
     bad, why = sum(stream.bad_images for stream in streams), next((s.why_bad for s in streams if s.why_bad), "")
     stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
     log_times_ns = np.array([stamp for stream in streams for stamp in stream.log_times_ns], np.int64)
@@ -304,6 +375,8 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog) -> _Images:
     )
     images = _Images(with_log_times(stamps_ns, log_times_ns, what, log), sources)
     usual = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
+    if lenses is not None:
+        usual &= _of_usual_lens(lenses, what, log)
     return images.take(np.flatnonzero(usual)).forward(what, log)
 
 
@@ -361,27 +434,33 @@ def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: Camera
 
 
 def _calibration(
-    container: Container, roles: _Roles, has_right: bool, imu_frame: str | None, log: ReadLog
+    container: Container, roles: _Roles, lenses: Mapping[str, _Lenses], imu_frame: str | None, log: ReadLog
 ) -> RigCalibration:
     attached = container.attachments.get(CALIBRATION_ATTACHMENT)
     if attached is not None:
         where = f"{container.path}: attachment {CALIBRATION_ATTACHMENT}"
         return parse_calibration(attached.decode("utf-8", "replace"), where).calibration
     cameras = []
-    for role in ("left", "right") if has_right else ("left",):
-        streams, image_topic = roles.get(f"{role}_info", ()), roles[role][0].channel.topic
-        infos = [info for stream in streams for _, info in stream.values(stream.codec.camera_info)]
-        if not infos:
+    for side, (infos, numbers) in lenses.items():
+        image_topic = roles[side][0].channel.topic
+        if not infos and not any(len(stream) > stream.damaged for stream in roles.get(f"{side}_info", ())):
             raise CalibrationError(
                 f"{container.path}: no CameraInfo beside {image_topic} says what its lens is; pass a calibration with "
                 "--calibration FILE"
             )
-        if not infos[0].matrix.any():
+        if not infos:
             raise CalibrationError(
                 f"{container.path}: every CameraInfo beside {image_topic} holds zeros, as drivers without a calibration send it; "
                 "calibrate the camera, or pass a calibration with --calibration FILE"
             )
-        cameras.append(InfoCamera(infos[0], bool(_RECTIFIED.search(image_topic.lower()))))
+        usual = _usual_lens((infos, numbers))
+        sizes_px = [size for stream in roles[side] for size in stream.sizes_px]
+        size_px = Counter(size for size, n in zip(sizes_px, numbers, strict=True) if n == usual).most_common(1)[0][0]
+        info = info_of_images(infos[usual], size_px, f"{container.path}: {image_topic}")
+        if info.binning != (1, 1) or info.roi[:2] != (0, 0):
+            told = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
+            log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {told}")
+        cameras.append(InfoCamera(info, bool(_RECTIFIED.search(image_topic.lower()))))
     streams = roles.get("tf_static", ())
     links = [link for stream in streams for _, found in stream.values(stream.codec.links) for link in found]
     for issue in dict.fromkeys(link_issue for link in links if (link_issue := link.issue)):

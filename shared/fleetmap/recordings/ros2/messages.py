@@ -25,7 +25,11 @@ _FLOAT32, _POINT_BYTES = 7, 12
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image."""
+    """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image.
+
+    matrix and projection are those of the whole picture, width_px x height_px. binning (2,): pixels that the driver joins to one; zeros
+    mean 1. roi (4,): x, y, width, height of the part that it sends, before binning; zeros mean all.
+    """
 
     frame_id: str
     width_px: int
@@ -35,6 +39,8 @@ class CameraInfo:
     matrix: Array
     rect_from_cam: Array
     projection: Array
+    binning: tuple[int, int] = (1, 1)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +108,19 @@ def decode_camera_info(data: bytes) -> CameraInfo:
     height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
     distortion = reader.doubles(reader.unsigned())
     matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
+    binning = reader.unsigned() or 1, reader.unsigned() or 1
+    x, y, roi_height, roi_width = (reader.unsigned() for _ in range(4))
     return CameraInfo(
-        frame_id, width, height, lens, distortion, matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
+        frame_id,
+        width,
+        height,
+        lens,
+        distortion,
+        matrix.reshape(3, 3),
+        rect.reshape(3, 3),
+        projection.reshape(3, 4),
+        binning,
+        (x, y, roi_width, roi_height),
     )
 
 
