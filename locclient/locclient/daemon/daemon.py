@@ -103,7 +103,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
     site, name = address.site, address.robot
     with ExitStack() as stack:
         prior = parse_prior(run.prior)
-        source = open_source(config.source, config.topics)
+        source = open_source(config.source, config.topics, config.output.map_frame)
         stack.callback(source.close)
         calibration = source.calibration
         rectifier = Rectifier(calibration, has_depth=source.has_depth)

@@ -74,7 +74,7 @@ def _guarded(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Find
 
 
 def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
-    source = open_source(config.source, config.topics)
+    source = open_source(config.source, config.topics, config.output.map_frame)
     try:
         rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
         yield _calibration(source.calibration, rectifier)

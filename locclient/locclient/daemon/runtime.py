@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
+from fleetmap.log_lines import LogLimit
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sources.intake import Intake
@@ -88,6 +89,7 @@ class Runtime:
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
+        self._refusals, self._unreadable = LogLimit(_log), 0
         self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
         self._fetched_again: set[str] = set()
         self._shown_grid: WantedVersion | None = None
@@ -193,6 +195,9 @@ class Runtime:
         if now_s - self._health_s < _HEALTH_EVERY_S:
             return
         self._health_s = now_s
+        if self._parts.intake.counts.unreadable > self._unreadable:
+            self._unreadable = self._parts.intake.counts.unreadable
+            self._refusals.warning("message", "a sensor's message is not used: %s", self._parts.intake.unreadable_why)
         is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
         if is_silent and self._parts.fleet_manager is not None:
             self._parts.fleet_manager.adapter.silence()

@@ -73,7 +73,9 @@ class ReplayIntake:
             return FailureAck(id=part.id, received_bytes=part.total_bytes)
         if part.offset:
             return FailureAck(id=part.id)  # it was forgotten: from the beginning
-        self._uploads = {k: each for k, each in self._uploads.items() if k != key and now_ns - each.heard_ns < _IDLE_NS}
+        self._uploads = {
+            k: each for k, each in self._uploads.items() if k != key and abs(now_ns - each.heard_ns) < _IDLE_NS
+        }
         if len(self._uploads) >= MAX_UPLOADS:
             raise LinkError(f"later: {MAX_UPLOADS} robots send recordings of failures already")
         if not self._rates.admits(key):

@@ -26,6 +26,7 @@ class HealthStream:
     def __init__(self) -> None:
         self._stamp_ns: int | None = None
         self._wall_ns: int | None = None
+        self._older_wall_ns: int | None = None
         self._figures: dict[str, float] = {}
         self._has_fix = False
         self._fix_counted = False
@@ -72,7 +73,12 @@ class HealthStream:
             return False
         if health.wall_ns is None or self._wall_ns is None:
             return health.stamp_ns == self._stamp_ns
-        return health.wall_ns <= self._wall_ns
+        if health.wall_ns > self._wall_ns:
+            return False
+        # Two that follow each other from far before: the robot's clock was set back.
+        before_ns, self._older_wall_ns = self._older_wall_ns, health.wall_ns
+        is_set_back = before_ns is not None and 0 < health.wall_ns - before_ns <= MAX_GAP_S * 1e9
+        return not (is_set_back and self._wall_ns - health.wall_ns > MAX_GAP_S * 1e9)
 
     def _is_new_run(self, health: RobotHealth, figures: dict[str, float]) -> bool:
         if self._stamp_ns is None:

@@ -131,6 +131,7 @@ class SensorDrive:
         self.rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
         self._source, self._path, self._topics = source, path, topics
         self._ended, self._recorded_frames = threading.Event(), 0
+        self._fault: Exception | None = None
         self.speed = 1.0
         self._intake = Intake(
             frames=_QUEUE,
@@ -153,19 +154,21 @@ class SensorDrive:
         return ()
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
-        """See Drive."""
+        """See Drive; RecordingError where the sensors end by a fault, with where the drive is recorded up to there."""
         feeding = threading.Thread(target=self._feed, name="sensors", daemon=True)
         writer = McapRecordingWriter(self._path, self.calibration, topics=self._topics, in_place=True)
         feeding.start()
         begun_s = time.monotonic()
         try:
             while not self._intake.exhausted:
-                bundle = self._intake.take(_POLL_S)
+                bundle = self._take()
                 due_s = time.monotonic()
                 frame = None if bundle.frame is None else self._recorded(writer, bundle)
                 yield None if frame is None else DueFrame(frame, bundle.imu, bundle.wheel, due_s)
                 if due_s - begun_s > _SILENCE_S:
                     self._refuse_silence()
+            if self._fault is not None:
+                raise self._ended_by(self._fault)
         finally:
             self._ended.set()
             feeding.join(5.0)
@@ -207,8 +210,23 @@ class SensorDrive:
     def _feed(self) -> None:
         try:
             self._source.run(self._intake, self._ended.wait)
+        except Exception as error:  # whatever it is, the drive must not end as if it were complete
+            self._fault = error
         finally:
             self._intake.finish()
+
+    def _take(self) -> SensorBundle:
+        try:
+            return self._intake.take(_POLL_S)
+        except RecordingError as error:
+            raise self._ended_by(error) from error
+
+    def _ended_by(self, fault: Exception) -> RecordingError:
+        reason = str(fault) if isinstance(fault, FleetmapError) else f"{type(fault).__name__}: {fault}"
+        kept = "nothing was recorded before"
+        if self._recorded_frames:
+            kept = f"{self._path} holds the drive up to there, and `mapserver build {self._path}` makes a map of it"
+        return RecordingError(f"the sensors ended the drive: {reason}; {kept}")
 
     def _recorded(self, writer: McapRecordingWriter, bundle: SensorBundle) -> RectifiedFrame | None:
         """The frame as tracking takes it; None, and nothing recorded of it, where it cannot be read."""

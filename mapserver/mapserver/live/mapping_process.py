@@ -183,6 +183,8 @@ class MappingProcess:
             self._ours.send(None)
         except OSError:  # the process has ended: `_receive` knows why
             pass
+        except Exception as error:
+            self._failed = self._failed or _given_up(error)
 
     def _receive(self) -> None:
         try:
@@ -196,6 +198,12 @@ class MappingProcess:
                     self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
             self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
+        except Exception as error:
+            self._failed = self._failed or _given_up(error)
+
+
+def _given_up(error: Exception) -> str:
+    return f"mapping was given up ({type(error).__name__}: {error}); the finished map is built all the same"
 
 
 def _map(pipe: Connection) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.ordering import UNITS, wrong_unit
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
@@ -17,6 +18,8 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
 _STALE_NS = 60_000_000_000  # inertial samples integrated for longer without an image are useless
 _ABSURD = 1e5
+_SET_BACK_NS = 1_000_000_000  # by more, a stamp is not one that was late on its way
+_STAYS_NS = 500_000_000  # for so long the older stamps must go on before it is the clock that was set
 
 
 @dataclass
@@ -61,6 +64,8 @@ class Intake:
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = self._forget = False
+        self._older_since_ns: dict[str, int] = {}
+        self._set_back = ""
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted.
@@ -73,7 +78,9 @@ class Intake:
                 self._imu, self._last_imu_ns = _ImuQueue(), -(2**62)
             if frame.stamp_ns <= self._last_frame_ns:
                 self.counts.frames_disordered += 1
+                self._note_older("images", frame.stamp_ns, self._last_frame_ns)
                 return
+            self._older_since_ns.pop("images", None)
             self._last_frame_ns = frame.stamp_ns
             self.counts.frames += 1
             self._frames.append(frame)
@@ -95,7 +102,10 @@ class Intake:
             for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
                 if not good or stamp_ns <= self._last_imu_ns:
                     self.counts.imu_refused += 1
+                    if good:
+                        self._note_older("imu", stamp_ns, self._last_imu_ns)
                     continue
+                self._older_since_ns.pop("imu", None)
                 self._last_imu_ns = stamp_ns
                 self.counts.imu_samples += 1
                 self._imu.stamps_ns.append(stamp_ns)
@@ -147,9 +157,15 @@ class Intake:
             return self._changed.wait_for(lambda: len(self._frames) < self._limit, timeout_s)
 
     def take(self, timeout_s: float) -> SensorBundle:
-        """The oldest frame with the samples before it, once its inertial samples are there or have been waited for."""
+        """The oldest frame with the samples before it, once its inertial samples are there or have been waited for.
+
+        RecordingError once the stamps have gone back to stay: nothing would be taken until they have caught up.
+        """
         with self._changed:
-            if not self._changed.wait_for(lambda: self._frames or self._finished, timeout_s) or not self._frames:
+            has_come = self._changed.wait_for(lambda: self._frames or self._finished or self._set_back, timeout_s)
+            if self._set_back:
+                raise RecordingError(self._set_back)
+            if not has_come or not self._frames:
                 return SensorBundle()
             if self._has_imu and not self._changed.wait_for(self._imu_is_there, self._imu_wait_s):
                 self.counts.imu_late += 1
@@ -163,6 +179,20 @@ class Intake:
             forget, self._forget = self._forget, False
             self._changed.notify_all()
             return SensorBundle(frame, imu, wheel, priors, forget)
+
+    def _note_older(self, what: str, stamp_ns: int, last_ns: int) -> None:
+        """Notices stamps that go on from far before the last one. The caller holds the lock."""
+        since_ns = self._older_since_ns.get(what)
+        if last_ns - stamp_ns < _SET_BACK_NS:
+            self._older_since_ns.pop(what, None)
+        elif since_ns is None or stamp_ns < since_ns:
+            self._older_since_ns[what] = stamp_ns
+        elif stamp_ns - since_ns >= _STAYS_NS:
+            self._set_back = (
+                f"{what}: the stamps went back by {(last_ns - since_ns) * 1e-9:.1f} s, from {last_ns} to {since_ns}, and go on from "
+                "there: the sensors' clock was set; start again, which begins a new run with the new clock"
+            )
+            self._changed.notify_all()
 
     def _imu_is_there(self) -> bool:
         """Up to the oldest frame, which may be another one than when the wait began."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.bags.topics import transports
 from fleetmap.recordings.images import grey_bits, grey_peak
@@ -32,16 +32,20 @@ class Ros2Source:
         *,
         images: bool = True,
         has_depth: bool = False,
+        map_frame: str = "map",
     ) -> None:
         """images: False takes everything but images, which come from another source. has_depth: depth images in place of the right ones.
 
-        A calibration of one camera takes left images alone.
+        A calibration of one camera takes left images alone. map_frame: the frame of priors; those in another one are refused.
         """
         self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
         self._grey_peak = 0  # of images of 16 bits, until one shows that they have more than 12
-        self._topics: list[tuple[str, Take]] = [(topics.wheel, _take_wheel), (topics.prior, _take_prior)]
+        self._topics: list[tuple[str, Take]] = [
+            (topics.wheel, _take_wheel),
+            (topics.prior, partial(_take_prior, map_frame)),
+        ]
         if calibration.imu is not None:
             self._topics.append((topics.imu, _take_imu))
         if images:
@@ -109,5 +113,8 @@ def _take_wheel(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
     intake.put_wheel(messages.decode_odometry(payload))
 
 
-def _take_prior(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
+def _take_prior(map_frame: str, intake: Intake, _is_compressed: bool, payload: bytes) -> None:
+    _, frame_id = messages.header_of(payload)
+    if frame_id.lstrip("/") not in ("", map_frame):
+        raise RecordingError(f"a position prior in the frame {frame_id!r} is not used; give it in {map_frame!r}")
     intake.put_prior(messages.decode_prior(payload))

@@ -32,7 +32,7 @@ class Source(Protocol):
         """Closes files and connections."""
 
 
-def _recording(section: SourceSection, topics: Topics) -> Source:
+def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Source:
     if section.recording is None:
         raise UsageError('[source] recording is missing: kind = "recording" plays the recording at that path')
     calibration = None if section.calibration is None else Path(section.calibration)
@@ -40,13 +40,13 @@ def _recording(section: SourceSection, topics: Topics) -> Source:
     return RecordingSource(opened, speed=section.speed)
 
 
-def _ros2(section: SourceSection, topics: Topics) -> Source:
+def _ros2(section: SourceSection, topics: Topics, map_frame: str) -> Source:
     calibration = _calibration(section)
     layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
-    return Ros2Source(bus, layout, topics, calibration, has_depth=section.sensors == "rgbd")
+    return Ros2Source(bus, layout, topics, calibration, has_depth=section.sensors == "rgbd", map_frame=map_frame)
 
 
-def _uvc(section: SourceSection, topics: Topics) -> Source:
+def _uvc(section: SourceSection, topics: Topics, map_frame: str) -> Source:
     if section.sensors != "stereo":
         raise UsageError(
             f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
@@ -54,7 +54,7 @@ def _uvc(section: SourceSection, topics: Topics) -> Source:
     calibration = _calibration(section)
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
     layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
-    topic_source = Ros2Source(bus, layout, topics, calibration, images=False)
+    topic_source = Ros2Source(bus, layout, topics, calibration, images=False, map_frame=map_frame)
     mode = VideoMode(section.width_px, section.height_px, section.rate_hz, section.delay_s)
     return UvcSource(lambda: cv2.VideoCapture(device), calibration, mode, topic_source)
 
@@ -72,14 +72,18 @@ def _calibration(section: SourceSection) -> RigCalibration:
     return calibration
 
 
-SOURCES: dict[str, Callable[[SourceSection, Topics], Source]] = {"recording": _recording, "ros2": _ros2, "uvc": _uvc}
+SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {
+    "recording": _recording,
+    "ros2": _ros2,
+    "uvc": _uvc,
+}
 
 
-def open_source(section: SourceSection, topics: Topics) -> Source:
-    """The source that the section asks for.
+def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") -> Source:
+    """The source that the section asks for; map_frame: the only one in which ROS 2 topics may give position priors.
 
     UsageError for an unknown kind or what it lacks, RecordingError and CalibrationError for files that cannot be used.
     """
     if section.kind not in SOURCES:
         raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(SOURCES)}")
-    return SOURCES[section.kind](section, topics)
+    return SOURCES[section.kind](section, topics, map_frame)

@@ -3,7 +3,9 @@
 import threading
 
 import numpy as np
+import pytest
 
+from fleetmap.errors import RecordingError
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.intake import Intake
 
@@ -95,3 +97,23 @@ def test_the_end_is_told_once_all_is_taken() -> None:
     assert queue.take(10.0).frame is not None
     assert queue.exhausted
     assert queue.take(10.0).frame is None
+
+
+def test_a_clock_that_was_set_back_is_an_error_and_not_waited_for() -> None:
+    """Stamps that go on from an hour before would be refused for an hour."""
+    hour_ms = 3_600_000
+    queue = intake(frames=30)
+    queue.put_frame(frame(hour_ms))
+    queue.put_frame(frame(0))  # one bad stamp is one frame
+    queue.put_frame(frame(hour_ms + 50))
+    for stamp_ms in range(0, 450, 50):
+        queue.put_frame(frame(stamp_ms))
+    assert queue.take(0).frame.stamp_ns == hour_ms * MS
+    queue.put_frame(frame(550))
+    with pytest.raises(RecordingError, match=r"images: the stamps went back by 3600\.1 s.*clock was set; start again"):
+        queue.take(0)
+    inertial = intake()
+    inertial.put_imu(imu(*range(hour_ms, hour_ms + 10)))
+    inertial.put_imu(imu(*range(600)))
+    with pytest.raises(RecordingError, match="imu: the stamps went back"):
+        inertial.take(0)

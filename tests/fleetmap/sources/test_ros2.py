@@ -81,7 +81,12 @@ def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> 
         encode_prior(PositionPrior(start_ns, np.eye(4), np.eye(6)), "map"),
     )
     send(TOPICS.imu, "sensor_msgs/Imu", b"nonsense")
-    while (queue.counts.frames < 4 or not queue.counts.unreadable) and time.monotonic() < deadline:
+    send(
+        "/prior",
+        "geometry_msgs/PoseWithCovarianceStamped",
+        encode_prior(PositionPrior(start_ns, np.eye(4), np.eye(6)), "odom"),
+    )
+    while (queue.counts.frames < 4 or queue.counts.unreadable < 2) and time.monotonic() < deadline:
         time.sleep(0.01)
     moments = [queue.take(1.0) for _ in range(4)]
     assert [moment.frame.stamp_ns for moment in moments] == [start_ns + n * 50_000_000 for n in range(4)]
@@ -92,7 +97,8 @@ def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> 
     np.testing.assert_allclose(moments[1].imu.gyro_radps, [[1.0, 2.0, 3.0]])
     assert len(moments[0].priors) == 1
     assert [len(moment.wheel) for moment in moments] == [1, 1, 1, 1]
-    assert queue.counts.unreadable == 1
+    assert queue.counts.unreadable == 2
+    assert "position prior in the frame 'odom' is not used; give it in 'map'" in queue.unreadable_why
     for handle in handles:
         handle.close()
 

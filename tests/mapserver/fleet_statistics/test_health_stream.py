@@ -196,3 +196,11 @@ def test_impossible_times_become_now() -> None:
     assert server_time_ns(90 * NS, 5.0, now, 0) == 85 * NS
     assert server_time_ns(900 * NS, None, now, 0) == now
     assert server_time_ns(3 * NS, None, now, 50 * NS) == now
+
+
+@pytest.mark.parametrize(("back_s", "reports"), [(5.0, 15), (12.0, 19), (3600.0, 19)])
+def test_a_robots_clock_that_was_set_back_is_not_waited_for(back_s: float, reports: int) -> None:
+    """Ten reports, then ten of a clock that is back_s behind: those that may have come twice are not counted, for 5 s at most."""
+    seconds = [100_000.0 + n for n in range(10)]
+    seconds += [second + 10.0 - back_s for second in seconds]
+    assert total([health(second, wall_ns=round(second * NS)) for second in seconds]).reports == reports

@@ -12,7 +12,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import mapserver
-from fleetmap.errors import FleetmapError, RecordingError, StateError, SurveyError, UsageError
+from fleetmap.errors import FleetmapError, LinkError, RecordingError, StateError, SurveyError, UsageError
 from fleetmap.live_survey import LiveSurveyState
 from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -250,6 +250,37 @@ def test_sensors_that_say_nothing_are_not_waited_for(
         assert 1 <= len(kept) <= len(frames)
         np.testing.assert_array_equal(kept.read_frame(0).right, frames[0].right)
     assert "sensors" not in {thread.name for thread in threading.enumerate()}
+
+
+class Broken(Scripted):
+    """Sensors that die after their frames."""
+
+    def __init__(self, frames: list[CameraFrame], error: Exception) -> None:
+        super().__init__(frames)
+        self._error = error
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        for frame in self._frames:
+            intake.put_frame(frame)
+        raise self._error
+
+
+@pytest.mark.parametrize(
+    ("count", "error", "says"),
+    [
+        (3, ZeroDivisionError("no rate"), "ZeroDivisionError: no rate; .*drive.mcap holds the drive.*mapserver build"),
+        (0, LinkError("no router at tcp/1.2.3.4:7447"), "no router at .*; nothing was recorded before"),
+    ],
+)
+def test_sensors_that_die_end_the_drive_with_their_reason(
+    site: Site, tmp_path: Path, count: int, error: Exception, says: str
+) -> None:
+    record, sample = tmp_path / "drive.mcap", robot_world.cycle()
+    frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(count)]
+    drive = SensorDrive(Broken(frames, error), record, Topics())
+    with pytest.raises(RecordingError, match=f"the sensors ended the drive: {says}"):
+        driven(site, drive, SensorSet.STEREO_INERTIAL)
+    assert record.exists() == bool(count)
 
 
 def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_path: Path, builds: list[Call]) -> None:
