@@ -11,6 +11,8 @@ from fleetmap.bow import decode_vocabulary
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.numerics.free_memory import give_back_free_memory
+from fleetmap.recordings import Recording
+from fleetmap.sensors.lens_fit import lens_of_frames
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import PositionPrior, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
@@ -109,11 +111,18 @@ def replay(
     if robot.ring is not None:
         robot.ring.finish()
     result.search = reporter.figures.search
-    result.notes += [words] if (words := result.search.words) else []
+    if words := result.search.words:
+        result.notes += [words, *_lens_note(source.recording)]
     reporter.finish()
     if not truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())
     return result
+
+
+def _lens_note(recording: Recording) -> list[str]:
+    """What to know of the lens where another one fits the images better: none of the map is found with a wrong one."""
+    fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, recording.read_frame)
+    return [fit.words(recording.calibration.cameras[0])] if fit is not None and fit.is_doubtful else []
 
 
 def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: float, decode_s: float) -> FrameRecord:

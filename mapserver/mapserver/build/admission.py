@@ -9,7 +9,7 @@ from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.recordings import Follow
-from mapserver.doctor import Finding, Verdict, accelerometer_images, fixed_pattern, run_checks
+from mapserver.doctor import Finding, Verdict, accelerometer_images, fixed_pattern, lens, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
 from mapserver.doctor.metres import METRES, WHEELS
@@ -26,6 +26,7 @@ DECISIVE |= {
     METRES,
     "repeated images",
     fixed_pattern.NAME,
+    lens.NAME,
     *(parameter.value for parameter in TOLERANCES),
 }
 # What nothing but the calibration tells a map, and the checks that judge it.

@@ -21,7 +21,8 @@ SIGNED_AXES = [
     for order in permutations(range(3))
     for signs in product((1.0, -1.0), repeat=3)
 ]
-_NAMES = ("camera-imu time offset", "gyro scale", "gyro axes")
+AXES = "gyro axes"
+_NAMES = ("camera-imu time offset", "gyro scale", AXES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +66,21 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
         advice = "check that the IMU belongs to this camera and that both are stamped by one clock"
         return [
-            Finding("gyro axes", Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
+            Finding(AXES, Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
             *(not_judged(name, words, "check the gyro's axes first") for name in _NAMES[:2]),
         ], None
     findings = [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
     return findings, fit.offset_s if fit.correlation > _SURE_CORRELATION else None
+
+
+def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float, body_from_cam: Array) -> bool | None:
+    """True if the images turn as if each were rotated by 180 degrees in its plane, False if as given; None where nothing tells."""
+    if _why_not(turns, imu, imu_minus_cam_s):
+        return None
+    gyro, seen = _gyro_rates(turns, imu, imu_minus_cam_s), turns.rates_body_radps
+    rotated = body_from_cam[:3, :3] @ np.diag([-1.0, -1.0, 1.0]) @ body_from_cam[:3, :3].T
+    as_given, as_rotated = _correlation(gyro, seen), _correlation(gyro @ rotated.T, seen)
+    return as_rotated > as_given if max(as_given, as_rotated) > _SURE_CORRELATION else None
 
 
 def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> GyroFit:

@@ -19,10 +19,18 @@ from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.depth import depth_share, measured_depth
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
-from mapserver.doctor.gyro_images import CameraTurns, gyro_check
+from mapserver.doctor.gyro_images import AXES, CameraTurns, gyro_check, turn_upside_down
+from mapserver.doctor.lens import lens_check
 from mapserver.doctor.metres import ImageMetres, Metres
 from mapserver.doctor.sharpness import laplacian_variance, sharpness
-from mapserver.doctor.stereo import StereoMatches, epipolar_error, match_stereo, swapped_cameras
+from mapserver.doctor.stereo import (
+    ROTATE_BACK,
+    SWAPPED,
+    StereoMatches,
+    epipolar_error,
+    match_stereo,
+    swapped_cameras,
+)
 from mapserver.doctor.wheel_images import WheelFit, fit_wheels
 from mapserver.survey.executor import SERIAL, Executor, Work
 
@@ -101,7 +109,7 @@ def run_checks(
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     calibration = MeasuredCalibration([], None)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
-    findings += _soon_seen(recording, rectifier, seen)
+    findings += _soon_seen(recording, rectifier, seen, frames)
     turns: CameraTurns | None = None
     beside: list[Work[_Turns]] = []
 
@@ -137,6 +145,12 @@ def run_checks(
     elif turns is None:
         turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
+    upside_down = turn_upside_down(turns, imu, shift_s, rectifier.body_from_cam)
+    if recording.sensor_set in _PAIRS:
+        findings = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in findings]
+    if upside_down:
+        words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
+        checked = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in checked]
     axes, metres = judged(turns)
     findings += [*checked, axes, metres.wheels_finding(), metres.metres_finding()]
     findings += [*calibration.findings, sharpness(seen.variances), _readable(frames)]
@@ -147,8 +161,9 @@ def run_checks(
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
     """Those of `run_checks` for which the IMU and `sampled` frames will do: what can be said before a long drive begins."""
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    seen = _sampled(recording, _Frames(recording, lambda: None), rectifier, sampled, SERIAL)
-    return _soon_seen(recording, rectifier, seen)
+    frames = _Frames(recording, lambda: None)
+    seen = _sampled(recording, frames, rectifier, sampled, SERIAL)
+    return _soon_seen(recording, rectifier, seen, frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +182,7 @@ class _Seen:
     image_mps: float
 
 
-def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen) -> list[Finding]:
+def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen, frames: _Frames) -> list[Finding]:
     imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
     overlap = timing.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
     findings = [overlap, inertial.gravity_magnitude(imu), fixed_pattern(seen.structures)]
@@ -175,7 +190,7 @@ def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen) -> list[
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
     if recording.sensor_set is SensorSet.RGBD:
         findings.append(measured_depth(seen.depth_shares))
-    return findings
+    return [*findings, lens_check(recording, frames.read)]
 
 
 def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:

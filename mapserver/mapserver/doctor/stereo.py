@@ -12,6 +12,8 @@ from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _MIN_MATCHES = 40
 _NEAR = "drive in the light where both cameras see the same things, some of them near"
+SWAPPED = "left and right"
+ROTATE_BACK = "switch the driver's rotation (flip) off, or calibrate the rig with these images"
 _SEARCH_ROWS_PX = 25.0
 _LARGEST_SHARE_OF_WIDTH = 0.3
 
@@ -53,15 +55,22 @@ def match_stereo(frame: RectifiedFrame) -> StereoMatches:
     return _refined(frame, left[plausible], right[plausible])
 
 
-def swapped_cameras(pairs: Sequence[StereoMatches]) -> Finding:
-    """Points lie further left in the right image; where they do not, the images are swapped."""
-    name = "left and right"
+def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None = None) -> Finding:
+    """Points lie further left in the right image; where they do not, the images are swapped, or both rotated by 180 degrees.
+
+    upside_down: whether they turn as if rotated, None where nothing tells.
+    """
+    name = SWAPPED
     disparities = np.concatenate([p.disparities_px for p in pairs]) if pairs else np.zeros(0)
     decided = disparities[np.abs(disparities) > 1.0]
     if len(decided) < _MIN_MATCHES:
         return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few", _NEAR)
     wrong_share = float((decided < 0).mean())
-    bad = f"{wrong_share:.0%} of the matches have negative disparity; left and right are swapped, exchange the folders or topics"
+    cause = "left and right are swapped: exchange the folders or topics"
+    if upside_down is not False:
+        rotated = f"the images of both cameras are rotated by 180 degrees: {ROTATE_BACK}"
+        cause = rotated if upside_down else f"{cause}; or {rotated}"
+    bad = f"{wrong_share:.0%} of the matches have negative disparity; {cause}"
     limits = Limits(0.2, 0.5, "of the matches with negative disparity")
     return judge(name, wrong_share, limits, "the left image is the left one", bad)
 

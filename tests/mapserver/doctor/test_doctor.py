@@ -76,6 +76,11 @@ def swapped(frame: CameraFrame) -> CameraFrame:
     return replace(frame, left=frame.right, right=frame.left)
 
 
+def rotated(frame: CameraFrame) -> CameraFrame:
+    assert frame.right is not None
+    return replace(frame, left=frame.left[::-1, ::-1].copy(), right=frame.right[::-1, ::-1].copy())
+
+
 def right_lower_by_3_px(frame: CameraFrame) -> CameraFrame:
     assert frame.right is not None
     return replace(frame, right=np.roll(frame.right, 3, axis=0))
@@ -86,13 +91,14 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
     bad = {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK}
     assert set(bad.values()) == {Verdict.NOT_JUDGED}
     assert "baseline" in bad  # a second of turning on the spot excites no accelerometer
-    assert len({f.name for f in findings}) == len(findings) == 19 + len(CalibrationParameter)
+    assert len({f.name for f in findings}) == len(findings) == 20 + len(CalibrationParameter)
 
 
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
         ("left and right", swapped, "swapped"),
+        ("left and right", rotated, "the images of both cameras are rotated by 180 degrees: switch the driver's"),
         ("epipolar error", right_lower_by_3_px, "calibrate the cameras again"),
         ("sharpness", lambda f: replace(f, left=np.full_like(f.left, 90)), "look at the lens"),
     ],
