@@ -17,7 +17,8 @@ S = TypeVar("S", bound="Section")
 _MAX_FILE_BYTES = 1 << 20
 # Keys that were settings once, and what replaces them.
 _RETIRED = {
-    "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key"
+    "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
+    "walls": "`mapserver align --pin` replaces it; delete the key",
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
 Tiers = Mapping[str, Mapping[str, str]]

@@ -1,52 +1,33 @@
 """Pictures that lie under a map: the drawing of its building, and the occupancy grid of planners. Pure."""
 
-import tempfile
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver.dashboard.map_layers import Box
 from mapserver.floor_plan.alignment import Alignment
-from mapserver.floor_plan.plan_file import PlanFile, read_plan
+from mapserver.floor_plan.plan_file import decode_plan
 
 _LONG_SIDE_PX = 2000
 _FINEST_M = 0.02
 _INK_BGR, _FREE_BGR = (150, 140, 130), (130, 170, 110)
-_INK, _FREE = 200, 60  # how opaque
+_FREE = 60  # how opaque
 
 
 def floor_picture(data: bytes, alignment: Alignment, box: Box) -> bytes:
     """A PNG of the drawing where it lies in a box of `map`: ink where the drawing is dark. UsageError for a drawing that cannot be read."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"plan{Path(alignment.plan or '').suffix.lower()}"
-        path.write_bytes(data)
-        plan = read_plan(path)
+    plan = decode_plan(alignment.plan or "", data)
     scale_m = max(_FINEST_M, max(box[2] - box[0], box[3] - box[1]) / _LONG_SIDE_PX)
     size = (max(1, round((box[2] - box[0]) / scale_m)), max(1, round((box[3] - box[1]) / scale_m)))
     building_from_map = alignment.frame.building_from_map[:2, [0, 1, 3]]
     map_from_pixel = np.array([[scale_m, 0, box[0] + scale_m / 2], [0, -scale_m, box[3] - scale_m / 2], [0, 0, 1]])
     drawing_from_pixel = (building_from_map @ map_from_pixel) / alignment.metres_per_unit  # right and up
-    if isinstance(plan, PlanFile):
-        # A picture counts down, and its first pixel's centre is half a pixel from its corner.
-        source = np.array([[1, 0], [0, -1]]) @ drawing_from_pixel - np.array([[0, 0, 0.5], [0, 0, 0.5]])
-        flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
-        grey = cv2.warpAffine(plan.grey, source, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
-        return _png(255 - grey.astype(np.uint8), _INK_BGR)
-    return _png(_drawn(plan.lines(), drawing_from_pixel, size), _INK_BGR)
-
-
-def _drawn(lines: Array, drawing_from_pixel: Array, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Lines (S, 4) of a drawing, opaque."""
-    pixel_from_drawing = cv2.invertAffineTransform(drawing_from_pixel)
-    ends = lines.reshape(-1, 2) @ pixel_from_drawing[:, :2].T + pixel_from_drawing[:, 2]
-    opaque = np.zeros(size[::-1], np.uint8)
-    near = np.clip(ends, -1e6, 1e6).round().astype(np.int32).reshape(-1, 2, 2)
-    cv2.polylines(opaque, list(near), False, _INK, 1, cv2.LINE_AA)
-    return opaque
+    # A picture counts down, and its first pixel's centre is half a pixel from its corner.
+    source = np.array([[1, 0], [0, -1]]) @ drawing_from_pixel - np.array([[0, 0, 0.5], [0, 0, 0.5]])
+    flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpAffine(plan.grey, source, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
+    return _png(255 - grey.astype(np.uint8), _INK_BGR)
 
 
 def grid_picture(grid: OccupancyGrid) -> tuple[bytes, Box]:

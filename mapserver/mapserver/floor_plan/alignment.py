@@ -16,7 +16,7 @@ PLAN = "plan"
 
 
 class Alignment(msgspec.Struct, frozen=True, kw_only=True):
-    """What `mapserver align` found. metres_per_unit: of the drawing, whose units are pixels or its own metres.
+    """What `mapserver align` found. metres_per_unit: of the drawing, whose units are pixels.
 
     off_m: what is left at each pin; plan: the file's name, for people.
     """

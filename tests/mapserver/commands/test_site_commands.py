@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import cv2
-import ezdxf
 import numpy as np
 import pytest
 import yaml
@@ -83,6 +82,7 @@ def test_what_gives_no_alignment_is_refused_and_changes_nothing(run, site, tmp_p
     huge[16:24] = (1 << 20).to_bytes(4, "big") * 2
     (tmp_path / "huge.png").write_bytes(huge)
     (tmp_path / "text.png").write_text("plan")
+    (tmp_path / "hall.dxf").write_text("0\nSECTION\n")
     refused = {
         "name --pin": (),
         "--show to print": ("--show", *pins(*PINS)),
@@ -91,8 +91,7 @@ def test_what_gives_no_alignment_is_refused_and_changes_nothing(run, site, tmp_p
         "cannot be decoded": ("--plan", tmp_path / "torn.png", *pins(*PINS)),
         "the limit is 100000000": ("--plan", tmp_path / "huge.png", *pins(*PINS)),
         "is not in plan.png, which has 600x500": ("--plan", tmp_path / "plan.png", *pins(*PINS, "d=700,0:9,9")),
-        "--walls needs the plan": ("--walls", *pins(*PINS)),
-        "0 lines": ("--walls", "--plan", tmp_path / "plan.png"),
+        "DXF is not read": ("--plan", tmp_path / "hall.dxf", *pins(*PINS)),
         "mirrored": pins("a=200,400:0,0", "b=200,0:20,0", "c=400,400:0,10"),
     }
     for words, arguments in refused.items():
@@ -140,7 +139,7 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
     run("areas", "import", drawn, *site)
     with MapStore.open(tmp_path / "store") as store:
         assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, "hall"]
-    assert "run `mapserver align` first" in run("align", *site, "--forget", status=2)
+    assert "run `mapserver align --store" in run("align", *site, "--forget", status=2)
     run("align", *site, *pins("a=200,400:50,0", "b=200,0:70,0", "c=0,400:50,10"))  # 50 m along x of the map
     with MapStore.open(tmp_path / "store") as store:
         assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, None]
@@ -158,15 +157,3 @@ def test_areas_that_are_none_change_nothing(run, site, tmp_path: Path) -> None:
         assert words in run("areas", "import", file, *site, status=2)
     assert run("areas", "list", *site) == "aisle 5: 64.0 m2\n1 areas\n"
     assert "has no site" in run("areas", "list", "--site", "hall", *site[2:], status=2)
-
-
-def test_a_dxf_plan_brings_its_own_scale_and_frame(run, site, tmp_path: Path) -> None:
-    document = ezdxf.new(units=4)
-    document.modelspace().add_line((0, 0), (40_000, 0))
-    document.saveas(tmp_path / "hall.dxf")
-    corners = pins("a=10000,-20000:0,0", "b=10000,0:20,0", "c=0,-20000:0,10")
-    said = run("align", *site, "--plan", tmp_path / "hall.dxf", *corners)
-    assert "the map's origin at 10.000, -20.000 m of the building, turned by 90.000 degrees" in said
-    assert "0.001 m per unit of the plan" in said
-    feet = run("align", *site, "--plan", tmp_path / "hall.dxf", "--metres-per-pixel", 0.3048, *corners, status=2)
-    assert "fit at 0.001 metres per unit" in feet

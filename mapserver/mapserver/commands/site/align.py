@@ -23,7 +23,7 @@ class PlanOptions:
     """The drawing and what is known of it."""
 
     plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above: a picture, or DXF.")
+        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
     ] = None
     pin: Annotated[
         list[str] | None,
@@ -32,12 +32,6 @@ class PlanOptions:
     metres_per_pixel: Annotated[
         float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: the pins give it.")
     ] = None
-    walls: Annotated[
-        bool,
-        typer.Option(
-            "--walls", help="Find walls of the map among the plan's lines; one --pin may tell alike places apart."
-        ),
-    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +66,7 @@ def align(
             typer.echo(f"site {where.site}: the alignment is forgotten; robots go by what their version says")
             return
         if named:
-            found, data = _aligned(given, maps, where.site)
+            found, data = _aligned(given, corners)
             files = {ALIGNMENT: encode_alignment(found), PLAN: data}
             maps.keep_site_files(where.site, files, _words(found), actor=by.named())
         alignment = maps.alignment(where.site)
@@ -94,7 +88,7 @@ def _corners(maps: "MapStore", site: str) -> "Array":
     return map_corners_m(maps.manifest(site, current.version))
 
 
-def _aligned(given: PlanOptions, maps: "MapStore", site: str) -> "tuple[Alignment, bytes | None]":
+def _aligned(given: PlanOptions, corners: "Array") -> "tuple[Alignment, bytes | None]":
     from mapserver.floor_plan.alignment import Alignment
     from mapserver.floor_plan.pins import fit_pins, parse_pin
     from mapserver.floor_plan.plan_file import read_plan, upwards
@@ -103,32 +97,11 @@ def _aligned(given: PlanOptions, maps: "MapStore", site: str) -> "tuple[Alignmen
     plan = None if given.plan is None else read_plan(given.plan)
     pins = upwards(pins) if plan is None else plan.drawn(pins)
     name, data = (None, None) if plan is None else (plan.name, plan.data)
-    scale = given.metres_per_pixel or (None if plan is None else plan.metres_per_unit)
-    if given.walls:
-        if plan is None:
-            raise UsageError("--walls needs the plan; name it by --plan")
-        from mapserver.floor_plan.walls import fit_walls
-
-        found = fit_walls(plan.lines(), _landmarks(maps, site), scale, pins)
-        typer.echo(f"{found.share:.0%} of the plan's {found.lines} longest lines have landmarks, where the map is")
-        return Alignment(frame=found.frame, metres_per_unit=found.metres_per_unit, method="walls", plan=name), data
-    fit = fit_pins(pins, scale, _corners(maps, site))
+    fit = fit_pins(pins, given.metres_per_pixel, corners)
     _say_checks(fit)
     return Alignment(
         frame=fit.frame, metres_per_unit=fit.metres_per_unit, method="pins", plan=name, off_m=fit.off_m
     ), data
-
-
-def _landmarks(maps: "MapStore", site: str) -> "Array":
-    """(N, 2) of the current version."""
-    import numpy as np
-
-    from fleetmap.mapformat import decode_tile
-
-    current = maps.current(site)
-    tiles = () if current is None else maps.manifest(site, current.version).tiles
-    found = [decode_tile(maps.blob(tile.sha256)).points_map[:, :2] for tile in tiles]
-    return np.concatenate([np.zeros((0, 2)), *found])
 
 
 def _say_checks(fit: "Fit") -> None:
