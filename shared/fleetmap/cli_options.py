@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_orig
 
 import typer
 
+from fleetmap.errors import UsageError
+
 if TYPE_CHECKING:
     from fleetmap.config import Section
 
@@ -88,11 +90,25 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> 
         if isinstance(command, Group):
             group = typer.Typer(no_args_is_help=True, add_completion=False, help=command.help)
             for inner_name, inner in command.commands.items():
-                group.command(inner_name)(inner)
+                group.command(inner_name, cls=_Command)(inner)
             app.add_typer(group, name=name)
         else:
-            app.command(name)(command)
+            app.command(name, cls=_Command)(command)
     return app
+
+
+class _Command(typer.core.TyperCommand):
+    """A command that refuses an option which is gone with what replaces it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As typer's; UsageError for an option that is gone."""
+        known = {option for parameter in self.params for option in parameter.opts}
+        for option in {word.partition("=")[0] for word in args if word.startswith("--")} - known:
+            from fleetmap.config import RETIRED
+
+            if instead := RETIRED.get(option.lstrip("-").replace("-", "_")):
+                raise UsageError(f"{option} is gone: {instead.removesuffix('; delete the key')}")
+        return super().parse_args(ctx, args)
 
 
 def options_of(command: Command) -> dict[str, inspect.Parameter]:

@@ -15,10 +15,13 @@ from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
 _MAX_FILE_BYTES = 1 << 20
-# Keys that were settings once, and what replaces them.
-_RETIRED = {
+_IN_A_VERSION = "`locclient replay RECORDING --realtime --store DIR --version N` localizes a drive in a version"
+RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "walls": "`mapserver align --pin` replaces it; delete the key",
+    "frozen": _IN_A_VERSION,
+    "map": _IN_A_VERSION,
+    "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
 Tiers = Mapping[str, Mapping[str, str]]
@@ -63,7 +66,7 @@ def _decoded(path: Path, kind: Any) -> Any:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
     # tomllib's own errors for bytes that are no UTF-8, for impossible dates, and for deep nesting
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        replaced = "".join(f"; {new}" for key, new in _RETIRED.items() if f"unknown field `{key}`" in str(error))
+        replaced = "".join(f"; {new}" for key, new in RETIRED.items() if f"unknown field `{key}`" in str(error))
         raise UsageError(
             f"configuration file {path}: {str(error)[:500]}{replaced}; docs/settings.md lists the settings"
         ) from error

@@ -35,15 +35,6 @@ class LiveRevisit(msgspec.Struct, frozen=True, kw_only=True):
     matches: int
 
 
-class LiveFinding(msgspec.Struct, frozen=True, kw_only=True):
-    """What the doctor found in ten seconds before at_s: verdict ok, warn or fail."""
-
-    name: Text
-    verdict: Name
-    words: Text
-    at_s: float
-
-
 class LiveMissing(msgspec.Struct, frozen=True, kw_only=True):
     """A heading (E along x, N along y of the survey's frame) that nothing looks at around a place that was passed the other way."""
 
@@ -63,7 +54,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART where too little was seen to belong
     to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
     verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
-    estimate: where the newest keyframe is in this map, or in the `frozen` version, odometry's frame in the place of `odom`.
+    estimate: where the newest keyframe is in this map, odometry's frame in the place of `odom`.
     scale_known: False for one camera: the map that grows is in a unit of its own, with an IMU too.
     """
 
@@ -88,9 +79,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     revisits: Annotated[list[LiveRevisit], msgspec.Meta(max_length=32)] = []
     cells: _Bytes = b""
     missing: Annotated[list[LiveMissing], msgspec.Meta(max_length=64)] = []
-    findings: Annotated[list[LiveFinding], msgspec.Meta(max_length=32)] = []
     estimate: EstimateMessage | None = None
-    frozen: Version | None = None
     scale_known: bool = True
     version: Version | None = None
     words: Text = ""

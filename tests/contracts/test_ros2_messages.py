@@ -96,8 +96,6 @@ def written() -> list[Written]:
         ),
         stamped("geometry_msgs/msg/PoseStamped", messages.encode_pose(STAMP_NS, "map", PLACE), "map", pose__position__x=1.5),
         Written("tf2_msgs/msg/TFMessage", messages.encode_frame_links(STAMP_NS, [link]), {"transforms.0.child_frame_id": "odom"}),
-        stamped("nav_msgs/msg/Path", messages.encode_path(STAMP_NS, "map", np.ones((2, 3))), "map", poses__1__pose__position__z=1.0),
-        stamped("sensor_msgs/msg/PointCloud2", messages.encode_points(STAMP_NS, "map", np.ones((2, 3))), "map", width=2, is_dense=True),
         Written("std_msgs/msg/String", messages.encode_text("LOST"), {"data": "LOST"}),
         stamped(
             "nav_msgs/msg/OccupancyGrid", encode_grid(STAMP_NS, "map", GRID), "map", info__width=3, info__height=2,

@@ -29,13 +29,6 @@ class LiveCommandOptions(SurveyOptions):
     """Options of `live` beside those of `nightly`."""
 
     use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
-    map: Annotated[
-        int | None, typer.Option(metavar="VERSION", help="Localize in this version of the site; with --frozen.")
-    ] = None
-    frozen: Annotated[bool, typer.Option("--frozen", help="Map nothing: the version of --map stays what it is.")] = (
-        False
-    )
-
     speed: Annotated[float, typer.Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
     sensors: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
@@ -44,10 +37,6 @@ class LiveCommandOptions(SurveyOptions):
     server: Annotated[
         str | None,
         typer.Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey."),
-    ] = None
-    ros2: Annotated[
-        str | None,
-        typer.Option(metavar="ENDPOINT", help="zenoh endpoint to show the survey at as ROS 2 topics."),
     ] = None
     foxglove: Annotated[
         str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there; nobody signs in.")
@@ -74,8 +63,6 @@ def live(
         raise UsageError(
             f"--{of_recordings[0]} says how a RECORDING is read; the [source] and [topics] of {sensors} say it of sensors"
         )
-    if options.frozen != (options.map is not None):
-        raise UsageError("--map VERSION --frozen localizes in a version; without both of them a map is made")
     from fleetmap.console import plain_console
     from fleetmap.foxglove import require_foxglove, viewer_address
 
@@ -88,10 +75,8 @@ def live(
 
     use = None if options.use is None else named_sensor_set(options.use)
     asked = options.asked(context) | {"config": config_path(context), "use": use}
-    site, store, speed, server, record, version, ros2 = (
-        asked.pop(name) for name in ("site", "store", "speed", "server", "record", "map", "ros2")
-    )
-    for name in ("frozen", "foxglove", "insecure", "sensors"):
+    site, store, speed, server, record = (asked.pop(name) for name in ("site", "store", "speed", "server", "record"))
+    for name in ("foxglove", "insecure", "sensors"):
         asked.pop(name)
     build, is_stopped = BuildOptions(**asked), _stopping()
     with (
@@ -100,16 +85,14 @@ def live(
         if recording is not None
         else _driven(context.obj.read_config(sensors)[0], record, build) as (drive, settings),
         _bus(server, store) as bus,
-        _bus(ros2, store, is_ros=True) as ros2_bus,
     ):
-        request = LiveRequest(site, store, settings, build, version)
+        request = LiveRequest(site, store, settings, build)
         viewer = None if foxglove is None else _viewer(foxglove, drive)
-        tell = _teller(bus, ros2_bus, viewer)
+        tell = _teller(bus, viewer)
         see = None if viewer is None else viewer.see
         result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
     typer.echo(result.figures.words())
-    if result.built is not None:
-        typer.echo(result.built.sentence)
+    typer.echo(result.built.sentence)
 
 
 @contextmanager
@@ -159,13 +142,13 @@ def _stopping() -> Callable[[], bool]:
     return lambda: stopped
 
 
-def _bus(server: str | None, store: Path, *, is_ros: bool = False) -> "AbstractContextManager[Bus | None]":
+def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
     from fleetmap.bus import ZenohBus, check_endpoint, has_tls
 
     if server is None:
         return nullcontext(None)
     if not has_tls(check_endpoint(server)):
-        return ZenohBus.connect(server, is_ros=is_ros)
+        return ZenohBus.connect(server)
     from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
@@ -190,23 +173,15 @@ def _viewer(server: "FoxgloveServer", drive: "Drive") -> "LiveViewer":
     return LiveViewer(server, drive)
 
 
-def _teller(
-    bus: "Bus | None", ros2_bus: "Bus | None", viewer: "LiveViewer | None"
-) -> "Callable[[LiveSurveyState], None]":
+def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":
     from fleetmap.errors import LinkError
     from fleetmap.live_survey import live_key
     from fleetmap.messages import encode_message
-    from mapserver.live.ros2_view import Ros2View
-
-    view = None if ros2_bus is None else Ros2View(ros2_bus)
 
     def tell(state: "LiveSurveyState") -> None:
         if bus is not None:
             with suppress(LinkError):  # a survey goes on without those who look at it
                 bus.publish(live_key(state.site), encode_message(state), may_drop=True)
-        if view is not None:
-            with suppress(LinkError):
-                view.show(state)
         if viewer is not None:
             viewer.tell(state)
 

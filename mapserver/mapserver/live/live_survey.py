@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,21 +12,17 @@ import cv2
 import numpy as np
 from rich.console import Console
 
-from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
-from fleetmap.errors import FleetmapError, StateError, SurveyError, UsageError
+from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse, skew
-from fleetmap.live_survey import NO_PART, LiveSurveyState
+from fleetmap.live_survey import LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.build.build import BuildOptions
 from mapserver.build.survey_recordings import read_zones
-from mapserver.library import BuiltMap, build_map, open_map
+from mapserver.library import BuiltMap, build_map
 from mapserver.live.drives import Drive, DueFrame
-from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MakeMap, MappingProcess, thinning
-from mapserver.store import MapStore
-from mapserver.survey.live.frozen_map import FrozenMap, FrozenVersion
-from mapserver.survey.live.live_map import LiveMap
+from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig
 from mapserver.survey.live.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
@@ -41,20 +36,18 @@ _TELL_EVERY_S = 0.5
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """A survey to follow. options: of the build at its end. frozen: a version of the site to localize in; nothing is mapped then."""
+    """A survey to follow. options: of the build at its end."""
 
     site: str
     store: Path
     settings: SurveySettings
     options: BuildOptions = field(default_factory=BuildOptions)
-    frozen: int | None = None
 
 
 class LiveFigures(NamedTuple):
     """How the survey kept up: frames and the seconds that they last; 0.5 and 0.99 of the frames were answered within latency_ms, None
     where they were not played at their own speed; late_frames took longer than the time to the next one. most_behind: keyframes that
     waited at once; lag_s: the longest time from a keyframe to the map that shows it. dropped: frames that came too quickly to be taken.
-    localized: share of the keyframes that were placed in a frozen version, None without one.
     """
 
     frames: int
@@ -68,7 +61,6 @@ class LiveFigures(NamedTuple):
     loops: int
     parts: int
     mapping_failed: str
-    localized: float | None = None
 
     def words(self) -> str:
         """A sentence."""
@@ -77,8 +69,6 @@ class LiveFigures(NamedTuple):
         if self.latency_ms is not None:
             kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
         made = f"{self.loops} loops" + (f" in {self.parts} parts that nothing has joined" if self.parts > 1 else "")
-        if self.localized is not None:
-            made = f"{self.localized:.0%} of them localized in the version"
         return (
             f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
             f"most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
@@ -86,10 +76,10 @@ class LiveFigures(NamedTuple):
 
 
 class LiveResult(NamedTuple):
-    """What the survey saw while it drove, and the draft that was made of it; None where it was localized in a frozen version."""
+    """What the survey saw while it drove, and the draft that was made of it."""
 
     figures: LiveFigures
-    built: BuiltMap | None
+    built: BuiltMap
 
 
 def run_live(
@@ -103,7 +93,7 @@ def run_live(
     """Follows a survey to its end, or until it is stopped, and builds the draft of what was seen.
 
     tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, before the drive
-    where possible, UsageError for what cannot be localized in a version, SurveyError for a drive of which nothing was.
+    where possible.
     """
     survey = _Survey(request, drive, tell, see)
     try:
@@ -111,29 +101,14 @@ def run_live(
             console.print(remark, markup=False)
         survey.follow(is_stopped)
         console.print(survey.figures().words(), markup=False)
-        built = _finished(request, drive, survey)
+        path, options = drive.finish(survey.figures().frames, replace(request.options, settings=request.settings))
+        survey.say("adjusting")
+        built = build_map(path, request.store, request.site, options)
     except FleetmapError as error:
         survey.say("failed", words=str(error))
         raise
-    if built is None:
-        survey.say("localized", words=survey.figures().words())
-    else:
-        survey.say("stored", version=built.version, words=built.sentence)
+    survey.say("stored", version=built.version, words=built.sentence)
     return LiveResult(survey.figures(), built)
-
-
-def _finished(request: LiveRequest, drive: Drive, survey: "_Survey") -> BuiltMap | None:
-    """The draft; None with a frozen version, SurveyError where nothing was localized in that."""
-    path, options = drive.finish(survey.figures().frames, replace(request.options, settings=request.settings))
-    if request.frozen is None:
-        survey.say("adjusting")
-        return build_map(path, request.store, request.site, options)
-    if not survey.figures().localized:
-        raise SurveyError(
-            f"none of {survey.figures().keyframes} keyframes was localized in version {request.frozen} of site {request.site}; is it the "
-            "map of this place? Drive a metre or more through what it shows, the same way round as its survey, or name another --map"
-        )
-    return None
 
 
 class _Survey:
@@ -150,7 +125,6 @@ class _Survey:
         self._behind, self._failed, self._lag_s = 0, "", 0.0
         # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
-        self._stamps_since: list[int] = []
         rectifier, imu = drive.rectifier, drive.calibration.imu
         self._rig = LiveRig(
             rectifier.camera,
@@ -160,12 +134,11 @@ class _Survey:
             drive.has_depth,
             scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
         )
-        self._make: MakeMap
 
     def check(self) -> list[str]:
         """What is wanting before it begins, in words; FleetmapErrors for what could only be in vain."""
-        remarks = self._drive.check()
-        self._make = self._maker()
+        remarks, request = self._drive.check(), self._request
+        self._config = SurveyConfig(request.settings, default_vocabulary(), read_zones(request.options.zones))
         if not self._rig.scale_known:
             remarks.append(
                 "scale: unknown: one camera without an IMU shows no metres; the draft can be inspected, and published only if docks or "
@@ -183,23 +156,10 @@ class _Survey:
             scratch.handle(frame, ImuSamples.empty(), ())
         del scratch
         # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
-        with _one_thread(), MappingProcess(self._make, self._rig, warm_up) as mapping:
+        with _one_thread(), MappingProcess(self._config, self._rig, warm_up) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
             self._look(mapping)
-
-    def _maker(self) -> MakeMap:
-        """What makes the map that takes the keyframes."""
-        request, rig = self._request, self._rig
-        if request.frozen is not None:
-            if not rig.scale_known:
-                raise UsageError(
-                    "--frozen: one camera without an IMU shows no metres, and a version has them; localize with an IMU, a second camera "
-                    "or depths"
-                )
-            return partial(FrozenMap, frozen_version(request.store, request.site, request.frozen), rig)
-        zones = read_zones(request.options.zones)
-        return partial(LiveMap, SurveyConfig(request.settings, default_vocabulary(), zones), rig)
 
     def _track(self, tracking: LiveTracking, mapping: MappingProcess, is_stopped: Callable[[], bool]) -> None:
         told_s = 0.0
@@ -221,11 +181,9 @@ class _Survey:
         if self._see is not None:
             self._see(tracked)
         self._stamps_ns.append(due.frame.stamp_ns)
-        self._stamps_since.append(due.frame.stamp_ns)
         self._worst = min(self._worst, tracked.quality)
         if tracked.keyframe is not None:
-            mapping.put(due.frame, tracked.keyframe, self._stamps_since)
-            self._stamps_since = []
+            mapping.put(due.frame, tracked.keyframe)
             self._qualities.append(self._worst)
             self._worst = 1.0
 
@@ -251,13 +209,7 @@ class _Survey:
             loops=self._sketch.loops,
             parts=len(self._sketch.parts),
             mapping_failed=self._failed,
-            localized=self._localized(),
         )
-
-    def _localized(self) -> float | None:
-        if self._request.frozen is None:
-            return None
-        return float((self._sketch.part != NO_PART).sum() / max(len(self._sketch.part), 1))
 
     def _seconds(self) -> float:
         return (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0
@@ -294,11 +246,9 @@ class _Survey:
                 loops=sketch.loops,
                 refused=sketch.refused,
                 revisits=list(sketch.revisits),
-                cells=sketch.quality.cells.astype("<f4").tobytes(),
-                missing=sketch.quality.missing,
-                findings=sketch.quality.findings,
+                cells=sketch.cells.astype("<f4").tobytes(),
+                missing=sketch.missing,
                 estimate=self._estimate(sketch.estimate),
-                frozen=self._request.frozen,
                 scale_known=self._scale_known,
                 version=version,
                 words=(words or self._failed)[:2000],
@@ -320,7 +270,7 @@ class _Survey:
             stamp_ns=self._stamps_ns[found.keyframe.number],
             status=found.status.value,
             cause=found.cause.value,
-            map_version=self._request.frozen,
+            map_version=None,
             odom_from_base=Placement.of(odom_from_body @ body_from_base),
             map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
             cov_rot_trans=None if cov is None else tuple(cov.ravel().tolist()),
@@ -338,13 +288,3 @@ def _one_thread() -> Iterator[None]:
     finally:
         gc.unfreeze()
         cv2.setNumThreads(before)
-
-
-def frozen_version(store: Path, site: str, version: int) -> FrozenVersion:
-    """A version of a store to localize in; StoreErrors where it is not there, StateError where it has no metres."""
-    found = open_map(store, site, version)
-    if found.manifest.report.get("scale") == "unknown":
-        raise StateError(f"version {version} of site {site} has a scale of its own, no metres; name another --map")
-    with MapStore.open(store) as maps:
-        vocabulary = decode_vocabulary(maps.blob(found.manifest.vocabulary.sha256))
-    return FrozenVersion(version, found.tiles, vocabulary, found.manifest.camera.focal_px)

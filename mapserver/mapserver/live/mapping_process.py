@@ -8,9 +8,8 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -18,10 +17,12 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LiveFinding, LiveMissing, LivePart, LiveRevisit
+from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LiveMissing, LivePart, LiveRevisit
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.live.drive_quality import DriveDoctor, covered_cells, missing_directions
-from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe
+from mapserver.live.drive_quality import covered_cells, missing_directions
+from mapserver.survey.live.live_map import LiveMap
+from mapserver.survey.live.live_values import LiveEstimate, LiveRig, NewKeyframe
+from mapserver.survey.survey_inputs import SurveyConfig
 
 _READY_WITHIN_S = 120.0  # a first start compiles kernels
 _STOP_WITHIN_S = 120.0  # for the keyframes that wait
@@ -29,47 +30,13 @@ MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 _LOOK_EVERY_S = 2.0  # at what the drive lacks
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
 _SHOW_WITHIN_S = 0.5  # a map that is behind is shown so often; one that is not, after every keyframe
-_DOCTOR_WAITING = 32  # keyframes that the doctor may look at later; the oldest go
 _NICENESS = 5  # below tracking, which answers frames
-
-
-class GrowingMap(Protocol):
-    """What takes keyframes: a map that grows, or one that is frozen."""
-
-    @property
-    def map_from_body(self) -> Array:
-        """(K, 4, 4) of the keyframes so far."""
-
-    def __len__(self) -> int: ...
-
-    def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
-        """One more keyframe."""
-
-    def points_map(self) -> Array:
-        """(N, 3) landmarks."""
-
-    def loops(self) -> LiveLoops:
-        """What became of revisits."""
-
-    def parts(self) -> LiveParts:
-        """What belongs together."""
-
-    def estimate(self) -> LiveEstimate | None:
-        """Where the newest keyframe is."""
-
-
-class Quality(NamedTuple):
-    """What the drive lacks, looked at now and then: see LiveSurveyState."""
-
-    cells: Array
-    missing: list[LiveMissing]
-    findings: list[LiveFinding]
 
 
 class MapSketch(NamedTuple):
     """The map after so many keyframes: their places (K, 2) and the number of each one's part, landmarks (N, 2) thinned evenly, believed
     loops (L, 4), how many candidates were refused, by verdict, and the newest ones. parts: what lies to each other. estimate: of the
-    newest keyframe.
+    newest keyframe. cells and missing: what is covered and what the drive lacks, looked at now and then; see LiveSurveyState.
     """
 
     keyframes: int
@@ -82,29 +49,37 @@ class MapSketch(NamedTuple):
     refused: dict[str, int]
     revisits: tuple[LiveRevisit, ...]
     estimate: LiveEstimate | None
-    quality: Quality
+    cells: Array
+    missing: list[LiveMissing]
 
 
-_NO_QUALITY = Quality(np.zeros((0, 3)), [], [])
 NO_SKETCH = MapSketch(
-    0, np.zeros((0, 2)), np.zeros(0, np.uint8), [], np.zeros((0, 2)), np.zeros((0, 4)), 0, {}, (), None, _NO_QUALITY
+    0,
+    np.zeros((0, 2)),
+    np.zeros(0, np.uint8),
+    [],
+    np.zeros((0, 2)),
+    np.zeros((0, 4)),
+    0,
+    {},
+    (),
+    None,
+    np.zeros((0, 3)),
+    [],
 )
-
-
-MakeMap = Callable[[], GrowingMap]
-_Item = tuple[RectifiedFrame, NewKeyframe, list[int]]
+_Item = tuple[RectifiedFrame, NewKeyframe]
 
 
 class MappingProcess:
     """The process and the threads that speak with it, from `with` until its end."""
 
-    def __init__(self, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
-        """make: the empty map, there. warm_up: frames on which its kernels are loaded before the survey begins."""
+    def __init__(self, config: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+        """warm_up: frames on which its kernels are loaded before the survey begins."""
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         # What it needs goes through the pipe: more than a pipe holds, as arguments, would wait for ever for a process that has died.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
-        self._theirs, self._needed = theirs, (make, rig, warm_up)
+        self._theirs, self._needed = theirs, (config, rig, warm_up)
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
@@ -140,8 +115,8 @@ class MappingProcess:
         """Why no more keyframes are taken; empty while all is well."""
         return self._failed
 
-    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe, stamps_ns: list[int]) -> None:
-        """One more keyframe, and the stamps of the frames since the one before; returns at once.
+    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
+        """One more keyframe; returns at once.
 
         A map that is too far behind is given up: the build at the end does not need it.
         """
@@ -155,7 +130,7 @@ class MappingProcess:
             return
         self._sent += 1
         self._put_s.append(time.monotonic())
-        self._waiting.put((frame, keyframe, stamps_ns))
+        self._waiting.put((frame, keyframe))
 
     def finish(self) -> None:
         """Waits for the keyframes that were put, at most some time, and ends the process."""
@@ -211,33 +186,22 @@ def _map(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
     os.nice(_NICENESS)
     cv2.setNumThreads(1)  # the other core is tracking's
-    make, rig, warm_up = pipe.recv()
-    _warm(make(), warm_up)
+    config, rig, warm_up = pipe.recv()
+    _warm(LiveMap(config, rig), warm_up)
     gc.freeze()
-    growing, doctor, quality, looked_s, shown_s = make(), DriveDoctor(rig), _NO_QUALITY, 0.0, 0.0
-    unseen: deque[_Item] = deque(maxlen=_DOCTOR_WAITING)
+    growing, quality, looked_s, shown_s = LiveMap(config, rig), None, 0.0, 0.0
     try:
         pipe.send("ready")
-        while True:
-            if unseen and not pipe.poll():
-                doctor.take(*unseen.popleft())  # while nobody waits for the map
-                continue
-            item = pipe.recv()
-            if item is None:
-                break
-            frame, keyframe, _ = item
-            growing.add(frame, keyframe)
-            unseen.append(item)
+        while (item := pipe.recv()) is not None:
+            growing.add(*item)
             now_s = time.monotonic()
             if pipe.poll() and now_s - shown_s < _SHOW_WITHIN_S:
                 continue
             if now_s - looked_s >= _LOOK_EVERY_S:
-                looked_s, quality = now_s, _quality(growing, rig, doctor)
+                looked_s, quality = now_s, _quality(growing, rig)
             pipe.send(sketch_of(growing, quality))
             shown_s = time.monotonic()
-        for item in unseen:
-            doctor.take(*item)
-        pipe.send(sketch_of(growing, _quality(growing, rig, doctor)))
+        pipe.send(sketch_of(growing, _quality(growing, rig)))
         pipe.send(None)
     except (EOFError, OSError):  # the survey was killed
         pass
@@ -245,17 +209,15 @@ def _map(pipe: Connection) -> None:
         pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built all the same")
 
 
-def _quality(growing: GrowingMap, rig: LiveRig, doctor: DriveDoctor) -> Quality:
-    """Directions and coverage of the part that is the map."""
+def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
+    """Coverage and missing directions of the part that is the map."""
     labels = growing.parts().labels
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
-    return Quality(
-        cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam), doctor.findings
-    )
+    return cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam)
 
 
-def _warm(scratch: GrowingMap, frames: tuple[RectifiedFrame, ...]) -> None:
+def _warm(scratch: LiveMap, frames: tuple[RectifiedFrame, ...]) -> None:
     """Loads every kernel on some frames."""
     step = np.diag([1e-4] * 6)
     for number, frame in enumerate(frames):
@@ -267,7 +229,7 @@ def _warm(scratch: GrowingMap, frames: tuple[RectifiedFrame, ...]) -> None:
         )
 
 
-def sketch_of(growing: GrowingMap, quality: Quality = _NO_QUALITY) -> MapSketch:
+def sketch_of(growing: LiveMap, quality: tuple[Array, list[LiveMissing]] | None = None) -> MapSketch:
     """What of a map is shown while it grows; no array is larger than a message may hold."""
     placed, found, parts = growing.map_from_body, growing.loops(), growing.parts()
     numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
@@ -283,7 +245,7 @@ def sketch_of(growing: GrowingMap, quality: Quality = _NO_QUALITY) -> MapSketch:
         found.refused,
         found.newest,
         growing.estimate(),
-        quality,
+        *(quality or (NO_SKETCH.cells, NO_SKETCH.missing)),
     )
 
 

@@ -278,7 +278,7 @@ def failure(
 
 
 class SurveyChannels:
-    """Surveys under way, seen from above: in a frame `survey` of their own, or in `map` where they are localized in a version."""
+    """Surveys under way, seen from above, in a frame `survey` of their own."""
 
     def __init__(self, base_from_cam: Array | None = None) -> None:
         """base_from_cam (4, 4): where the camera is, if that is known."""
@@ -288,35 +288,34 @@ class SurveyChannels:
     def shown(self, state: LiveSurveyState) -> list[Shown]:
         """One more state; a line of the log where its status is new."""
         stamp_ns, estimate = state.stamp_ns, state.estimate
-        frame = SURVEY if state.frozen is None else MAP
         found = [
             Shown(
                 "/survey/landmarks",
                 stamp_ns,
-                lambda: points(stamp_ns, _from_above(state.landmarks()), "/survey/landmarks", frame),
+                lambda: points(stamp_ns, _from_above(state.landmarks()), "/survey/landmarks", SURVEY),
             ),
-            Shown("/survey/path", stamp_ns, lambda: path(stamp_ns, _from_above(state.path()), "/survey/path", frame)),
-            Shown("/survey/revisits", stamp_ns, lambda: _revisits(stamp_ns, state.loop_lines(), frame)),
+            Shown("/survey/path", stamp_ns, lambda: path(stamp_ns, _from_above(state.path()), "/survey/path", SURVEY)),
+            Shown("/survey/revisits", stamp_ns, lambda: _revisits(stamp_ns, state.loop_lines())),
         ]
         status = (state.phase, state.words) if estimate is None else (estimate.status, estimate.cause)
         if status != self._status:
             self._status = status
             found.append(Shown("/log", stamp_ns, lambda: status_log(stamp_ns, state.recording, *status)))
         if estimate is not None:
-            found += self._placed(estimate, frame, state.recording)
+            found += self._placed(estimate, state.recording)
         return found
 
-    def _placed(self, estimate: EstimateMessage, frame: str, name: str) -> list[Shown]:
+    def _placed(self, estimate: EstimateMessage, name: str) -> list[Shown]:
         odom_from_base, stamp_ns = estimate.odom_from_base.target_from_source, estimate.stamp_ns
         joined, marks = [(ODOM, BASE, odom_from_base)], list[RobotMark]()
         if self._base_from_cam is not None:
             joined.append((BASE, CAMERA, self._base_from_cam))
         if estimate.map_from_odom is not None:
             map_from_odom = estimate.map_from_odom.target_from_source
-            joined.append((frame, ODOM, map_from_odom))
+            joined.append((SURVEY, ODOM, map_from_odom))
             marks.append(RobotMark(name, map_from_odom @ odom_from_base, estimate.status))
         return [
-            Shown("/survey/robot", stamp_ns, lambda: robots(stamp_ns, marks, "/survey/robot", frame)),
+            Shown("/survey/robot", stamp_ns, lambda: robots(stamp_ns, marks, "/survey/robot", SURVEY)),
             Shown("/tf", stamp_ns, lambda: links(stamp_ns, joined)),
         ]
 
@@ -331,7 +330,7 @@ def _from_above(rows: Array) -> Array:
     return np.column_stack([rows[:, :2], np.zeros(len(rows))])
 
 
-def _revisits(stamp_ns: int, ends_m: Array, frame: str) -> ChannelMessage:
+def _revisits(stamp_ns: int, ends_m: Array) -> ChannelMessage:
     corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
     line = LinePrimitive(
         type=LinePrimitiveLineType.LineList,
@@ -341,7 +340,7 @@ def _revisits(stamp_ns: int, ends_m: Array, frame: str) -> ChannelMessage:
         points=corners,
         color=_colour(_WARN),
     )
-    scene = _scene(stamp_ns, [_entity(stamp_ns, frame, "revisits", lines=[line])])
+    scene = _scene(stamp_ns, [_entity(stamp_ns, SURVEY, "revisits", lines=[line])])
     return ChannelMessage("/survey/revisits", stamp_ns, scene)
 
 

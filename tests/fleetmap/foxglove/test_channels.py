@@ -160,8 +160,6 @@ def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
     assert links == {("survey", "odom"), ("odom", "base_link"), ("base_link", "camera")}
     again = [shown.topic for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))]
     assert "/log" not in again, "its status is the same"
-    frozen = {shown.topic: shown.make() for shown in told.shown(LiveSurveyState(**plain, estimate=estimate, frozen=3))}
-    assert decoded(frozen["/survey/landmarks"]).frame_id == "map"
     lost = told.shown(LiveSurveyState(**plain))
     assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
 

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from fleetmap.bus import ZenohBus
-from fleetmap.live_survey import LiveFinding, LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
+from fleetmap.live_survey import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving, watch
@@ -57,7 +57,6 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
             ],
             cells=np.array([[0, 0, 300], [1, 0, 40]], "<f4").tobytes(),
             missing=[LiveMissing(x_m=7.0, y_m=0.0, heading="W", places=9)],
-            findings=[LiveFinding(name="sharpness", verdict="warn", words="blurred", at_s=10.0)],
             estimate=EstimateMessage(
                 stamp_ns=5, status="DEGRADED", cause="odometry lost", map_version=None,
                 odom_from_base=Placement.of(np.eye(4)), map_from_odom=Placement.of(np.eye(4)),
@@ -72,7 +71,6 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
             "11.5°",
             "50 m²",
             "too few or too crowded",
-            "blurred",
             "scale is not known",
         ):
             expect(page.locator("body")).to_contain_text(words)

@@ -12,7 +12,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 import mapserver
-from fleetmap.errors import FleetmapError, LinkError, RecordingError, StateError, SurveyError, UsageError
+from fleetmap.errors import FleetmapError, LinkError, RecordingError, UsageError
 from fleetmap.live_survey import LiveSurveyState
 from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -22,10 +22,9 @@ from mapserver.cli import app
 from mapserver.commands import live as live_command
 from mapserver.config import survey_settings
 from mapserver.live import LiveRequest, RecordedDrive, SensorDrive, drives, live_survey, run_live
-from mapserver.store import DraftContent, MapStore
-from support.recordings.live_drives import MappingHere, played, write_rgbd
+from mapserver.store import MapStore
+from support.recordings.live_drives import MappingHere, write_rgbd
 from support.recordings.recording_samples import calibration, kalibr_text, write_euroc
-from support.storage.map_samples import draft_details
 from support.worlds import robot_world
 
 METRIC = [SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD, SensorSet.MONO_INERTIAL]
@@ -107,79 +106,19 @@ def test_live_and_build_take_one_configuration_file(
     assert by_live.use is kind
 
 
-@pytest.mark.parametrize("kind", METRIC)
-def test_every_metric_kind_is_localized_in_a_frozen_version(site: Site, tmp_path: Path, kind: SensorSet) -> None:
-    words = ("--config", configured(tmp_path, site, kind), "--map", site.version, "--frozen")
-    done = run("live", site.recording(kind), *words)
-    assert done.exit_code == 0, done.exception
-    after = MappingHere.made.after
-    placed = {
-        n: s.estimate for n, s in after.items() if s.estimate is not None and s.estimate.map_from_body is not None
-    }
-    assert f"{len(placed) / len(after):.0%} of them localized in the version" in done.stdout
-    assert len(placed) > 0.6 * len(after)
-    for number, estimate in placed.items():
-        assert np.linalg.norm(estimate.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]) < 0.02
-    with MapStore.open(site.store) as store:
-        assert [info.version for info in store.versions("lab")] == [site.version]
-
-
 def driven(
     site: Site,
     drive: RecordedDrive | SensorDrive,
     kind: SensorSet,
-    *,
-    frozen: int | None = None,
-    store: Path | None = None,
 ) -> list[LiveSurveyState]:
     told: list[LiveSurveyState] = []
-    request = LiveRequest("lab", store or site.store, survey_settings(None, kind), BuildOptions(), frozen)
+    request = LiveRequest("lab", site.store, survey_settings(None, kind))
     try:
         run_live(request, drive, told.append, lambda: False, QUIET)
     except FleetmapError:
         assert told[-1].phase == "failed"
         raise
     return told
-
-
-def test_one_camera_alone_has_no_metres_to_be_localized_with(site: Site, tmp_path: Path) -> None:
-    words = ("--config", configured(tmp_path, site, SensorSet.MONO), "--map", site.version, "--frozen")
-    done = run("live", site.pairs, *words)
-    assert isinstance(done.exception, UsageError)
-    assert "record" not in str(done.exception)
-    assert "localize with an IMU" in str(done.exception)
-
-
-def test_a_version_without_metres_is_not_localized_in(site: Site, tmp_path: Path) -> None:
-    with MapStore.open(tmp_path / "maps", create=True) as store:
-        details = draft_details(path_m=10.0, scale="unknown")
-        content = DraftContent(
-            tiles=list(robot_world.tiles()), vocabulary=robot_world.vocabulary(), details=details, archive=b"archive"
-        )
-        version = store.save_draft("lab", content)
-    with (
-        pytest.raises(StateError, match="a scale of its own"),
-        played(site.pairs, speed=0, use=SensorSet.STEREO) as drive,
-    ):
-        driven(site, drive, SensorSet.STEREO, frozen=version, store=tmp_path / "maps")
-
-
-def test_the_map_of_another_place_is_said_not_to_be_this_one(site: Site, tmp_path: Path) -> None:
-    """The room upside down is another one."""
-    sample = robot_world.cycle()
-    other = replace(
-        sample,
-        left=[np.ascontiguousarray(image[::-1]) for image in sample.left],
-        right=[np.ascontiguousarray(image[::-1]) for image in sample.right],
-    )
-    path = write_euroc(tmp_path / "other", other)
-    with (
-        pytest.raises(
-            SurveyError, match=r"none of \d+ keyframes was localized in version 1 of site lab; is it the map of"
-        ),
-        played(path, ":45", speed=0, use=SensorSet.STEREO) as drive,
-    ):
-        driven(site, drive, SensorSet.STEREO, frozen=site.version)
 
 
 def not_begun(*_: object) -> MappingHere:

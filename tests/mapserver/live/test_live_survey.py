@@ -1,5 +1,6 @@
 """A survey under way from end to end, on a small recording."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,6 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(
     assert last.estimate is not None
     assert last.estimate.status == "TRACKING"
     assert last.covered()[:, 2].sum() > 100
-    assert {finding.verdict for finding in last.findings} <= {"ok", "warn", "fail"}
     assert (last.path()[:, 2] > 0.5).all()
     assert len(last.landmarks()) > 100
 
@@ -124,13 +124,11 @@ def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path,
     assert not (tmp_path / "maps").exists()
 
 
-def test_a_version_that_is_not_there_is_refused_before_the_drive(recording: Path, tmp_path: Path) -> None:
-    MapStore.open(tmp_path / "maps", create=True).close()
-    with pytest.raises(FleetmapError, match="no site lab"), played(recording) as drive:
-        run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS, frozen=7), drive, print, lambda: False, QUIET)
-    said = CliRunner().invoke(app, ["live", str(recording), "--site", "lab", "--store", str(tmp_path), "--frozen"])
+@pytest.mark.parametrize("option", ["--frozen", "--map=7", "--ros2=tcp/127.0.0.1:1"])
+def test_an_option_that_is_gone_names_what_replaces_it(recording: Path, tmp_path: Path, option: str) -> None:
+    said = CliRunner().invoke(app, ["live", str(recording), "--site", "lab", "--store", str(tmp_path), option])
     assert isinstance(said.exception, UsageError)
-    assert "--map VERSION --frozen" in str(said.exception)
+    assert re.match("--(frozen|map|ros2) is gone: .*(locclient replay|--foxglove)", str(said.exception))
 
 
 @pytest.mark.usefixtures("ordered")

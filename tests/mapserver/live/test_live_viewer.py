@@ -14,12 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
-from fleetmap.geometry import rotation_from_quat_wxyz, se3
 from mapserver.cli import app
-from mapserver.store import MapStore
 from support.fleet.foxglove_client import FoxgloveClient
 from support.recordings.recording_samples import make_sample, write_euroc
-from support.worlds import robot_world
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -67,28 +64,6 @@ def test_the_map_grows_before_the_viewers_eyes(tmp_path: Path) -> None:
             path = viewer.wait_for("/survey/path", len(viewer.messages["/survey/path"]) + 1)[-1][1]
         assert path.frame_id == "survey"
         assert len(viewer.wait_for("/survey/landmarks")[-1][1].data) % 12 == 0
-
-
-def test_a_frozen_version_is_the_frame_of_what_is_seen(tmp_path: Path) -> None:
-    recording = write_euroc(tmp_path / "ride", robot_world.cycle())
-    with MapStore.open(tmp_path / "maps", create=True) as store:
-        version = robot_world.save(store, site="lab")
-    stamps = [int(stamp) for stamp in robot_world.cycle().stamps_ns]
-    with live(recording, tmp_path / "maps", "--map", str(version), "--frozen", "--frames", ":50") as viewer:
-        viewer.subscribe(["/tf"])
-        links = {}
-        while ("map", "odom") not in links:
-            stamp_ns, found = viewer.wait_for("/tf", len(viewer.messages.get("/tf", [])) + 1)[-1]
-            links = {(link.parent_frame_id, link.child_frame_id): link for link in found.transforms}
-        map_from_odom, odom_from_base = (
-            se3(
-                rotation_from_quat_wxyz(np.array([link.rotation.w, link.rotation.x, link.rotation.y, link.rotation.z])),
-                np.array([link.translation.x, link.translation.y, link.translation.z]),
-            )
-            for link in (links["map", "odom"], links["odom", "base_link"])
-        )
-        map_from_base = map_from_odom @ odom_from_base
-        assert np.linalg.norm(map_from_base[:3, 3] - robot_world.truth(stamps.index(stamp_ns))[:3, 3]) < 0.05
 
 
 @pytest.mark.parametrize(("given", "words"), [("x", "8765"), ("0.0.0.0:0", "--insecure"), ("TAKEN", "cannot listen")])

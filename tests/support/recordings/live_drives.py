@@ -14,8 +14,10 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
 from mapserver.build.survey_recordings import RecordingOptions
 from mapserver.live import RecordedDrive
-from mapserver.live.mapping_process import NO_SKETCH, MakeMap, MapSketch, sketch_of
+from mapserver.live.mapping_process import NO_SKETCH, MapSketch, sketch_of
+from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveRig, NewKeyframe
+from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, calibration
 from support.worlds.box_room import points_seen
 
@@ -27,8 +29,14 @@ class MappingHere:
 
     made: "MappingHere"
 
-    def __init__(self, make: MakeMap, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
-        self._map, self.sketch, self.behind, self.failed, self.longest_lag_s = make(), NO_SKETCH, 0, "", 0.0
+    def __init__(self, config: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+        self._map, self.sketch, self.behind, self.failed, self.longest_lag_s = (
+            LiveMap(config, rig),
+            NO_SKETCH,
+            0,
+            "",
+            0.0,
+        )
         self.after: dict[int, MapSketch] = {}  # by frame
         MappingHere.made = self
 
@@ -38,7 +46,7 @@ class MappingHere:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe, stamps_ns: list[int]) -> None:
+    def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
         """One more keyframe."""
         self._map.add(frame, keyframe)
         self.sketch = self.after[keyframe.number] = sketch_of(self._map)

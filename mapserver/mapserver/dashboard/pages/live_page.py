@@ -23,7 +23,6 @@ _PHASES = {
     "tracking": ("warn", "The survey drives."),
     "adjusting": ("warn", "The drive is over; the finished map is made."),
     "stored": ("good", "The finished map is stored as a draft."),
-    "localized": ("good", "The drive is over; nothing was mapped."),
     "failed": ("bad", "No map could be made of it."),
 }
 
@@ -84,7 +83,7 @@ def _after(survey: LiveSurvey | None) -> Markup:
     """What stands below the map."""
     if survey is None:
         return Markup("")
-    return joined([_estimate(survey), _missing(survey), _revisits(survey), _refused(survey), _findings(survey)])
+    return joined([_estimate(survey), _missing(survey), _revisits(survey), _refused(survey)])
 
 
 def _phase(context: PageContext, survey: LiveSurvey) -> Markup:
@@ -124,10 +123,9 @@ def _figures(survey: LiveSurvey) -> Markup:
 def _where(survey: LiveSurvey) -> Figure:
     """Status and accuracy of the newest keyframe."""
     estimate = survey.state.estimate
-    inside = "this map" if survey.state.frozen is None else f"version {survey.state.frozen}"
     if estimate is None:
-        return Figure("Localization", "–", f"in {inside}")
-    return Figure("Localization", estimate.status, f"in {inside}, {_sigma(survey) or 'place unknown'}")
+        return Figure("Localization", "–", "in this map")
+    return Figure("Localization", estimate.status, f"in this map, {_sigma(survey) or 'place unknown'}")
 
 
 def _sigma(survey: LiveSurvey) -> str:
@@ -193,20 +191,6 @@ def _revisits(survey: LiveSurvey) -> Markup:
         return Markup("")
     head = ("at", "looks like", "", "matches", "why")
     return joined([Markup("<h2>Newest revisits</h2>"), table(head, rows, empty="", name="Newest revisits")])
-
-
-def _findings(survey: LiveSurvey) -> Markup:
-    tones = {"ok": "good", "warn": "warn"}
-    rows = [
-        (f.name, badge(tones.get(f.verdict, "bad"), f.verdict), f.words, f"{f.at_s:.0f} s")
-        for f in survey.state.findings
-    ]
-    if not rows:
-        return Markup("")
-    head = ("check", "", "found", "at")
-    return joined(
-        [Markup("<h2>The doctor, while it drives</h2>"), table(head, rows, empty="", name="Findings of the doctor")]
-    )
 
 
 def _parts(survey: LiveSurvey) -> Markup:

@@ -20,7 +20,6 @@ UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 _ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
 _IMU_DOUBLES = 37
 _SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand, and no rotation any more
-_FLOAT32, _POINT_BYTES = 7, 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,23 +268,6 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     for link in links:
         writer.header(stamp_ns, link.parent).text(link.child).doubles(_position_quat_xyzw(link.parent_from_child))
     return writer.message()
-
-
-def encode_path(stamp_ns: int, frame_id: str, places: Array) -> bytes:
-    """nav_msgs/Path through places (N, 3), which say nothing of direction."""
-    writer, ahead = CdrWriter().header(stamp_ns, frame_id).unsigned(len(places)), np.array([0.0, 0.0, 0.0, 1.0])
-    for place in places:
-        writer.header(stamp_ns, frame_id).doubles(np.concatenate([place, ahead]))
-    return writer.message()
-
-
-def encode_points(stamp_ns: int, frame_id: str, points: Array) -> bytes:
-    """sensor_msgs/PointCloud2 of points (N, 3) as float32."""
-    writer = CdrWriter().header(stamp_ns, frame_id).unsigned(1).unsigned(len(points)).unsigned(3)
-    for number, name in enumerate("xyz"):
-        writer.text(name).unsigned(4 * number).byte(_FLOAT32).unsigned(1)
-    data = np.ascontiguousarray(points, "<f4").tobytes()
-    return writer.byte(0).unsigned(_POINT_BYTES).unsigned(len(data)).blob(data).byte(1).message()
 
 
 def encode_text(text: str) -> bytes:
