@@ -71,7 +71,7 @@ class PlaybackOptions:
     ] = False
     foxglove: Annotated[
         str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Let Foxglove play and scrub the run there, until Ctrl-C."),
+        typer.Option(metavar="[HOST:]PORT", help="Show the run in Foxglove there; --realtime at its own speed."),
     ] = None
 
 
@@ -163,10 +163,8 @@ def _run(
                 write_tum(files.trajectory, result.trajectory)
             if files.picture is not None:
                 result.save_picture(files.picture)
-            if viewer is not None:
-                viewer.timeline.finish()
-                if files.mcap is not None:
-                    viewer.write_mcap(files.mcap)
+            if viewer is not None and files.mcap is not None:
+                viewer.write_mcap(files.mcap)
             _print_table(report)
     if result.search.is_lost_run:
         typer.echo(result.search.words, err=True)
@@ -185,33 +183,24 @@ def _viewer_address(playback: PlaybackOptions, files: ResultFiles, *, insecure: 
 
 @contextmanager
 def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: bool) -> "Iterator[RunViewer | None]":
-    """What shows a replay, None where nobody wants it; with an address the block's end waits until the viewers' user is done."""
+    """What shows a replay, None where nobody wants it."""
     if at is None and not is_wanted:
         yield None
         return
-    import signal
-    import threading
-
     import numpy as np
 
-    from fleetmap.foxglove.playback import Player
     from fleetmap.foxglove.server import FoxgloveServer
     from locclient.replay.run_viewer import RunViewer
 
     recording = source.recording
     with recording.part(np.arange(len(recording))) as images:
-        viewer = RunViewer(replace(source, recording=images))
+        played = replace(source, recording=images)
         if at is None:
-            yield viewer
+            yield RunViewer(played)
             return
-        with FoxgloveServer(at, recording.name, Player(viewer.timeline)) as server:
+        with FoxgloveServer(at, recording.name) as server:
             typer.echo(f"foxglove: {server.url}")
-            yield viewer
-            done = threading.Event()
-            for number in (signal.SIGTERM, signal.SIGINT):
-                signal.signal(number, lambda *_: done.set())
-            typer.echo("the run can be played and scrubbed in Foxglove; Ctrl-C ends")
-            done.wait()
+            yield RunViewer(played, server.show)
 
 
 def _print_table(report: dict[str, Any]) -> None:

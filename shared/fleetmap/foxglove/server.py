@@ -2,31 +2,19 @@
 
 import logging
 import threading
-import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable
 from typing import Self
 
 import foxglove
 from foxglove import Channel, Context
-from foxglove.websocket import (
-    Capability,
-    ChannelView,
-    Client,
-    PlaybackCommand,
-    PlaybackControlRequest,
-    PlaybackState,
-    PlaybackStatus,
-    ServerListener,
-)
+from foxglove.websocket import ChannelView, Client, ServerListener
 
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.foxglove import ViewerAddress
 from fleetmap.foxglove.channels import CHANNELS, Shown, encoding_of
-from fleetmap.foxglove.playback import PlaybackPhase, PlaybackPoint, Player
 from fleetmap.log_lines import LogLimit
 
-_STEP_S = 0.02
 _WAITING = 32  # messages of a topic that nobody has encoded yet
 _BACKLOG = 256  # encoded messages that wait for one viewer; the library drops the oldest
 _STOP_WITHIN_S = 1.0
@@ -39,10 +27,9 @@ class FoxgloveServer:
     A new viewer gets the last message of each topic. dropped: messages that came too quickly to be encoded.
     """
 
-    def __init__(self, address: ViewerAddress, name: str, player: Player | None = None) -> None:
-        """name: shown by viewers. player: what they play, pause and scrub. Raises UsageError where nothing can listen there."""
+    def __init__(self, address: ViewerAddress, name: str) -> None:
+        """name: shown by viewers. Raises UsageError where nothing can listen there."""
         self.dropped = 0
-        self._player = player
         self._context = Context()
         # All before anybody connects: who subscribes at once to a channel that is made later may be told that there is none.
         self._channels = {
@@ -54,14 +41,11 @@ class FoxgloveServer:
         self._subscribed: deque[str] = deque()  # without a lock: the library calls while it holds its own
         self._lock, self._wake, self._ended = threading.Lock(), threading.Event(), False
         self._faults = LogLimit(_log)
-        timeline = None if player is None else player.timeline
         try:
             self._server = foxglove.start_server(
                 name=name,
                 host=address.host,
                 port=address.port,
-                capabilities=[] if player is None else [Capability.PlaybackControl, Capability.Time],
-                playback_time_range=None if timeline is None else (timeline.first_ns, timeline.last_ns),
                 server_listener=_Listener(self),
                 message_backlog_size=_BACKLOG,
                 context=self._context,
@@ -107,23 +91,10 @@ class FoxgloveServer:
         self._subscribed.append(topic)
         self._wake.set()
 
-    def control(self, request: PlaybackControlRequest) -> PlaybackState | None:
-        """The state of playback that answers a viewer's request."""
-        if self._player is None:
-            return None
-        point = self._player.control(
-            plays=request.playback_command == PlaybackCommand.Play,
-            speed=request.playback_speed,
-            seek_ns=request.seek_time,
-        )
-        self._wake.set()
-        return _state(point, did_seek=request.seek_time is not None, request_id=request.request_id)
-
     def _serve(self) -> None:
         """Outside the library's callbacks, which must not publish."""
-        told: tuple[PlaybackPhase, float] | None = None
         while not self._ended:
-            self._wake.wait(None if self._player is None else _STEP_S)
+            self._wake.wait()
             self._wake.clear()
             topics = {self._subscribed.popleft() for _ in range(len(self._subscribed))}
             late = [self._last[topic] for topic in sorted(topics) if topic in self._last]
@@ -132,26 +103,6 @@ class FoxgloveServer:
                 self._waiting.clear()
             self._publish(late)
             self._publish(fresh)
-            if self._player is None:
-                continue
-            due = self._player.advance(time.monotonic())
-            self._publish(self._newest(due))
-            point = self._player.point
-            if due:
-                self._server.broadcast_time(point.at_ns)
-            if topics or (point.phase, point.speed) != told:
-                self._server.broadcast_playback_state(_state(point, did_seek=False, request_id=None))
-            told = point.phase, point.speed
-
-    def _newest(self, due: list[Shown]) -> list[Shown]:
-        """Of a topic no more than can wait: fast playback must not keep a viewer from stopping it."""
-        counts, kept = Counter[str](), list[Shown]()
-        for shown in reversed(due):
-            counts[shown.topic] += 1
-            if counts[shown.topic] <= _WAITING:
-                kept.append(shown)
-        self.dropped += len(due) - len(kept)
-        return kept[::-1]
 
     def _publish(self, some: Iterable[Shown]) -> None:
         for shown in some:
@@ -170,11 +121,6 @@ class FoxgloveServer:
             channel.log(message.data, log_time=max(0, message.stamp_ns))
 
 
-def _state(point: PlaybackPoint, *, did_seek: bool, request_id: str | None) -> PlaybackState:
-    status: PlaybackStatus = getattr(PlaybackStatus, point.phase.value)
-    return PlaybackState(status, point.at_ns, point.speed, did_seek, request_id)
-
-
 class _Listener(ServerListener):
     """What the library calls, from threads of its own."""
 
@@ -184,7 +130,3 @@ class _Listener(ServerListener):
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """See the library's ServerListener."""
         self._server.subscribed(channel.topic)
-
-    def on_playback_control_request(self, playback_control_request: PlaybackControlRequest) -> PlaybackState | None:
-        """See the library's ServerListener."""
-        return self._server.control(playback_control_request)

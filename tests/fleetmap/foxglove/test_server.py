@@ -13,12 +13,10 @@ import pytest
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.foxglove import ViewerAddress, channels
 from fleetmap.foxglove.channels import ChannelMessage, Shown
-from fleetmap.foxglove.playback import Player, Timeline
 from fleetmap.foxglove.server import FoxgloveServer
-from support.fleet.foxglove_client import ENDED, PAUSED, PLAYING, FoxgloveClient
+from support.fleet.foxglove_client import FoxgloveClient
 
 FREE = ViewerAddress("127.0.0.1", 0)
-S = 1_000_000_000
 POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 HANGING = """
 import json, os, signal, sys
@@ -156,33 +154,3 @@ def test_a_port_in_use_is_told_at_once(server: FoxgloveServer) -> None:
         FoxgloveServer(ViewerAddress("127.0.0.1", port), "hall")
     with pytest.raises(UsageError, match="cannot listen there"):
         FoxgloveServer(ViewerAddress("no.such.name.invalid", 0), "hall")
-
-
-def test_playback_is_the_viewers() -> None:
-    timeline = Timeline(10 * S, 30 * S)
-    timeline.add(Shown.now(channels.points(10 * S, POINTS)))
-    for number in range(201):
-        timeline.add(place(10 * S + number * S // 10))
-    timeline.finish()
-    with FoxgloveServer(FREE, "ride", Player(timeline)) as server, FoxgloveClient(server.url) as viewer:
-        assert set(viewer.info["capabilities"]) >= {"playbackControl", "time"}
-        assert viewer.info["dataStartTime"] == {"sec": 10, "nsec": 0}
-        assert viewer.info["dataEndTime"] == {"sec": 30, "nsec": 0}
-        viewer.subscribe(["/map", "/fixes"])
-        viewer.wait_for("/map")
-        assert viewer.wait_for("/fixes")[0][0] == 10 * S
-        assert viewer.wait_for_playback(PAUSED, 0).at_ns == 10 * S
-        told = viewer.control(play=False, seek_ns=25 * S + 1)
-        assert (told.status, told.at_ns, told.did_seek) == (PAUSED, 25 * S + 1, True)
-        viewer.wait_until("/fixes", 25 * S)  # who subscribes while a message goes out may get that message twice
-        count = len(viewer.messages["/fixes"])
-        viewer.read(0.3)
-        assert {stamp_ns for stamp_ns, _ in viewer.messages["/fixes"][count:]} <= {25 * S}, "it is paused"
-        count = len(viewer.messages["/fixes"])
-        assert viewer.control(play=True, seek_ns=12 * S).status == PLAYING
-        stamps_ns = [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", count + 6)[count:]]
-        assert stamps_ns == [12 * S + n * S // 10 for n in range(6)]
-        assert viewer.control(play=True, speed=50.0).speed == 50.0
-        assert viewer.wait_for_playback(ENDED).at_ns == 30 * S
-        viewer.wait_until("/fixes", 30 * S)  # states overtake messages
-        assert viewer.times_ns[-1] == 30 * S

@@ -6,7 +6,6 @@ import struct
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any, Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -15,19 +14,7 @@ from google.protobuf.message_factory import GetMessageClass
 from websockets.sync.client import connect
 
 PROTOCOL = "foxglove.sdk.v1"
-DATA, TIME, PLAYBACK = 1, 2, 5
-PLAYING, PAUSED, BUFFERING, ENDED = range(4)
-
-
-@dataclass(frozen=True)
-class Playback:
-    """A state of playback that the server told."""
-
-    status: int
-    at_ns: int
-    speed: float
-    did_seek: bool
-    request_id: str
+DATA = 1
 
 
 class FoxgloveClient:
@@ -44,8 +31,6 @@ class FoxgloveClient:
         self.channels: dict[str, dict[str, Any]] = {}
         self._topics: dict[int, str] = {}
         self.messages: dict[str, list[tuple[int, Any]]] = {}
-        self.playback: list[Playback] = []
-        self.times_ns: list[int] = []
         self._until(lambda: bool(self.info), "serverInfo")
 
     def __enter__(self) -> Self:
@@ -75,20 +60,6 @@ class FoxgloveClient:
         self._until(lambda: self.messages.get(topic, [(-1, None)])[-1][0] == stamp_ns, f"{topic} at {stamp_ns}")
         return self.messages[topic][-1][1]
 
-    def wait_for_playback(self, status: int, begin: int | None = None) -> Playback:
-        """The next state with this status, or that behind number `begin`."""
-        begin = len(self.playback) if begin is None else begin
-        self._until(lambda: any(p.status == status for p in self.playback[begin:]), f"playback {status}")
-        return next(p for p in self.playback[begin:] if p.status == status)
-
-    def control(self, *, play: bool, speed: float = 1.0, seek_ns: int | None = None) -> Playback:
-        """Plays, pauses or seeks; the server's answer."""
-        name = f"request-{time.monotonic_ns()}"
-        head = struct.pack("<BBfBQI", 3, 0 if play else 1, speed, seek_ns is not None, seek_ns or 0, len(name))
-        self._socket.send(head + name.encode())
-        self._until(lambda: any(p.request_id == name for p in self.playback), name)
-        return next(p for p in self.playback if p.request_id == name)
-
     def read(self, seconds: float) -> None:
         """Whatever comes in that time."""
         until_s = time.monotonic() + seconds
@@ -113,11 +84,6 @@ class FoxgloveClient:
             number, stamp_ns = struct.unpack_from("<IQ", data, 1)
             topic = self._topics[number]
             self.messages.setdefault(topic, []).append((stamp_ns, self._decoded(topic, data[13:])))
-        elif data[0] == TIME:
-            self.times_ns.append(struct.unpack_from("<Q", data, 1)[0])
-        elif data[0] == PLAYBACK:
-            status, at_ns, speed, did_seek, length = struct.unpack_from("<BQfBI", data, 1)
-            self.playback.append(Playback(status, at_ns, speed, bool(did_seek), data[19 : 19 + length].decode()))
 
     def _hear(self, said: dict[str, Any]) -> None:
         if said["op"] == "serverInfo":
