@@ -16,11 +16,16 @@ from fleetmap.errors import UsageError
 S = TypeVar("S", bound="Section")
 _MAX_FILE_BYTES = 1 << 20
 _IN_A_VERSION = "`locclient replay RECORDING --realtime --store DIR --version N` localizes a drive in a version"
+_OF_POSES = (
+    "`--trajectory FILE` knows TUM, KITTI and DROID's poses.npy by their content; evo_traj writes TUM of other formats, and "
+    "`--trajectory-frame camera|body` says whose poses they are"
+)
 RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "walls": "`mapserver align --pin` replaces it; delete the key",
     "frozen": _IN_A_VERSION,
     "map": _IN_A_VERSION,
+    **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},
     "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.

@@ -13,7 +13,6 @@ from benchmarks.survey import (
     bench_prepare,
     bench_real_pairs,
     bench_survey,
-    bench_trajectory,
 )
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
@@ -95,18 +94,3 @@ def test_prepare_leaves_no_kernel_to_a_build_or_a_replay() -> None:
     assert found["kernels"] > 100
     assert found["left out"] == []
     assert found["mapserver prepare again"]["cpu_s"] < 0.1 * found["mapserver prepare"]["cpu_s"]
-
-
-@pytest.mark.timeout(7200)
-@pytest.mark.parametrize("name", ["euroc_v101_keyframes", "small-loop"])
-def test_another_systems_poses_make_as_good_a_map(name: str, tmp_path: Path) -> None:
-    """Noisy truth written in every wrong way: found out or asked for, and at most a tenth above our own odometry's map."""
-    path = tmp_path / f"{name}.mcap"
-    if name == "small-loop":
-        record_order(Order(name, seed=1, robot="survey"), path, "mcap")
-    else:
-        path = real_data(name)
-    rows = bench_trajectory.bench(path)
-    bench_trajectory.show(rows)
-    assert len(rows) == 1 + len(bench_trajectory.CASES)
-    assert max(row.ratio for row in rows) <= bench_trajectory.RATIO_LIMIT

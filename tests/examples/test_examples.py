@@ -8,13 +8,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from fleetmap import open_recording, read_tum
-from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import format_calibration
-from fleetmap.recordings.tum import format_stamp
 from fleetsim import Order, record_order
 from mapserver import open_store
 from mapserver.fleet_statistics.kpis import Counters, hour_of
@@ -96,22 +93,6 @@ def test_fleet_figures(site: Path, tmp_path: Path) -> None:
     said = run("fleet_figures", tmp_path, "maps", "lab")
     assert "lab, version 1, last 24 h:    16.0 h, 2.00 failures a day" in said
     assert "robot    tug-7" in said
-
-
-def test_other_trajectory(site: Path, tmp_path: Path) -> None:
-    """The true poses on the floor, in a frame that is turned and moved."""
-    with open_recording(site / "survey.mcap") as recording:
-        truth = recording.ground_truth
-    assert truth is not None
-    other_from_map = se3(so3_exp(np.array([0.0, 0.0, 1.0])), np.array([5.0, -3.0, 1.0]))
-    rows = []
-    for stamp, other_from_body in zip(truth.stamps_ns.tolist(), other_from_map @ truth.frame_from_body, strict=True):
-        (x, y), yaw = other_from_body[:2, 3], np.arctan2(other_from_body[1, 0], other_from_body[0, 0])
-        rows.append(f"{format_stamp(stamp)},{x},{y},{yaw}")
-    (tmp_path / "poses.csv").write_text("\n".join(rows))
-    said = run("other_trajectory", tmp_path, site / "survey.mcap", "poses.csv", "maps", "lab")
-    assert "site lab: draft 1 of " in said
-    assert float(said.partition("ATE ")[2].split()[0]) < 0.02
 
 
 def test_first_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -371,7 +371,7 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
     options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
-    given: dict[str, Any] = {} if options.trajectory is None else {"trajectory_format": options.trajectory.format}
+    given: dict[str, Any] = {} if options.trajectory is None else {"trajectory": options.trajectory.file.name}
     if parent is not None and (trusted := parent.manifest.configuration.get(TRUSTED_KEY)):
         given[TRUSTED_KEY] = trusted
     topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}

@@ -36,7 +36,6 @@ from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import Joined, chained
 from mapserver.survey.pipeline import Survey, survey
-from mapserver.survey.settings import for_depths
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 _log = logging.getLogger(__name__)
@@ -273,8 +272,7 @@ def survey_recording(
         else:
             known = []
             rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-            own = replace(options, settings=for_depths(options.settings, recording.depth_sigma_px))
-            done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), own, tools)
+            done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), options, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),

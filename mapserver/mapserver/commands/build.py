@@ -44,39 +44,23 @@ class GivenTrajectoryOptions:
     trajectory: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system to begin with.")
     ] = None
-    trajectory_format: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Their format, such as tum or kitti.")
-    ] = None
     trajectory_frame: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` or of the `body`.")
-    ] = None
-    trajectory_direction: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The transform written: `map-from-pose` or `pose-from-map`.")
-    ] = None
-    trajectory_quaternion: Annotated[str | None, typer.Option(metavar="ORDER", help="`xyzw` or `wxyz`.")] = None
-    trajectory_stamps: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="`s`, `ms`, `us`, `ns`, `elapsed-s` or `frames`.")
+        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
     ] = None
     trajectory_scale: Annotated[
         float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
     ] = None
 
     def given(self) -> "OtherTrajectory | None":
-        """The trajectory that is named, None without one; UsageError for an incomplete name."""
-        from mapserver.build.trajectory import TRAJECTORY_FORMATS, OtherTrajectory
+        """The trajectory that is named, None without one; UsageError for options that say something of none."""
+        from mapserver.build.trajectory import OtherTrajectory
 
         if self.trajectory is None:
             said = [name for name, value in vars(self).items() if value is not None]
             if said:
                 raise UsageError(f"--{said[0].replace('_', '-')} says something of --trajectory FILE, which is missing")
             return None
-        if self.trajectory_format is None:
-            raise UsageError(
-                f"--trajectory {self.trajectory} is read; name its --trajectory-format, one of {', '.join(TRAJECTORY_FORMATS)}; the poses "
-                "of the map are written with --trajectory-out"
-            )
-        known = {name.removeprefix("trajectory_"): value for name, value in vars(self).items() if name != "trajectory"}
-        return OtherTrajectory(self.trajectory, **known)
+        return OtherTrajectory(self.trajectory, self.trajectory_frame or "camera", self.trajectory_scale)
 
 
 @expand_options

@@ -2,8 +2,6 @@
 
 from typing import Literal
 
-import msgspec
-
 from fleetmap.config import Section
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.odometry import OdometrySettings
@@ -179,11 +177,3 @@ class SurveySettings(Section, frozen=True):
     min_observations: int = 2  # keyframes that must see a landmark
     # Odometry's sigma across a blackout up to which components are joined; else the largest one is the map
     join_sigma_m: float = 0.1
-
-
-def for_depths(settings: SurveySettings, depth_sigma_px: float | None) -> SurveySettings:
-    """The settings for a recording whose depths no sensor measured: at best as good as those of one. Unchanged for None."""
-    if depth_sigma_px is None:
-        return settings
-    sigma_px = max(depth_sigma_px, settings.stereo.depth_sigma_px)
-    return msgspec.structs.replace(settings, stereo=msgspec.structs.replace(settings.stereo, depth_sigma_px=sigma_px))

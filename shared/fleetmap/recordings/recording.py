@@ -73,7 +73,7 @@ class Recording:
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
     samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
     in issues). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
-    refers to without one). issues: what could not be read. depth_sigma_px: of depths that no sensor measured, None for those of one.
+    refers to without one). issues: what could not be read.
     """
 
     path: Path
@@ -88,7 +88,6 @@ class Recording:
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
     issues: tuple[DataIssue, ...] = ()
-    depth_sigma_px: float | None = None
 
     def __len__(self) -> int:
         return len(self.frame_stamps_ns)

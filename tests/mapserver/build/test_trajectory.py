@@ -1,7 +1,6 @@
-"""Poses of another SLAM system: each wrong reading of noisy truth is found out or asked for, those of another recording are refused."""
+"""Poses of another SLAM system: noisy truth in a wrong convention, and poses of another recording, are refused."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import BuildOptions, build_map
 from mapserver.build.sensor_subset import reduced
-from mapserver.build.trajectory import TRAJECTORY_FORMATS, GivenPoses, OtherTrajectory, given_poses
+from mapserver.build.trajectory import GivenPoses, OtherTrajectory, given_poses
 from mapserver.build.trajectory import given as given_module
 from mapserver.build.trajectory.readings import Followed, fitted_scale
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
@@ -98,41 +97,54 @@ def off_m(found: GivenPoses, sample: Sample) -> float:
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
-@pytest.mark.parametrize("camera", [False, True])
-@pytest.mark.parametrize("inverse", [False, True])
-@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
-def test_frame_direction_and_order_are_found(
-    sample: Sample, recording: Path, tmp_path: Path, use: SensorSet | None, camera: bool, inverse: bool, order: str
+@pytest.mark.parametrize("frame", ["camera", "body"])
+@pytest.mark.parametrize(
+    ("wrong", "instead"),
+    [
+        ({}, ""),
+        ({"camera": None}, "say --trajectory-frame"),
+        ({"inverse": True}, "write map_from_pose, the inverse of each pose"),
+        ({"order": "wxyz"}, "write quaternions as x y z w"),
+    ],
+)
+def test_a_wrong_convention_is_refused_with_the_one_that_fits(
+    sample: Sample,
+    recording: Path,
+    tmp_path: Path,
+    use: SensorSet | None,
+    frame: str,
+    wrong: dict[str, Any],
+    instead: str,
 ) -> None:
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=camera, inverse=inverse, order=order)
-    found = given(recording, OtherTrajectory(file, "tum"), use)
-    frame, direction = "camera" if camera else "body", "pose-from-map" if inverse else "map-from-pose"
-    assert f"poses of the {frame}, {direction}, quaternions {order}, stamps in s, scale 1:" in found.words
-    assert off_m(found, sample) < 0.02
+    convention = {"camera": frame == "camera"} | wrong
+    if wrong == {"camera": None}:
+        convention, instead = {"camera": frame == "body"}, f"{instead} {'camera' if frame == 'body' else 'body'}"
+    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), **convention)
+    if instead:
+        with pytest.raises(RecordingError, match=f"does not fit ride as poses of the {frame}: .*; {instead}$"):
+            given(recording, OtherTrajectory(file, frame), use)
+    else:
+        found = given(recording, OtherTrajectory(file, frame), use)
+        assert f"trajectory p.tum (TUM): poses of the {frame}, scale 1:" in found.words
+        assert off_m(found, sample) < 0.02
 
 
 @pytest.mark.parametrize(
-    ("unit", "stamp"),
-    [
-        ("ns", str),
-        ("ns", lambda ns: f"{ns}.000000"),
-        ("us", lambda ns: f"{ns / 1000:.3f}"),
-        ("ms", lambda ns: f"{ns / 10**6:.4f}"),
-        ("elapsed-s", lambda ns: f"{(ns - START_NS) / 10**9:.7f}"),
-        ("frames", lambda ns: str(round((ns - START_NS) / 10**8))),
-    ],
+    "stamp",
+    [lambda ns: f"{(ns - START_NS) / 10**9:.7f}", lambda ns: f"{(ns - START_NS) / 10**8:.1f}"],
+    ids=["elapsed", "frames"],
 )
-def test_the_unit_of_stamps_is_found(sample: Sample, recording: Path, tmp_path: Path, unit: str, stamp: object) -> None:
-    stamps = [stamp(ns) for ns in sample.stamps_ns.tolist()]  # type: ignore[operator]
-    found = given(recording, OtherTrajectory(written(tmp_path / "p.csv", drifted(sample), stamps), "okvis2"))
-    assert f"stamps in {unit}," in found.words
-    assert off_m(found, sample) < 0.02
+def test_stamps_of_mast3r_and_dpv_slam_are_read(sample: Sample, recording: Path, tmp_path: Path, stamp: Any) -> None:
+    """Seconds since the first frame, and numbers of frames."""
+    stamps = [stamp(ns) for ns in sample.stamps_ns.tolist()]
+    file = written(tmp_path / "p.txt", drifted(sample), stamps, camera=True)
+    assert off_m(given(recording, OtherTrajectory(file)), sample) < 0.02
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.3])
 def test_the_scale_is_found(sample: Sample, recording: Path, tmp_path: Path, scale: float) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=scale)
-    found = given(recording, OtherTrajectory(file, "mast3r"))
+    found = given(recording, OtherTrajectory(file))
     said = float(found.words.partition("scale ")[2].partition(":")[0])
     assert said * scale == pytest.approx(1.0, rel=0.02)
     assert off_m(found, sample) < 0.03
@@ -155,15 +167,15 @@ def test_noise_of_neither_side_passes_for_another_scale(noise_m: float, own_nois
 def test_kitti_and_droid_are_read(sample: Sample, recording: Path, tmp_path: Path) -> None:
     map_from_cam = drifted(sample) @ BODY_FROM_CAM0
     np.savetxt(tmp_path / "p.txt", map_from_cam[:, :3].reshape(-1, 12))
-    assert off_m(given(recording, OtherTrajectory(tmp_path / "p.txt", "kitti")), sample) < 0.02
+    assert off_m(given(recording, OtherTrajectory(tmp_path / "p.txt")), sample) < 0.02
     rows = []
     for cam_from_map in se3_inverse(map_from_cam):
         w, x, y, z = quat_wxyz_from_rotation(cam_from_map[:3, :3])
         rows.append([*cam_from_map[:3, 3], x, y, z, w])
     np.save(tmp_path / "poses.npy", np.array(rows, np.float32)[::2])
     np.save(tmp_path / "tstamps.npy", np.arange(0, FRAMES, 2, np.float64))
-    found = given(recording, OtherTrajectory(tmp_path, "droid"))
-    assert "poses of the camera, pose-from-map, quaternions xyzw, stamps in frames" in found.words
+    found = given(recording, OtherTrajectory(tmp_path))
+    assert "(DROID): poses of the camera" in found.words
     assert off_m(found, sample) < 0.02
 
 
@@ -174,50 +186,19 @@ def test_missing_poses_are_bridged_by_our_odometry(
     """Every third one, a second in the middle, and both ends."""
     kept = [k for k in range(3, FRAMES - 4) if k % 3 and not 25 <= k < 36]
     stamps = np.array(in_seconds(sample))[kept].tolist()
-    found = given(recording, OtherTrajectory(written(tmp_path / "p.tum", drifted(sample)[kept], stamps), "tum"), use)
+    found = given(recording, OtherTrajectory(written(tmp_path / "p.tum", drifted(sample)[kept], stamps), "body"), use)
     assert "21 of 61 frames without a pose are bridged by our own odometry" in found.words
     assert len(found.trajectory) == FRAMES
     assert off_m(found, sample) < 0.03
 
 
-def test_rows_in_any_order_are_sorted(sample: Sample, recording: Path, tmp_path: Path) -> None:
-    shuffled = np.random.default_rng(1).permutation(FRAMES)
-    stamps = np.array(in_seconds(sample))[shuffled].tolist()
-    found = given(recording, OtherTrajectory(written(tmp_path / "p.tum", drifted(sample)[shuffled], stamps), "tum"))
-    assert off_m(found, sample) < 0.02
-
-
-def test_what_the_motion_does_not_tell_is_asked_for(tmp_path: Path) -> None:
-    """Standing still tells nothing; what is then said is taken, and nothing less."""
-    still = replace(ride_sample(lambda _: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.zeros(3)), 20, 0.1))
+def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
+    still = ride_sample(lambda _: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.zeros(3)), 20, 0.1)
     folder = write_euroc(tmp_path / "still", still)
     file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
-    with pytest.raises(UsageError) as asked:
-        given(folder, OtherTrajectory(file, "tum"), frames=20)
-    for option in (
-        "frame camera|body",
-        "direction map-from-pose|pose-from-map",
-        "quaternion xyzw|wxyz",
-        "scale METRES",
-    ):
-        assert f"--trajectory-{option}" in str(asked.value)
-    known = OtherTrajectory(file, "tum", "body", "map-from-pose", "xyzw", scale=1.0)
-    assert "as said" in given(folder, known, frames=20).words
-
-
-def test_a_straight_line_leaves_scale_told_and_asks_only_for_the_rest(tmp_path: Path) -> None:
-    """Sideways without a turn: quaternions of a camera and a body whose axes agree differ by nothing but a lever arm."""
-    slide = ride_sample(
-        lambda t: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.array([0.4 * max(t, 0) - 1.2, 0.6, 0.0])), 50, 0.1
-    )
-    folder = write_euroc(tmp_path / "slide", slide)
-    file = written(tmp_path / "p.tum", np.array(slide.world_from_body), in_seconds(slide), scale=2.0)
-    try:
-        found = given(folder, OtherTrajectory(file, "tum"), frames=50)
-    except UsageError as asked:
-        assert "--trajectory-scale" not in str(asked)
-    else:
-        assert off_m(found, slide) < 0.03
+    with pytest.raises(UsageError, match="say its metres with --trajectory-scale METRES"):
+        given(folder, OtherTrajectory(file, "body"), frames=20)
+    assert "as said" in given(folder, OtherTrajectory(file, "body", scale=1.0), frames=20).words
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
@@ -227,10 +208,10 @@ def test_poses_of_another_recording_are_refused(
     other = ride_sample(out_and_back(3.5, yaw_rad=0.3), FRAMES, 0.1, begin_s=0.4)
     file = written(tmp_path / "p.tum", np.array(other.world_from_body), in_seconds(sample))
     with pytest.raises(RecordingError, match=r"another recording: .* off by \d+ % of"):
-        given(recording, OtherTrajectory(file, "tum"), use)
+        given(recording, OtherTrajectory(file, "body"), use)
     late = [f"{stamp / 10**9 + 3600:.6f}" for stamp in sample.stamps_ns.tolist()]
-    with pytest.raises(RecordingError, match="another recording: in no unit"):
-        given(recording, OtherTrajectory(written(tmp_path / "q.tum", drifted(sample), late), "tum"), use)
+    with pytest.raises(RecordingError, match="another recording: of its 61 poses"):
+        given(recording, OtherTrajectory(written(tmp_path / "q.tum", drifted(sample), late), "body"), use)
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
@@ -245,14 +226,14 @@ def test_a_build_from_poses_makes_a_map_of_them(
         return poses_as_odometry(given, *rest)
 
     monkeypatch.setattr("mapserver.survey.chain.poses_as_odometry", begun)
-    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, inverse=True, scale=0.1)
-    options = BuildOptions(use=use, trajectory=OtherTrajectory(file, "stella"), threads=1)
+    file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=0.1)
+    options = BuildOptions(use=use, trajectory=OtherTrajectory(file), threads=1)
     done = build_map(recording, tmp_path / "maps", "hall", options)
     assert done.report["ate_rmse_m"] < 0.02
     assert done.report["keyframes"] > 5
     assert begun_with == [FRAMES]
-    (said,) = [words for words in done.report["findings"]["ride"] if words.startswith("trajectory p.tum (stella)")]
-    assert "poses of the camera, pose-from-map" in said
+    (said,) = [words for words in done.report["findings"]["ride"] if words.startswith("trajectory p.tum (TUM)")]
+    assert "poses of the camera" in said
     up = done.trajectory.frame_from_body[:, 2, :3]
     true_up = np.array(sample.world_from_body)[:, 2, :3]
     assert np.arccos(np.clip(np.einsum("fi,fi->f", up, true_up), -1, 1)).max() < 0.01
@@ -263,7 +244,7 @@ def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, rec
     rng = np.random.default_rng(4)
     noisy = [drift @ se3_exp(rng.normal(0, [3e-3] * 3 + [0.04] * 3)) for drift in drifted(sample)]
     file = written(tmp_path / "p.tum", np.array(noisy), in_seconds(sample))
-    options = BuildOptions(use=SensorSet.STEREO, trajectory=OtherTrajectory(file, "tum"), threads=1)
+    options = BuildOptions(use=SensorSet.STEREO, trajectory=OtherTrajectory(file, "body"), threads=1)
     done = build_map(recording, tmp_path / "maps", "hall", options)
     assert done.report["keyframes"] < FRAMES / 2
     assert done.report["ate_rmse_m"] < 0.02
@@ -272,29 +253,27 @@ def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, rec
 def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp_path: Path) -> None:
     write_tum(tmp_path / "half.tum", Trajectory(sample.stamps_ns[:28], drifted(sample)[:28]))
     with pytest.raises(UsageError, match=r"no pose for 33 of 61 frames of ride: \d+\.\d{9}, .* --frames"):
-        given(recording, OtherTrajectory(tmp_path / "half.tum", "tum"))
-    assert len(given(recording, OtherTrajectory(tmp_path / "half.tum", "tum"), frames=28).trajectory) == 28
+        given(recording, OtherTrajectory(tmp_path / "half.tum", "body"))
+    assert len(given(recording, OtherTrajectory(tmp_path / "half.tum", "body"), frames=28).trajectory) == 28
 
 
 @pytest.mark.parametrize(
-    ("content", "kind", "said"),
+    ("content", "said"),
     [
-        ("", "tum", "no poses"),
-        ("1 2 3\n", "tum", "line 1 has 3 numbers, 8 are expected"),
-        ("1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", "tum", "pose 2 is none"),
-        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 3\n", "tum", "pose 2 is none"),
-        ("inf 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", "tum", "is no time"),
-        ("1 0 0 0 0 0 0 1\n1 0 x 0 0 0 0 1\n", "tum", "line 2: '1 0 x"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n", "kitti", "pose 2 is none"),
-        ("\udcff", "tum", "not a text file"),
+        ("", "holds 0 poses"),
+        ("1 2 3\n", "line 1: '1 2 3' is not 't x y z qx qy qz qw'"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", "line 2.*NaN"),
+        ("1 0 0 0 0 0 0 1\n2 1e13 0 0 0 0 0 1\n", "pose 2 is at"),
+        ("1403636579763555584 0 0 0 0 0 0 1\n", "looks like ns; write seconds"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n", "pose 2 has no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0\n", "each line is to have twelve numbers"),
+        ("\udcff", "not a text file"),
     ],
 )
-def test_files_that_are_no_poses_are_refused(
-    recording: Path, tmp_path: Path, content: str, kind: str, said: str
-) -> None:
+def test_files_that_are_no_poses_are_refused(recording: Path, tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "p.txt").write_bytes(content.encode("utf-8", "surrogateescape"))
     with pytest.raises(RecordingError, match=said):
-        given(recording, OtherTrajectory(tmp_path / "p.txt", kind))
+        given(recording, OtherTrajectory(tmp_path / "p.txt"))
 
 
 def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -> None:
@@ -309,23 +288,21 @@ def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -
     ):
         np.save(file, array, allow_pickle=True)
         with pytest.raises(RecordingError, match=r"poses\.npy"):
-            given(recording, OtherTrajectory(file, "droid"))
+            given(recording, OtherTrajectory(file))
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 7), }".ljust(117) + b"\n"
     for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00v\x00" + header, b"\x93NUMPY\x01\x00v\x00" + b"(" * 118):
         file.write_bytes(content)
         with pytest.raises(RecordingError, match="file of numbers"):
-            given(recording, OtherTrajectory(file, "droid"))
+            given(recording, OtherTrajectory(file))
 
 
 @pytest.mark.parametrize(
     ("change", "use", "said"),
     [
-        ({"format": "kalman"}, None, "the formats are tum, kitti"),
         ({"frame": "lidar"}, None, "--trajectory-frame lidar: it is one of camera, body"),
         ({"scale": 0.0}, None, "--trajectory-scale 0.0"),
         ({}, SensorSet.MONO, "needs stereo or depth"),
         ({"file": Path("nowhere.tum")}, None, "cannot be read"),
-        ({"frame": "camera"}, None, "another recording: read as poses of the camera"),
     ],
 )
 def test_what_does_not_fit_is_refused(
@@ -333,16 +310,11 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
     with pytest.raises(FleetmapError, match=said):
-        given(recording, OtherTrajectory(**{"file": file, "format": "tum"} | change), use)  # type: ignore[arg-type]
+        given(recording, OtherTrajectory(**{"file": file} | change), use)  # type: ignore[arg-type]
 
 
 def test_one_file_belongs_to_one_recording(sample: Sample, recording: Path, tmp_path: Path) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
-    options = BuildOptions(trajectory=OtherTrajectory(file, "tum"))
+    options = BuildOptions(trajectory=OtherTrajectory(file, "body"))
     with pytest.raises(UsageError, match="is of one recording, 2 are named"):
         build_map([recording, recording], tmp_path / "maps", "hall", options)
-
-
-def test_our_own_odometry_is_the_default() -> None:
-    assert list(TRAJECTORY_FORMATS) == ["tum", "kitti", "euroc", "okvis2", "orb-slam3", "stella", "droid", "mast3r"]
-    assert BuildOptions().trajectory is None

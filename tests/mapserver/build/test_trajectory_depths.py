@@ -54,7 +54,7 @@ def run(sample: Sample, tmp_path: Path) -> Path:
 
 
 def options(run: Path, scale: float | None = METRES, use: SensorSet = SensorSet.MONO) -> RecordingOptions:
-    return RecordingOptions(use=use, trajectory=OtherTrajectory(run, "droid", scale=scale))
+    return RecordingOptions(use=use, trajectory=OtherTrajectory(run, scale=scale))
 
 
 @pytest.mark.parametrize("use", [SensorSet.MONO, SensorSet.MONO_INERTIAL])
@@ -122,7 +122,7 @@ def test_a_lens_bends_the_recorded_pixels_alone(tmp_path: Path, width: int, heig
 
 
 def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recording: Path, run: Path) -> None:
-    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, "droid", scale=METRES), threads=1)
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
     done = build_map(recording, run / "maps", "hall", chosen)
     assert done.report["ate_rmse_m"] < 0.03
     assert done.report["keyframes"] > 5
@@ -130,12 +130,14 @@ def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recordi
     assert moved == pytest.approx(np.ptp(np.array(sample.world_from_body)[:, :3, 3], axis=0).max(), rel=0.02)
     said = [words for words in done.report["findings"]["ride"] if "disps.npy" in words]
     assert said == ["depth of another system: 30 of 61 frames have none in disps.npy and are left out"]
-    assert any("pose-from-map" in words and f"scale {METRES}" in words for words in done.report["findings"]["ride"])
+    assert any(
+        "poses of the camera" in words and f"scale {METRES}" in words for words in done.report["findings"]["ride"]
+    )
 
 
 def test_depths_of_another_unit_than_the_poses_are_refused(recording: Path, run: Path) -> None:
     np.save(run / "disps.npy", np.load(run / "disps.npy") / 4)
-    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, "droid", scale=METRES), threads=1)
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
     with pytest.raises(RecordingError, match="another recording"):
         build_map(recording, run / "maps", "hall", chosen)
 

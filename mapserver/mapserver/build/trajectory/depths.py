@@ -1,9 +1,9 @@
-"""Depths that DROID-SLAM and MASt3R-SLAM keep beside their poses, as depth images of a single camera's recording."""
+"""Depths that DROID-SLAM keeps beside its poses, as depth images of a single camera's recording."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,11 +14,9 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
-from mapserver.build.trajectory.cloud_depths import Placing, cloud_images, places
-from mapserver.build.trajectory.clouds import EDGE_RATIO
-from mapserver.build.trajectory.formats import PoseRows, array_in
-from mapserver.build.trajectory.given import OtherTrajectory, check_span, clock_of
-from mapserver.build.trajectory.readings import NEAR_NS, possible_units, stamps_of
+from mapserver.build.trajectory.formats import array_in, read_poses
+from mapserver.build.trajectory.given import OtherTrajectory, check_span, stamps_on_clock
+from mapserver.build.trajectory.readings import NEAR_NS
 
 if TYPE_CHECKING:
     import hashlib
@@ -27,61 +25,41 @@ if TYPE_CHECKING:
     from fleetmap.recordings.recording import FrameSource
 
 _MOST_SIDE = 8192
+_EDGE_RATIO = 1.25  # between neighbouring depths: what lies between them is neither surface
 _ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay well below
 _NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
-
-
-class DepthImages(Protocol):
-    """Images of inverse depth, 0 where unknown, of a camera without distortion."""
-
-    @property
-    def scale(self) -> float:
-        """Metres in the unit of the depths."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of each."""
-
-    @property
-    def pinhole(self) -> Array:
-        """(4,) fx, fy, cx, cy of their pixels."""
-
-    def inverse(self, frame: int) -> NDArray[np.float32] | None:
-        """That of a frame by its number in the recording; None for a frame without."""
 
 
 def with_depths(
     recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory | None
 ) -> tuple[Recording, NDArray[np.int64]]:
-    """A single camera's recording as one with depth, and those of the selected frames that have one: by `disps.npy` beside DROID's poses,
-    or the cloud of points beside MASt3R's.
+    """A single camera's recording as one with depth, and those of the selected frames that have one: by `disps.npy` beside DROID's poses.
 
     The same recording and selection where there is no such file or the recording needs none. The scale must be said, as one camera does
     not show it: UsageError. RecordingError for a file that is not of these poses and this camera.
     """
     if other is None or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
         return recording, indices
-    folder = other.file if other.file.is_dir() else other.file.parent
-    file = {"droid": folder / "disps.npy", "mast3r": other.file.with_suffix(".ply")}.get(other.format)
-    if file is None or file == other.file or not file.exists():
+    file = (other.file if other.file.is_dir() else other.file.parent) / "disps.npy"
+    if not (other.file.is_dir() or other.file.suffix == ".npy") or not file.exists():
         return recording, indices
     if other.scale is None:
         raise UsageError(
             f"{file} holds depths of one camera, which does not show their unit; say the metres in it with --trajectory-scale"
         )
-    rows, camera = other.rows(), recording.calibration.cameras[0]
-    if other.format == "droid":
-        _check(file, len(rows.positions), camera)
-    unit, row_of_frame = _rows_of_frames(rows, recording, indices, other)
+    written, camera = read_poses(other.file), recording.calibration.cameras[0]
+    _check(file, len(written.map_from_it), camera)
+    frame_of_row = _frames_at(stamps_on_clock(written, recording, indices, other), recording.frame_stamps_ns)
+    if (frame_of_row >= 0).mean() <= 0.5:
+        raise RecordingError(
+            f"{other.file} belongs to another recording: most of its stamps are at no frame; pass the recording's own"
+        )
+    row_of_frame = np.full(len(recording), -1)
+    row_of_frame[frame_of_row[frame_of_row >= 0]] = np.flatnonzero(frame_of_row >= 0)
     has_depth = row_of_frame[indices] >= 0
     check_span(recording.frame_stamps_ns[indices], has_depth, recording, other)
     words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
-    images: DepthImages = DispImages(file, row_of_frame, camera, other.scale)
-    sigma_px = None
-    if other.format == "mast3r":
-        placing = Placing(file, rows, unit, clock_of(rows, recording, indices, other), indices[has_depth])
-        images, found, sigma_px = cloud_images(recording, placing, other)
-        words += f"; {found}"
+    images = DispImages(file, row_of_frame, camera, other.scale)
     unused = "; the IMU is not used" if len(recording.imu) else ""
     seen = replace(
         recording,
@@ -90,7 +68,6 @@ def with_depths(
         imu=ImuSamples.empty(),
         frames=_DepthFrames(recording.frames, images, np.arange(len(recording)), camera),
         issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
-        depth_sigma_px=sigma_px,
     )
     return seen, indices[has_depth]
 
@@ -114,28 +91,6 @@ def _check(file: Path, count: int, camera: CameraCalibration) -> None:
             raise RecordingError(
                 f"{file}: image {number + 1} has values that are no inverse depths: they must be finite and not negative"
             )
-
-
-def _rows_of_frames(
-    rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
-) -> tuple[str | None, NDArray[np.int64]]:
-    """The only unit of stamps that puts most at frames, and (F,) for each frame of the recording the row of its pose, -1 without one."""
-    clock, stamps_ns = clock_of(rows, recording, indices, other), recording.frame_stamps_ns
-    units = [None] if rows.stamps is None else [u for u in possible_units(rows, clock) if other.stamps in (None, u)]
-    frames = {unit: _frames_at(stamps_of(rows, unit, clock), stamps_ns) for unit in units}
-    fitting = {unit: found for unit, found in frames.items() if (found >= 0).mean() > 0.5}
-    if not fitting:
-        raise RecordingError(
-            f"{other.file} belongs to another recording: in no unit is most of its stamps at frames; pass the recording's own"
-        )
-    if len(fitting) > 1:
-        raise UsageError(
-            f"{other.file} may have its stamps in {' or '.join(map(str, fitting))}; say --trajectory-stamps"
-        )
-    ((unit, found),) = fitting.items()
-    out = np.full(len(stamps_ns), -1)
-    out[found[found >= 0]] = np.flatnonzero(found >= 0)
-    return unit, out
 
 
 def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
@@ -182,17 +137,17 @@ class DispImages:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """See DepthImages."""
+        """Height and width of each."""
         height, width = self._images.shape[1:]
         return height, width
 
     @cached_property
     def pinhole(self) -> Array:
-        """See DepthImages."""
+        """(4,) fx, fy, cx, cy of their pixels."""
         return _pinhole(self.file, self.camera, self.shape)
 
     def inverse(self, frame: int) -> NDArray[np.float32] | None:
-        """See DepthImages."""
+        """(h, w) that of a frame by its number in the recording, 0 where unknown; None for a frame without."""
         row = int(self.rows[frame])
         return None if row < 0 else np.array(self._images[row], np.float32)
 
@@ -206,7 +161,7 @@ class _DepthFrames:
     """Frames of `source`, whose numbers in `images` are numbers (F,), each with its depth image. What was recorded is hashed alone."""
 
     source: "FrameSource"
-    images: DepthImages
+    images: DispImages
     numbers: NDArray[np.int64]
     camera: CameraCalibration
 
@@ -232,7 +187,7 @@ class _DepthFrames:
         x, y = self._places
         (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
         high, low = (each(inverse, ones, anchor=(0, 0)) for each in (cv2.dilate, cv2.erode))
-        one_surface = (low > 0) & (high <= EDGE_RATIO * low)
+        one_surface = (low > 0) & (high <= _EDGE_RATIO * low)
         known = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
         known[known] = one_surface[y[known].astype(np.int64), x[known].astype(np.int64)]
         between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -242,5 +197,16 @@ class _DepthFrames:
 
     @cached_property
     def _places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        x, y = places(self.camera, self.images.pinhole).astype(np.float32)
+        x, y = _places(self.camera, self.images.pinhole).astype(np.float32)
         return x, y
+
+
+def _places(camera: CameraCalibration, pinhole: Array) -> Array:
+    """(2, H, W) for each recorded pixel its place x, y in images of a camera without distortion; -9 for none."""
+    size = camera.height_px, camera.width_px
+    v, u = np.indices(size, np.float64)
+    rays = camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
+    seen = (rays[:, 2] > 0) & np.isfinite(found).all(axis=1)
+    return np.asarray(np.where(seen[:, None], found, -9.0).T.reshape(2, *size))

@@ -1,132 +1,99 @@
-"""Files of other SLAM systems' poses: what they say, with everything left open that they do not.
+"""Poses of another SLAM system as its files have them: TUM and KITTI text, and DROID-SLAM's arrays.
 
 Files are hostile: their size is looked at before they are read, and nothing that is pickled is unpacked.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from tokenize import TokenError
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import AnyArray, Array
-from fleetmap.recordings.tum import read_text
+from fleetmap.geometry import AnyArray, Array, rotation_from_quat_wxyz, se3, se3_inverse
+from fleetmap.recordings.tum import parse_tum, read_text
+from fleetmap.sensors.samples import Stamps
 
-BILLION = 10**9
 _MOST_BYTES, _MOST_ROWS = 64 << 20, 500_000
 _MOST = 1e12  # of a position, in any unit
-_MOST_STAMP = Decimal(10) ** 19
+_MOST_S = 9e9
 _UNIT_WITHIN = 0.01
+_EXPECTED = "TUM or KITTI text, or DROID's poses.npy, is expected"
 
 
 @dataclass(frozen=True, slots=True)
-class PoseRows:
-    """N poses as written.
+class WrittenPoses:
+    """N poses of a file of a kind, TUM, KITTI or DROID.
 
-    stamps (N,) in billionths of the file's unit of time, None where rows carry none; positions (N, 3) in its unit of length; turns:
-    (N, 4) quaternions in the order of the file, or (N, 3, 3) rotations.
+    stamps_ns (N,): 10^9 times what is written, seconds or numbers of frames; None where each frame has one row.
+    map_from_it (N, 4, 4), where the camera or body is, in the file's unit of length.
     """
 
-    stamps: list[int] | None
-    positions: Array
-    turns: Array
+    kind: str
+    stamps_ns: Stamps | None
+    map_from_it: Array
 
-    def __post_init__(self) -> None:
-        """ValueError, in words, for what cannot be poses."""
-        count = len(self.positions)
-        if not 2 <= count <= _MOST_ROWS:
-            raise ValueError(f"it holds {count} poses, 2 to {_MOST_ROWS} are expected")
-        good: NDArray[np.bool_] = np.all(np.abs(self.positions) < _MOST, axis=1)
-        if self.turns.ndim == 2:
-            good &= np.abs(np.linalg.norm(self.turns, axis=1) - 1.0) < _UNIT_WITHIN
+
+def read_poses(path: Path) -> WrittenPoses:
+    """The poses in a file, of the kind that its content shows; RecordingError for anything else."""
+    if path.is_dir() or path.suffix == ".npy":
+        written = _droid(path / "poses.npy" if path.is_dir() else path)
+    else:
+        text = read_text(sized(path), _EXPECTED)
+        rows = [fields for line in text.splitlines() if (fields := line.split()) and not fields[0].startswith("#")]
+        if rows and len(rows[0]) == 12:
+            written = WrittenPoses("KITTI", None, _matrices(path, rows))
         else:
-            good &= (np.abs(self.turns) < 2.0).all(axis=(1, 2))
-            turns = np.where(good[:, None, None], self.turns, 0.0)
-            square = turns @ np.swapaxes(turns, 1, 2)
-            good &= (np.abs(square - np.eye(3)) < 2 * _UNIT_WITHIN).all(axis=(1, 2)) & (np.linalg.det(turns) > 0)
-        if not good.all():
-            row = int(np.argmin(good))
-            raise ValueError(
-                f"pose {row + 1} is none: position {self.positions[row].tolist()}, rotation {self.turns[row].tolist()}; positions must "
-                "be finite and rotations of unit length"
-            )
+            rows_in_time = parse_tum(text, str(path))
+            written = WrittenPoses("TUM", rows_in_time.stamps_ns, rows_in_time.frame_from_body)
+    count, positions = len(written.map_from_it), written.map_from_it[:, :3, 3]
+    if not 2 <= count <= _MOST_ROWS:
+        raise RecordingError(f"{path} holds {count} poses, 2 to {_MOST_ROWS} are expected")
+    if not (good := np.all(np.abs(positions) < _MOST, axis=1)).all():
+        row = int(np.argmin(good))
+        raise RecordingError(f"{path}: pose {row + 1} is at {positions[row].tolist()}; leave it out")
+    return written
 
 
-PoseReader = Callable[[Path], PoseRows]
-"""Raises ValueError, in words, for content that is not of the format, and RecordingError for files that cannot be read."""
+def _matrices(path: Path, rows: list[list[str]]) -> Array:
+    """(N, 4, 4) of rows of twelve numbers, the upper rows of matrices."""
+    try:
+        upper = np.array([[float(field) for field in fields] for fields in rows]).reshape(-1, 3, 4)
+    except ValueError as error:
+        raise RecordingError(f"{path} is no trajectory in KITTI's form: each line is to have twelve numbers") from error
+    turns = np.where(np.isfinite(upper), upper, 0.0)[:, :, :3]
+    off = np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    good = (off < 2 * _UNIT_WITHIN) & (np.linalg.det(turns) > 0)
+    if not good.all():
+        row = int(np.argmin(good))
+        raise RecordingError(f"{path}: pose {row + 1} has no rotation: {upper[row].tolist()}; leave it out")
+    u, _, vt = np.linalg.svd(turns)
+    map_from_it = np.tile(np.eye(4), (len(upper), 1, 1))
+    map_from_it[:, :3, :3], map_from_it[:, :3, 3] = u @ vt, upper[:, :, 3]
+    return map_from_it
 
 
-def text_rows(*columns: int) -> PoseReader:
-    """A reader of lines of numbers, as many as `columns` allows: 12 are the upper rows of a matrix, others begin with stamp, position
-    and quaternion. Comments (#), empty lines and a first line of names are skipped.
-    """
-
-    def read(path: Path) -> PoseRows:
-        rows: list[list[float]] = []
-        stamps: list[int] = []
-        for number, line in enumerate(read_text(sized(path), "poses as lines of numbers are expected").splitlines(), 1):
-            fields = line.replace(",", " ").replace(";", " ").split()
-            if not fields or fields[0].startswith("#"):
-                continue
-            try:
-                values = [float(field) for field in fields]
-            except ValueError as error:
-                if not rows:
-                    continue  # names of columns
-                raise ValueError(f"line {number}: {line[:80]!r} is not all numbers") from error
-            if len(values) not in columns or (rows and len(values) != len(rows[0])):
-                expected = " or ".join(str(count) for count in columns)
-                raise ValueError(f"line {number} has {len(values)} numbers, {expected} are expected: {line[:80]!r}")
-            rows.append(values)
-            if len(values) != 12:
-                stamps.append(billionths(fields[0]))
-            if len(rows) > _MOST_ROWS:
-                break
-        if not rows:
-            raise ValueError("it holds no poses")
-        table = np.array(rows)
-        if stamps:
-            return PoseRows(stamps, table[:, 1:4], table[:, 4:8])
-        matrices = table.reshape(-1, 3, 4)
-        return PoseRows(None, matrices[:, :, 3], matrices[:, :, :3])
-
-    return read
-
-
-def droid_rows(path: Path) -> PoseRows:
-    """DROID-SLAM's `poses.npy` (N, 7) position and quaternion, or (N, 4, 4), with `tstamps.npy` beside it; or text."""
-    if path.is_dir():
-        path = path / "poses.npy"
-    if path.suffix != ".npy":
-        return text_rows(8)(path)
-    mapped, file, stamps = array_in(path), path.with_name("tstamps.npy"), None
-    if mapped.shape[1:] not in ((7,), (4, 4), (3, 4)) or len(mapped) > _MOST_ROWS:
-        raise ValueError(f"its shape is {mapped.shape}; (N, 7) or (N, 4, 4) is expected")
-    written = np.array(mapped, np.float64)
+def _droid(path: Path) -> WrittenPoses:
+    """`poses.npy` (N, 7), cam_from_map as position and quaternion x y z w, and `tstamps.npy` beside it where there is one."""
+    mapped, file, stamps_ns = array_in(path), path.with_name("tstamps.npy"), None
+    if mapped.shape[1:] != (7,) or len(mapped) > _MOST_ROWS:
+        raise RecordingError(f"{path} is of shape {mapped.shape}; (N, 7), position and quaternion x y z w, is expected")
+    rows = np.array(mapped, np.float64)
+    good = np.isfinite(rows).all(axis=1) & (np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) < _UNIT_WITHIN)
+    if not good.all():
+        row = int(np.argmin(good))
+        raise RecordingError(f"{path}: pose {row + 1} is {rows[row].tolist()}; a unit quaternion is expected")
     if file.exists():
-        values = np.array(array_in(file)).ravel()
-        if len(values) != len(written):
-            raise ValueError(f"{file.name} has {len(values)} stamps for {len(written)} poses")
-        stamps = [billionths(repr(value)) for value in values.tolist()]
-    if written.shape[1:] == (7,):
-        return PoseRows(stamps, written[:, :3], written[:, 3:])
-    return PoseRows(stamps, written[:, :3, 3], written[:, :3, :3])
-
-
-TRAJECTORY_FORMATS: dict[str, PoseReader] = {
-    "tum": text_rows(8),
-    "kitti": text_rows(12),
-    "euroc": text_rows(8, 17),
-    "okvis2": text_rows(8, 17),
-    "orb-slam3": text_rows(8, 12),
-    "stella": text_rows(8, 12),
-    "droid": droid_rows,
-    "mast3r": text_rows(8),
-}
+        stamps = np.array(array_in(file), np.float64).ravel()
+        if len(stamps) != len(rows):
+            raise RecordingError(f"{file} has {len(stamps)} stamps for {len(rows)} poses; pass those of one run")
+        if not (np.abs(stamps) < _MOST_S).all():
+            raise RecordingError(f"{file} holds stamps that are neither seconds nor numbers of frames")
+        stamps_ns = np.round(stamps * 1e9).astype(np.int64)
+    cam_from_map = np.array([se3(rotation_from_quat_wxyz(row[[6, 3, 4, 5]]), row[:3]) for row in rows]).reshape(
+        -1, 4, 4
+    )
+    return WrittenPoses("DROID", stamps_ns, se3_inverse(cam_from_map))
 
 
 def array_in(path: Path) -> AnyArray:
@@ -140,17 +107,6 @@ def array_in(path: Path) -> AnyArray:
     if found.ndim < 3 and found.size > 16 * _MOST_ROWS:
         raise RecordingError(f"{path} holds {found.size} numbers, too many for a trajectory")
     return found
-
-
-def billionths(field: str) -> int:
-    """A decimal number times 10^9, exact to its ninth decimal; ValueError for anything else."""
-    try:
-        value = Decimal(field)
-    except InvalidOperation as error:
-        raise ValueError(f"stamp {field!r} is no number") from error
-    if not value.is_finite() or abs(value) > _MOST_STAMP:
-        raise ValueError(f"stamp {field!r} is no time")
-    return int(value * BILLION)
 
 
 def sized(path: Path, most_bytes: int = _MOST_BYTES) -> Path:

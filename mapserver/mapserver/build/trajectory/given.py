@@ -1,6 +1,5 @@
 """The initial trajectory that a file of poses gives: the reading that fits the recording, in metres, at every frame."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,73 +13,50 @@ from fleetmap.recordings import Recording
 from fleetmap.recordings.tum import format_stamp
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet, Stamps, Trajectory
-from mapserver.build.trajectory.formats import TRAJECTORY_FORMATS, PoseRows
+from mapserver.build.trajectory.formats import WrittenPoses, read_poses
 from mapserver.build.trajectory.readings import (
-    DIRECTIONS,
     FITS_WITHIN,
     FRAMES,
     GAP_NS,
     LEAST_STRETCHES,
-    QUATERNIONS,
     SCALE_WITHIN,
-    STAMPS,
     Followed,
     Judged,
+    PoseReading,
     Shown,
     covered,
     judge,
     pose_at,
-    possible_units,
     read_as,
     readings,
-    stamps_of,
     stretches,
     undecided,
 )
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
-from mapserver.survey.settings import SurveySettings, for_depths
+from mapserver.survey.settings import SurveySettings
 
-CHOICES = {"frame": FRAMES, "direction": DIRECTIONS, "quaternion": QUATERNIONS, "stamps": STAMPS}
 _WINDOWS, _WINDOW_FRAMES = 5, 60
 _LEAST_SPAN = 0.5  # of the frames' time
+_MARGIN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class OtherTrajectory:
-    """A file of another system's poses, its format, and what is known of it; what is None is found out or asked for.
+    """A file of another system's poses: TUM or KITTI text, DROID-SLAM's `poses.npy` or its folder.
 
-    frame: camera or body. direction: map-from-pose or pose-from-map. quaternion: xyzw or wxyz. stamps: s, ms, us, ns, elapsed-s (since
-    the first frame) or frames (numbers of frames). scale: metres in its unit of length.
+    frame: camera (the left one) or body. scale: metres in its unit of length, None where the recording shows it.
     """
 
     file: Path
-    format: str
-    frame: str | None = None
-    direction: str | None = None
-    quaternion: str | None = None
-    stamps: str | None = None
+    frame: str = "camera"
     scale: float | None = None
 
     def __post_init__(self) -> None:
         """UsageError for words that mean nothing."""
-        if self.format not in TRAJECTORY_FORMATS:
-            raise UsageError(f"--trajectory-format {self.format}: the formats are {', '.join(TRAJECTORY_FORMATS)}")
-        for name, said in self.said().items():
-            if said is not None and said not in CHOICES[name]:
-                raise UsageError(f"--trajectory-{name} {said}: it is one of {', '.join(CHOICES[name])}")
+        if self.frame not in FRAMES:
+            raise UsageError(f"--trajectory-frame {self.frame}: it is one of {', '.join(FRAMES)}")
         if self.scale is not None and not 0 < self.scale < np.inf:
             raise UsageError(f"--trajectory-scale {self.scale}: it is the metres in the file's unit of length, above 0")
-
-    def said(self) -> dict[str, str | None]:
-        """The items of a reading that are known."""
-        return {name: getattr(self, name) for name in CHOICES}
-
-    def rows(self) -> PoseRows:
-        """What the file says; RecordingError where it cannot be read or is of another format."""
-        try:
-            return TRAJECTORY_FORMATS[self.format](self.file)
-        except ValueError as error:
-            raise RecordingError(f"{self.file} is no {self.format} trajectory: {error}") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,76 +68,77 @@ class GivenPoses:
 
 
 def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> GivenPoses:
-    """The poses of the selected frames (F,) by the reading that the recording supports.
+    """The poses of the selected frames (F,).
 
-    Frames without poses get them from our own odometry between those that have. UsageError for a single camera, where readings stay
-    open, and where too few frames have poses; RecordingError for a file that cannot be read or belongs to another recording.
+    Frames without poses get them from our own odometry between those that have. UsageError for a single camera, where the scale stays
+    open, and where too few frames have poses; RecordingError for a file that cannot be read, is of another convention (with the one that
+    fits) or of another recording.
     """
     if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
         raise UsageError(
             f"{recording.path} is {recording.sensor_set}; --trajectory needs stereo or depth, such as DROID's disps.npy beside its poses"
         )
-    rows = other.rows()
+    written = read_poses(other.file)
     stamps_ns = recording.frame_stamps_ns[indices]
-    clock = clock_of(rows, recording, indices, other)
-    units = _units(rows, clock, stamps_ns, other)
-    each = [covered(stamps_of(rows, unit, clock), stamps_ns) for unit in units]
-    check_span(stamps_ns, np.any(each, axis=0), recording, other)
-    known = np.all(each, axis=0)
+    other_trajectory = Trajectory(stamps_on_clock(written, recording, indices, other), written.map_from_it)
+    known = covered(other_trajectory.stamps_ns, stamps_ns)
+    if known.sum() <= LEAST_STRETCHES:
+        raise _foreign_stamps(written, recording, other)
+    check_span(stamps_ns, known, recording, other)
     is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
     whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
     followed = _followed(recording, indices, whole=whole)
     shown = Shown(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
-    found, words = _judged(rows, units, clock, shown, recording, other)
-    as_read = read_as(rows, found.reading, clock)
-    is_placed = covered(as_read.stamps_ns, stamps_ns)
-    check_span(stamps_ns, is_placed, recording, other)
+    found, words = _judged(other_trajectory, f"{other.file.name} ({written.kind})", shown, recording, other)
     at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-    at_frames[is_placed] = [pose_at(as_read, int(stamp)) for stamp in stamps_ns[is_placed]]
+    at_frames[known] = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns[known]]
     at_frames[:, :3, 3] *= found.in_metres
     at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
-    if not is_placed.all():
+    if not known.all():
         if not whole:
             followed = _followed(recording, indices, whole=True)
-        at_frames = _bridged(at_frames, is_placed, followed, other)
-        words += (
-            f"; {int((~is_placed).sum())} of {len(stamps_ns)} frames without a pose are bridged by our own odometry"
-        )
+        at_frames = _bridged(at_frames, known, followed, other)
+        words += f"; {int((~known).sum())} of {len(stamps_ns)} frames without a pose are bridged by our own odometry"
     return GivenPoses(Trajectory(stamps_ns, at_frames), words)
 
 
-def clock_of(rows: PoseRows, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> Stamps:
-    """Stamps of the frames that numbers of frames mean: all of the recording, or the selected ones where rows are as many."""
-    stamps, count = recording.frame_stamps_ns, len(rows.positions)
-    if rows.stamps is not None or count == len(stamps):
-        return stamps
-    if count == len(indices):
-        return stamps[indices]
-    raise UsageError(
-        f"{other.file} has {count} poses without stamps, {recording.name} has {len(stamps)} frames, of which {len(indices)} are "
-        "selected; select those that the poses belong to with --frames, or pass a file with stamps"
-    )
+def stamps_on_clock(
+    rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
+) -> Stamps:
+    """(N,) nanoseconds on the recording's clock, of stamps in seconds of that clock or since the first frame, or numbers of frames.
 
-
-def _units(rows: PoseRows, clock: Stamps, stamps_ns: Stamps, other: OtherTrajectory) -> list[str | None]:
-    """Units of the stamps by which poses lie at frames; RecordingError where there is none."""
-    if rows.stamps is None:
-        return [None]
-    possible = possible_units(rows, clock)
-    units: list[str | None] = [
-        unit
-        for unit in possible
-        if other.stamps in (None, unit) and covered(stamps_of(rows, unit, clock), stamps_ns).sum() > LEAST_STRETCHES
-    ]
-    if not units:
-        said = "in no unit" if other.stamps is None else f"in {other.stamps}"
-        first, last = (format_stamp(int(stamp)) for stamp in stamps_ns[[0, -1]])
-        raise RecordingError(
-            f"{other.file} belongs to another recording: {said} are more than {LEAST_STRETCHES} of its {len(rows.positions)} stamps, "
-            f"{rows.stamps[0] / 1e9:.9g} to {rows.stamps[-1] / 1e9:.9g}, at frames between {first} and {last} s, where half of them should "
-            "be; pass the recording's own, on the cameras' clock"
+    Rows without stamps belong to all frames, or to the selected ones: UsageError where they are as many as neither. RecordingError for
+    stamps of another clock.
+    """
+    clock, count = recording.frame_stamps_ns, len(rows.map_from_it)
+    if rows.stamps_ns is None:
+        if count in (len(clock), len(indices)):
+            return clock if count == len(clock) else clock[indices]
+        raise UsageError(
+            f"{other.file} has {count} poses without stamps, {recording.name} has {len(clock)} frames, of which {len(indices)} are "
+            "selected; select those that the poses belong to with --frames, or pass a file with stamps"
         )
-    return units
+    first, last, middle = int(clock[0]), int(clock[-1]), int(np.median(rows.stamps_ns))
+    if first - _MARGIN_NS <= middle <= last + _MARGIN_NS:
+        return rows.stamps_ns
+    numbers, rest = np.divmod(rows.stamps_ns, 1_000_000_000)
+    if not rest.any() and numbers.min() >= 0 and numbers.max() < len(clock):
+        return clock[numbers]
+    if 0 <= middle <= last - first + _MARGIN_NS:
+        return first + rows.stamps_ns
+    raise _foreign_stamps(rows, recording, other)
+
+
+def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: OtherTrajectory) -> RecordingError:
+    stamps_ns, clock = rows.stamps_ns, recording.frame_stamps_ns
+    written, frames = (
+        "no stamps" if some is None else " to ".join(format_stamp(int(stamp)) for stamp in (some.min(), some.max()))
+        for some in (stamps_ns, clock)
+    )
+    return RecordingError(
+        f"{other.file} belongs to another recording: of its {len(rows.map_from_it)} poses, at {written}, hardly any is at frames, "
+        f"{frames} s; pass the recording's own, with stamps in seconds on the cameras' clock or since the first frame, or numbers of frames"
+    )
 
 
 def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> Followed:
@@ -171,7 +148,7 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
     if not whole:
         starts = np.linspace(0, count - _WINDOW_FRAMES, _WINDOWS).round().astype(int).tolist()
         spans = [(start, start + _WINDOW_FRAMES) for start in starts]
-    rig, settings = recording.calibration, for_depths(SurveySettings(), recording.depth_sigma_px)
+    rig, settings = recording.calibration, SurveySettings()
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frame_from_body, piece, pieces = np.tile(np.eye(4), (count, 1, 1)), np.full(count, -1), 0
     for first, end in spans:
@@ -190,44 +167,36 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
 
 
 def _judged(
-    rows: PoseRows, units: list[str | None], clock: Stamps, shown: Shown, recording: Recording, other: OtherTrajectory
+    trajectory: Trajectory, name: str, shown: Shown, recording: Recording, other: OtherTrajectory
 ) -> tuple[Judged, str]:
-    """The reading that fits best, and why in words. RecordingError where none fits, UsageError where several do."""
-    mounting = shown.body_from_cam
-    is_camera_body = bool(np.abs(mounting - np.eye(4)).max() < 1e-3)
-    candidates = list(readings(rows, units, other.said(), is_camera_body))
-    found = [judge(read_as(rows, reading, clock), reading, shown, other.scale) for reading in candidates]
-    found.sort(key=lambda judged: float(judged.errors.mean()) if len(judged.errors) else 0.0)
-    best, rest = found[0], found[1:]
-    name, count = f"{other.file.name} ({other.format})", len(shown.pairs)
-    figures = " and ".join(
-        f"{100 * error:.0f} % of {what}"
-        for error, what in ((best.turn_error, "the turn"), (best.way_error, "the way"))
-        if error is not None
-    )
+    """The poses as they are named, and how well they fit in words.
+
+    RecordingError where another convention fits better, with what to do, or none fits; UsageError where the scale stays open.
+    """
+    is_camera_body = bool(np.abs(shown.body_from_cam - np.eye(4)).max() < 1e-3)
+    every = [judge(read_as(trajectory, each), each, shown, other.scale) for each in readings(is_camera_body)]
+    best = min(every, key=lambda judged: float(judged.errors.mean()) if len(judged.errors) else 0.0)
+    said = PoseReading(FRAMES[1] if is_camera_body else other.frame)
+    (found,) = [each for each in every if each.reading == said]
+    count = len(shown.pairs)
     if not best.fits:
         raise RecordingError(
-            f"{other.file} belongs to another recording: read as {best.reading}, which fits {recording.name} best, it is off by {figures} "
-            f"in the median of {count} stretches, {100 * FITS_WITHIN:.0f} % is the most; pass the poses of this recording"
+            f"{other.file} belongs to another recording: read as {best.reading}, which fits {recording.name} best, it is off by "
+            f"{best.figures} in the median of {count} stretches, {100 * FITS_WITHIN:.0f} % is the most; pass the poses of this recording"
         )
-    same = undecided(best, rest)
-    open_items = [item for item in CHOICES if len({getattr(each.reading, item) for each in (best, *same)}) > 1]
-    if open_items or best.scale_within > SCALE_WITHIN:
-        open_items += ["scale"] if best.scale_within > SCALE_WITHIN else []
+    if found is not best and not any(each is found for each in undecided(best, every)):
+        raise RecordingError(
+            f"{other.file} does not fit {recording.name} as {said}: off by {found.figures} in the median of {count} stretches, and by "
+            f"{best.figures} as {best.reading}; {best.reading.instead(other.frame)}"
+        )
+    if found.scale_within > SCALE_WITHIN:
         raise UsageError(
-            f"{other.file} can be read in {len(same) + 1} ways that {recording.name} does not tell apart over {count} stretches; "
-            f"say {asked(open_items)}"
+            f"{recording.name} does not show the unit of {other.file}; say its metres with --trajectory-scale METRES"
         )
-    words = f"trajectory {name}: {best.reading}, scale {best.in_metres:.4g}"
-    if not best.is_told:
-        return best, f"{words}, as said; the recording moves too little to judge it"
-    following = f"; the next reading, {rest[0].reading}, by {100 * rest[0].errors.mean():.0f} %" if rest else ""
-    return best, f"{words}: off our own odometry by {figures} in the median of {count} stretches{following}"
-
-
-def asked(items: Iterable[str]) -> str:
-    """The options that say open items of a reading."""
-    return " and ".join(f"--trajectory-{item} {'|'.join(CHOICES.get(item, ('METRES',)))}" for item in items)
+    words = f"trajectory {name}: {said}, scale {found.in_metres:.4g}"
+    if not found.is_told:
+        return found, f"{words}, as said; the recording moves too little to judge it"
+    return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
 
 
 def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:

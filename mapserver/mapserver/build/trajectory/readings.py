@@ -1,29 +1,21 @@
-"""Readings of a file of poses: a choice of each item that the file leaves open, judged by the motion that the recording shows.
+"""How well another system's poses agree with the motion that a recording shows.
 
-A right reading moves as the recording does. A wrong one turns about other axes or backwards, goes another way, or is unrelated;
-its errors are then as large as the motion itself. Truth plays no part.
+Poses that are right move as the recording does. Those of another convention turn about other axes or backwards, go another way, or are
+unrelated; their errors are then as large as the motion itself. Truth plays no part.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3_inverse
+from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, se3_inverse
 from fleetmap.sensors.samples import Stamps, Trajectory
-from mapserver.build.trajectory.formats import BILLION, PoseRows
 
 FRAMES = ("camera", "body")
-DIRECTIONS = ("map-from-pose", "pose-from-map")
-QUATERNIONS = ("xyzw", "wxyz")
-UNITS = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": BILLION}  # billionths of the unit in a nanosecond
-STAMPS = (*UNITS, "elapsed-s", "frames")
 GAP_NS = 200_000_000  # between poses that are interpolated
 NEAR_NS = 2_000_000  # a pose so close to a frame is that frame's
-_FAR = 2**62
-_MARGIN_NS = 1_000_000_000
 _STRETCH_RAD, _STRETCH_M, _STRETCH_NS = 0.15, 0.3, 1_000_000_000
 _LEAST_RAD, _LEAST_M = 0.05, 0.1  # of a motion, below which errors count as if it were so large
 LEAST_STRETCHES = 6
@@ -38,17 +30,22 @@ SCALE_WITHIN = 0.05 * _STANDARD_ERRORS  # by what the survey assumes of a given 
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
-    """A choice: frame of the poses, direction of the transform, order of quaternions (None without), unit of stamps (None without)."""
+    """A convention of poses: whose they are, and what of the file is to be turned round to read it so."""
 
     frame: str
-    direction: str
-    quaternion: str | None
-    stamps: str | None
+    is_inverted: bool = False
+    is_w_first: bool = False
 
     def __str__(self) -> str:
-        order = "" if self.quaternion is None else f", quaternions {self.quaternion}"
-        unit = "" if self.stamps is None else f", stamps in {self.stamps}"
-        return f"poses of the {self.frame}, {self.direction}{order}{unit}"
+        inverted = ", inverted (pose_from_map)" if self.is_inverted else ""
+        return f"poses of the {self.frame}{inverted}{', quaternions w x y z' if self.is_w_first else ''}"
+
+    def instead(self, said: str) -> str:
+        """What makes the file readable where this convention fits and `said` is the frame that was named."""
+        steps = [f"say --trajectory-frame {self.frame}"] if self.frame != said else []
+        steps += ["write map_from_pose, the inverse of each pose"] if self.is_inverted else []
+        steps += ["write quaternions as x y z w"] if self.is_w_first else []
+        return " and ".join(steps)
 
 
 @dataclass(frozen=True)
@@ -94,6 +91,12 @@ class Judged:
         return all(error is None or error <= FITS_WITHIN for error in (self.turn_error, self.way_error))
 
     @property
+    def figures(self) -> str:
+        """The errors in words."""
+        told = ((self.turn_error, "the turn"), (self.way_error, "the way"))
+        return " and ".join(f"{100 * error:.0f} % of {what}" for error, what in told if error is not None) or "nothing"
+
+    @property
     def in_metres(self) -> float:
         """The scale, 1 where it cannot be told from that: the file is then in metres, which are better than what the comparison gives."""
         return 1.0 if abs(np.log(self.scale)) <= self.scale_within else self.scale
@@ -104,46 +107,9 @@ class Judged:
         return self.turn_error is not None or self.way_error is not None
 
 
-def readings(
-    rows: PoseRows, units: list[str | None], given: dict[str, str | None], is_camera_body: bool
-) -> Iterator[PoseReading]:
-    """All that the file and the options leave open; a camera that is the body has one frame."""
-    frames = FRAMES[1:] if is_camera_body else FRAMES
-    orders = QUATERNIONS if rows.turns.ndim == 2 else (None,)
-    items = (
-        ("frame", frames),
-        ("direction", DIRECTIONS),
-        ("quaternion", orders),
-        ("stamps", units if rows.stamps else [None]),
-    )
-    chosen = [
-        options if (said := given.get(name)) is None or options == (None,) else (said,) for name, options in items
-    ]
-    return (PoseReading(*choice) for choice in product(*chosen))  # type: ignore[arg-type]
-
-
-def possible_units(rows: PoseRows, frame_stamps_ns: Stamps) -> list[str]:
-    """Units of the stamps by which at least half of the poses lie within the time of the frames."""
-    assert rows.stamps is not None
-    middle = sorted(rows.stamps)[len(rows.stamps) // 2]
-    first, last = int(frame_stamps_ns[0]), int(frame_stamps_ns[-1])
-    found = [name for name, parts in UNITS.items() if first - _MARGIN_NS <= middle // parts <= last + _MARGIN_NS]
-    if 0 <= middle <= last - first + _MARGIN_NS:
-        found.append("elapsed-s")
-    count = len(frame_stamps_ns)
-    if all(stamp % BILLION == 0 and 0 <= stamp < count * BILLION for stamp in rows.stamps):
-        found.append("frames")
-    return found
-
-
-def stamps_of(rows: PoseRows, unit: str | None, frame_stamps_ns: Stamps) -> Stamps:
-    """(N,) nanoseconds on the recording's clock; rows without stamps belong to one frame each."""
-    if rows.stamps is None:
-        return frame_stamps_ns[: len(rows.positions)]
-    if unit == "frames":
-        return np.asarray(frame_stamps_ns[[stamp // BILLION for stamp in rows.stamps]], np.int64)
-    start, parts = (int(frame_stamps_ns[0]), 1) if unit == "elapsed-s" else (0, UNITS[unit or "ns"])
-    return np.array([max(-_FAR, min(_FAR, start + stamp // parts)) for stamp in rows.stamps], np.int64)
+def readings(is_camera_body: bool) -> list[PoseReading]:
+    """All conventions; a camera that is the body has one frame."""
+    return [PoseReading(*each) for each in product(FRAMES[is_camera_body:], (False, True), (False, True))]
 
 
 def covered(stamps: Stamps, at_ns: Stamps) -> NDArray[np.bool_]:
@@ -163,22 +129,15 @@ def pose_at(as_read: Trajectory, stamp_ns: int) -> Array:
     )
 
 
-def read_as(rows: PoseRows, reading: PoseReading, frame_stamps_ns: Stamps) -> Trajectory:
-    """map_from_pose of the poses in order of time, translations in the file's unit."""
-    stamps = stamps_of(rows, reading.stamps, frame_stamps_ns)
-    order = np.argsort(stamps, kind="stable")
-    turns = rows.turns
-    if reading.quaternion is not None:
-        wxyz = [3, 0, 1, 2] if reading.quaternion == "xyzw" else [0, 1, 2, 3]
-        turns = np.array([rotation_from_quat_wxyz(quat) for quat in rows.turns[:, wxyz]])
-    else:
-        u, _, vt = np.linalg.svd(turns)
-        turns = u @ vt
-    written = np.tile(np.eye(4), (len(turns), 1, 1))
-    written[:, :3, :3], written[:, :3, 3] = turns, rows.positions
-    if reading.direction != DIRECTIONS[0]:
-        written = se3_inverse(written)
-    return Trajectory(stamps[order], written[order])
+def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
+    """Poses that were read as map_from_pose with quaternions x y z w, by another convention."""
+    matrices = trajectory.frame_from_body
+    if reading.is_w_first:
+        xyzw = [quat_wxyz_from_rotation(each[:3, :3])[[1, 2, 3, 0]] for each in matrices]
+        matrices = np.array(
+            [se3(rotation_from_quat_wxyz(q), each[:3, 3]) for q, each in zip(xyzw, matrices, strict=True)]
+        )
+    return Trajectory(trajectory.stamps_ns, se3_inverse(matrices) if reading.is_inverted else matrices)
 
 
 def stretches(followed: Followed, known: NDArray[np.bool_]) -> NDArray[np.int64]:
