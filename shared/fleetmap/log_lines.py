@@ -27,7 +27,6 @@ class LineFormatter(logging.Formatter):
     """Escapes what is not printable; the lines of a traceback are indented, so that none of them begins as a line of the log does."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
-        """The line."""
         return printable(super().formatMessage(record))
 
     def formatException(  # noqa: N802

@@ -160,7 +160,6 @@ class _StampRecorder(Intake):
         self.last_frame: CameraFrame | StoredFrame | None = None
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """See Intake."""
         before = self.counts.frames
         super().put_frame(frame)
         if self.counts.frames > before:

@@ -59,7 +59,6 @@ class MessagePackPublisher:
         self._bus, self._key = inputs.bus, robot_key(inputs.site, inputs.robot, "estimate")
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """See Publisher."""
         body_from_base = se3_inverse(base_from_body)
         hypotheses = estimate.hypotheses[:_MAX_HYPOTHESES]
         message = EstimateMessage(

@@ -191,7 +191,6 @@ class Ros2Localizer:
             self._send_static_frames()
 
     def alive(self, is_silent: bool) -> None:
-        """See Publisher."""
         self._alive_s = time.monotonic()
         self._send_diagnostics(encode_diagnostics(time.time_ns(), [self._diagnosis(is_silent)]))
 
@@ -250,7 +249,6 @@ class Ros2Localizer:
             self._send_latched()
 
     def close(self) -> None:
-        """See Publisher."""
         self._ended.set()
         self._beats.join()
         self._break_bond()

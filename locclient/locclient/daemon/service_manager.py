@@ -22,7 +22,6 @@ class ServiceManager:
         self._folder = folder or runtime_folder()
 
     def ready(self) -> None:
-        """The service is ready."""
         self._tell("READY=1")
 
     def alive(self, status: str) -> None:
@@ -31,7 +30,6 @@ class ServiceManager:
         self._write(status)
 
     def stopping(self) -> None:
-        """The service is stopping."""
         self._tell("STOPPING=1")
         if self._folder is not None:
             with suppress(OSError):

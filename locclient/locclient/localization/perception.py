@@ -78,39 +78,31 @@ class SensorPerception:
         )
 
     def handle_imu(self, samples: ImuSamples) -> None:
-        """See Perception."""
         self.odometry.handle_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """See Perception."""
         self.odometry.handle_wheel(samples)
         self._calibration.watch.handle_wheel(samples)
 
     def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
-        """See Perception."""
         image = self._images.judge(frame)
         return (self._images.without_frozen(frame) if image.cause is Cause.FROZEN else frame), image
 
     def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
-        """See Perception."""
         odometry = self.odometry.handle_stereo(frame)
         if image.cause is Cause.NONE:
             image = replace(image, cause=self._images.judge_depth(odometry.scene_depth_m))
         return odometry, image
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Motion."""
         return self.odometry.motion_since(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
-        """See Motion."""
         return self.odometry.will_forget(frame_index)
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        """See Perception."""
         self._calibration.work()
         return self._calibration.is_reversed(frame, is_localized=is_localized)
 
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """See Perception."""
         return relocalizer.extract(frame)

@@ -50,7 +50,6 @@ class KeptFeatures(FrameFeatures):
     def measured(
         self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings, prior_px: Array | None = None
     ) -> Array:
-        """See FrameFeatures."""
         self.pixels[rows, 2] = self.kept_px[rows]
         return self.pixels[rows]
 
@@ -75,11 +74,9 @@ class KeptPerception:
         """Nothing: the odometry's estimates are kept."""
 
     def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
-        """See Perception."""
         return frame, self._frame.image
 
     def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
-        """See Perception."""
         return self._frame.odometry, self._frame.image
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
@@ -87,15 +84,12 @@ class KeptPerception:
         return self._frame.motions.get(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
-        """See Motion."""
         return self._frame.forgotten.get(frame_index, True)
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        """See Perception."""
         return self._frame.is_reversed
 
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """See Perception."""
         query = self._frame.query
         if query is None:  # another version asks at another frame than the robot did
             yield
@@ -111,7 +105,6 @@ class KeptPerception:
         """Nothing, as `add`."""
 
     def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
-        """See Perception."""
         fixed_ns = None if self._frame.is_reversed else last_fix_ns
         return with_calibration(estimate, self._calibration, self._rig, fixed_ns, was_localized=was_localized)
 

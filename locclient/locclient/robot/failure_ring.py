@@ -76,7 +76,6 @@ class Said:
 
     @classmethod
     def of(cls, estimate: Estimate) -> "Said":
-        """Of an estimate."""
         radius_m = None if estimate.cov_rot_trans is None else radius_95_m(estimate.cov_rot_trans)
         return cls(estimate.status.value, estimate.cause.value, estimate.map_from_body, radius_m)
 
@@ -101,7 +100,6 @@ class KeptFrame:
 
     @property
     def stamp_ns(self) -> int:
-        """Of the frame."""
         return self.odometry.stamp_ns
 
 
@@ -191,17 +189,14 @@ class FailureRing:
     # --- as Perception ------------------------------------------------------------------------------------------------
 
     def handle_imu(self, samples: ImuSamples) -> None:
-        """See Perception."""
         self._inputs.imu.append(samples)
         self._inner.handle_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """See Perception."""
         self._inputs.wheel.extend(samples)
         self._inner.handle_wheel(samples)
 
     def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
-        """See Perception."""
         self._seen = frame
         if not self._segments:  # priors and maps until now are in the state
             self._begin_segment()
@@ -209,32 +204,27 @@ class FailureRing:
         return self._inner.judge(frame)
 
     def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
-        """See Perception."""
         odometry, image = self._inner.follow(frame, image)
         kept = replace(odometry, track_ids=_NO_TRACKS, track_pixels=None, revised=())
         self._frame, self._inputs = KeptFrame(self._inputs, kept, image), Inputs()
         return odometry, image
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Motion."""
         assert self._frame is not None
         found = self._frame.motions[frame_index] = self._inner.motion_since(frame_index)
         return found
 
     def will_forget(self, frame_index: int) -> bool:
-        """See Motion."""
         assert self._frame is not None
         found = self._frame.forgotten[frame_index] = self._inner.will_forget(frame_index)
         return found
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        """See Perception."""
         assert self._frame is not None
         found = self._frame.is_reversed = self._inner.is_reversed(frame, is_localized=is_localized)
         return found
 
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """See Perception."""
         assert self._frame is not None
         if self._query is not None and self._query.features is not None:
             self._query.features.frame = None  # nothing more is measured in it

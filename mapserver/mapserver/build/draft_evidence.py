@@ -189,7 +189,6 @@ class DraftMap(NamedTuple):
         return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
 
     def starts(self, frames: Sequence[Probe]) -> Starts | None:
-        """See `starts_without_prior`."""
         return starts_without_prior(self.view(), frames)
 
 

@@ -127,7 +127,6 @@ class ImageSpill:
         self._features.close()
 
     def put(self, pictures: Pictures) -> int:
-        """See ImageStore."""
         frame, number = pictures.frame, len(self._places)
         parts = (frame.left, frame.right, frame.disparity_px)
         with disk_errors(f"picture {number} of the survey cannot be set aside", "make space beside the store"):
@@ -136,7 +135,6 @@ class ImageSpill:
         return number
 
     def get(self, number: int) -> Pictures:
-        """See ImageStore."""
         if number not in self._held:
             place = self._places[number]
             left, right, disparity = self._file.get(place)
@@ -145,17 +143,14 @@ class ImageSpill:
         return self._held[number]
 
     def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        """See ImageStore."""
         with disk_errors("what a keyframe shows cannot be set aside", "make space beside the store"):
             return [self._features.put(array) for array in arrays]
 
     def release(self) -> None:
-        """See ImageStore."""
         self._features.release()
         give_back_free_memory()
 
     def another(self) -> "ImageSpill":
-        """See ImageStore."""
         return ImageSpill(self._folder)
 
     def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
@@ -178,11 +173,9 @@ class KeptFrames:
         self.keeps = True
 
     def stored(self, index: int) -> "StoredFrame":
-        """See FrameSource."""
         return self._source.stored(index)
 
     def frame(self, index: int) -> CameraFrame:
-        """See FrameSource."""
         if self._file is not None and index in self._places:
             place = self._places[index]
             return CameraFrame(place.stamp_ns, *self._file.get(place))
@@ -204,11 +197,9 @@ class KeptFrames:
         return self._source.part(indices)
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
-        """See FrameSource."""
         self._source.hash_into(digest)
 
     def close(self) -> None:
-        """See FrameSource."""
         self._source.close()
         if self._file is not None:
             self._file.close()

@@ -37,11 +37,9 @@ class RecordedParts:
 
     @property
     def stamps_ns(self) -> Stamps:
-        """See FrameParts."""
         return self.recording.frame_stamps_ns[self.indices]
 
     def part(self, first: int, end: int) -> Iterable[CameraFrame]:
-        """See FrameParts."""
         part = self.recording.part(self.indices[first:end])
         return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
 
@@ -94,7 +92,6 @@ class SurveyBeginnings:
 
     @property
     def executor(self) -> Executor:
-        """That of the surveys."""
         return self._tools.executor
 
     def follow(self, recording: Recording, indices: NDArray[np.int64], *, is_given: bool) -> Follow | None:
@@ -130,11 +127,9 @@ class _Estimating:
     stretch: CalibrationData
 
     def done(self) -> bool:
-        """See Work."""
         return False
 
     def result(self) -> CalibrationEstimate:
-        """See Work."""
         return estimate_from([self.stretch])
 
 
@@ -150,11 +145,9 @@ class _EstimatingBeside:
     is_good: bool = False
 
     def done(self) -> bool:
-        """See Work."""
         return self.estimate.done()
 
     def result(self) -> CalibrationEstimate:
-        """See Work."""
         tools = replace(self.tools, progress=self._progress)
         # What cannot be finished says so when the examination is over.
         with suppress(FleetmapError, _InVainError):

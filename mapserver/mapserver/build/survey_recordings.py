@@ -161,12 +161,10 @@ class OpenRecordings:
 
     @property
     def trajectory(self) -> OtherTrajectory | None:
-        """See RecordingOptions."""
         return self._options.trajectory
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
-        """See RecordingOptions."""
         if path != self._path:
             self.__exit__()
             recording, indices = self._options.opened(path)

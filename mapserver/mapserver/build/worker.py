@@ -47,16 +47,13 @@ class Threads:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Executor."""
         return _in_order(lambda batch: self._pool.submit(function, shared, batch), Future.result, batches, self._ahead)
 
     @property
     def nearby(self) -> Executor:
-        """See Executor."""
         return self
 
     def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
-        """See Executor."""
         return None if self._side is None else self._side.submit(function, *arguments)
 
 
@@ -180,7 +177,6 @@ class Processes:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Executor."""
         if self._shared is not shared or not self._files:
             for old in self._files[:-1]:
                 old.unlink()
@@ -195,11 +191,9 @@ class Processes:
 
     @property
     def nearby(self) -> Executor:
-        """See Executor."""
         return SERIAL
 
     def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
-        """See Executor."""
         return None
 
 
@@ -218,7 +212,6 @@ class Cluster:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Executor."""
         if self._shared[0] is not shared:
             packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
             self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])
@@ -232,11 +225,9 @@ class Cluster:
 
     @property
     def nearby(self) -> Executor:
-        """See Executor."""
         return SERIAL
 
     def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
-        """See Executor."""
         return None
 
 

@@ -249,7 +249,6 @@ class MapData:
         return self._store.events(site, span_ns)[::-1][:_EVENTS_SHOWN]
 
     def job(self, number: int) -> JobInfo:
-        """One job."""
         return self._store.job(number)
 
     def publish(self, site: str, version: int, actor: Actor) -> str:
@@ -267,7 +266,6 @@ class MapData:
         return f"Version {version} is current."
 
     def start_trial(self, site: str, version: int, actor: Actor) -> str:
-        """Starts a trial of a version."""
         if job := self._desk.ask("try", site, actor, version, self.trial_share):
             return _asked(job)
         releases.start_canary(self._store, site, version, self.trial_share, actor=actor, gate=self._gate)

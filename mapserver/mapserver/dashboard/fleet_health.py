@@ -104,7 +104,6 @@ class HealthData:
         return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
 
     def failure(self, number: int) -> FailureDetail:
-        """One failure."""
         return self._store.fleet.failure(number)
 
     def cameras(self, site: str) -> dict[str, CameraNote]:

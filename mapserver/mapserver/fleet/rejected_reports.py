@@ -35,7 +35,6 @@ class RejectedReports:
         self._folder = folder
 
     def keep(self, site: str, robot: str, payload: bytes, reason: str, now_ns: int) -> None:
-        """Keeps one."""
         _log.warning("a failure of robot %r of site %r is refused for good: %s", robot[:80], site[:80], reason)
         try:
             check_no_link(self._folder.parent, self._folder)

@@ -44,16 +44,13 @@ class SerialExecutor:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """See Executor."""
         return (function(shared, batch) for batch in batches)
 
     @property
     def nearby(self) -> Executor:
-        """See Executor."""
         return self
 
     def beside(self, function: Callable[..., Result], *arguments: Any) -> Work[Result] | None:
-        """See Executor."""
         return None
 
 

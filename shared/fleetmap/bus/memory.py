@@ -80,7 +80,6 @@ class MemoryBus(Bus):
         return data
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
-        """See Bus."""
         check_size(payload, key)
         hub = self._hub
         with hub.lock:
@@ -104,7 +103,6 @@ class MemoryBus(Bus):
         return LatchedPublisher(put, lambda: None)
 
     def session_id(self) -> str:
-        """See Bus."""
         return f"{id(self):x}"
 
     def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
@@ -112,11 +110,9 @@ class MemoryBus(Bus):
         return self._declare(self._hub.subscribers, (key_expr, listen, self._certificate))
 
     def declare_alive(self, key: str) -> Handle:
-        """See Bus."""
         return self._declare(self._hub.tokens, (key, self._certificate))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
-        """See Bus."""
         hub = self._hub
         if not hub.reachable or not hub.passes(self._certificate, Direction.IN, Act.LOOK_FOR_ALIVE, key_expr):
             return []
@@ -133,15 +129,12 @@ class MemoryBus(Bus):
         return sorted(name for name in self._hub.certificates if name)
 
     def connected(self) -> bool:
-        """See Bus."""
         return self._hub.reachable and len(self._hub.certificates) > 1 and not self.closed()
 
     def closed(self) -> bool:
-        """See Bus."""
         return self._handles is None
 
     def close(self) -> None:
-        """See Bus."""
         handles, self._handles = self._handles, None
         if handles is not None:
             self._hub.certificates.remove(self._certificate)

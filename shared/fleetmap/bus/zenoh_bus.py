@@ -142,8 +142,6 @@ class ZenohBus(Bus):
                     time.sleep(_RETRY_S)
 
     def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
-        """See Bus."""
-
         def reply(query: Any, key: str) -> None:
             # Leaving the block ends the question: without it the asker would wait for its timeout.
             with query:
@@ -192,7 +190,6 @@ class ZenohBus(Bus):
         raise no_answer(key, timeout_s, is_silenced=self._tls is not None and self.connected())
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
-        """See Bus."""
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
         beside = {"attachment": attachment} if attachment else {}
         check_size(payload, key)
@@ -217,12 +214,9 @@ class ZenohBus(Bus):
         return LatchedPublisher(put, partial(self._undeclare, declared))
 
     def session_id(self) -> str:
-        """See Bus."""
         return str(self._guarded(lambda session: session.zid()))
 
     def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
-        """See Bus."""
-
         def take(sample: Any) -> None:
             key = str(sample.key_expr)
             size = _size(sample, key)
@@ -242,11 +236,9 @@ class ZenohBus(Bus):
         return self._declare(lambda session: session.declare_subscriber(key_expr, direct), queue.close)
 
     def declare_alive(self, key: str) -> Handle:
-        """See Bus."""
         return self._declare(lambda session: session.liveliness().declare_token(key))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
-        """See Bus."""
         # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
         channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
         replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=timeout_s))
@@ -258,14 +250,12 @@ class ZenohBus(Bus):
         return sorted(link.auth_identifier for link in links if link.auth_identifier)
 
     def connected(self) -> bool:
-        """See Bus."""
         session = self._session
         if session is None or session.is_closed():
             return False
         return bool(session.info.routers_zid() or session.info.peers_zid())
 
     def closed(self) -> bool:
-        """See Bus."""
         return self._is_closed
 
     def close(self) -> None:

@@ -35,7 +35,6 @@ class Features:
         return len(self.pixels)
 
     def take(self, indices: NDArray[np.int64]) -> "Features":
-        """The features at `indices`."""
         return Features(
             self.pixels[indices], self.octaves[indices], self.angles_deg[indices], self.descriptors[indices]
         )

@@ -89,19 +89,15 @@ class WindowMode(Mode):
 
     @property
     def stamp_ns(self) -> int:
-        """See Mode."""
         return self.window.stamp_ns
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Mode."""
         return self.window.motion_since(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
-        """See Mode."""
         return frame_index not in self.window.filter.clone_ids[1:]
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """See Mode."""
         window_filter, used = self.window.filter, step.used
         state = window_filter.state
         status = OdometryStatus.INITIALISING if self.waits_for_gravity else OdometryStatus.TRACKING
@@ -315,7 +311,6 @@ class InertialMode(WindowMode):
         return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
 
     def predict(self, stamp_ns: int) -> None:
-        """See Mode."""
         window, imu = self.window, self._imu
         self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
@@ -329,7 +324,6 @@ class InertialMode(WindowMode):
         window.stamp_ns = max(end_ns, window.stamp_ns)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """See Mode."""
         return self.window.cam_from_earlier(frame_index)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:

@@ -108,11 +108,9 @@ class VideoFrames:
         return StoredFrame(self._stamps_ns[index], grey_image(_luma(self._at(index)), where))
 
     def frame(self, index: int) -> CameraFrame:
-        """Frame `index`."""
         return decode_frame(self.stored(index))
 
     def part(self, indices: NDArray[np.int64]) -> "VideoFrames":
-        """See FrameSource."""
         chosen = indices.tolist()
         pts, stamps_ns = (tuple(values[i] for i in chosen) for values in (self._pts, self._stamps_ns))
         return VideoFrames(self._read_files, self._keys, pts, stamps_ns)
@@ -123,7 +121,6 @@ class VideoFrames:
             hash_file(path, digest)
 
     def close(self) -> None:
-        """Closes the video."""
         if self._video is not None:
             self._video.close()
         self._video, self._last, self._is_closed = None, None, True

@@ -23,7 +23,6 @@ class RecordingSource:
         self.has_depth = recording.sensor_set is SensorSet.RGBD
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        """See Source."""
         begun_s, recorded_s = self._clock_s(), 0.0
         for number, imu in enumerate(self._source.imu_before_each()):
             if number:
@@ -45,7 +44,6 @@ class RecordingSource:
                 intake.count_unreadable(str(error))
 
     def close(self) -> None:
-        """See Source."""
         self._recording.close()
 
     def _ahead_s(self, recorded_s: float, begun_s: float) -> float:

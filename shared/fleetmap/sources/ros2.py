@@ -57,7 +57,6 @@ class Ros2Source:
                 self._topics += [(name, partial(self._take_image, side)) for name in names]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        """See Source."""
         handles = self.subscribe(intake)
         try:
             while not wait(_IDLE_S):
@@ -75,7 +74,6 @@ class Ros2Source:
         ]
 
     def close(self) -> None:
-        """See Source."""
         self._bus.close()
 
     def _handle(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:

@@ -50,7 +50,6 @@ class UvcSource:
         self.calibration, self.has_depth = calibration, False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        """See Source."""
         handles = [] if self._topics is None else self._topics.subscribe(intake)
         try:
             while not wait(0.0):
@@ -66,7 +65,6 @@ class UvcSource:
                 handle.close()
 
     def close(self) -> None:
-        """See Source."""
         if self._topics is not None:
             self._topics.close()
 

@@ -205,7 +205,6 @@ class _ProcessedFrames:
         return process_frame(self.source.frame(index), self.pipeline, self.seed)
 
     def part(self, indices: NDArray[np.int64]) -> "_ProcessedFrames":
-        """See FrameSource."""
         return replace(self, source=self.source.part(indices))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:

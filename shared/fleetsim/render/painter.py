@@ -154,7 +154,6 @@ class Painter:
         return seen
 
     def _add(self, canvas: Canvas, instant: Instant, map_from_cam: Array, t_s: float) -> None:
-        """Adds one instant to the canvas."""
         shadows = self._move(t_s)
         pinhole, world, plan, mirror = self._optics.pinhole, self._world, self._plan, self._mirror_plan
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])

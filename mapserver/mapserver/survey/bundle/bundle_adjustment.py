@@ -18,7 +18,7 @@ from mapserver.survey.bundle.problem import (
     RelativeTerm,
     continued,
 )
-from mapserver.survey.bundle.reduced_system import Chains, ReducedSystem, build_chains, marginal_blocks, solve_reduced
+from mapserver.survey.bundle.reduced_system import Chains, ReducedSystem, build_chains, solve_reduced
 from mapserver.survey.bundle.reprojection_kernels import (
     ImageNormal,
     Measured,
@@ -40,7 +40,6 @@ __all__ = [
     "PriorTerm",
     "RelativeTerm",
     "continued",
-    "keyframe_covariances",
     "optimize",
 ]
 
@@ -75,23 +74,6 @@ def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
         converged = costs[-1] - cost <= settings.relative_cost_tolerance * cost
         costs.append(cost)
     return bundle.result(costs, iterations, converged)
-
-
-def keyframe_covariances(problem: BundleProblem, keyframes: Array | None = None, huber_sigmas: float = 2.5) -> Array:
-    """Marginal covariances (n, 6, 6) of the poses of `keyframes` (all by default), rotation first, in map axes.
-
-    Everything else is marginalised, at the problem's values. Zero for held keyframes. Dense: for up to some thousand
-    unknowns. gtsam's convention (both in body axes) is blockdiag(R, R)^T C blockdiag(R, R).
-    """
-    bundle = _Bundle(problem, BundleSettings(huber_sigmas=huber_sigmas))
-    bundle.linearise()
-    wanted = np.arange(len(problem.map_from_body)) if keyframes is None else np.asarray(keyframes)
-    slots = bundle.structure.slots[wanted]
-    free = bundle.structure.free[:, :6]
-    covariances = np.zeros((len(wanted), 6, 6))
-    marginals = marginal_blocks(bundle.reduced(0.0), slots[slots >= 0])
-    covariances[slots >= 0] = marginals * (free[slots[slots >= 0], :, None] & free[slots[slots >= 0], None, :])
-    return covariances
 
 
 class _Bundle:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array
 from fleetmap.inertial import preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
@@ -64,11 +64,6 @@ class SurveyState:
     motion: KeyframeMotion
     landmarks: Landmarks
     is_depth_camera: bool = False
-
-    def cam_from_cam(self, j: int, i: int) -> Array:
-        """camera j from camera i (4, 4)."""
-        map_from_cam = self.map_from_body[[j, i]] @ self.body_from_cam
-        return np.asarray(se3_inverse(map_from_cam[0]) @ map_from_cam[1])
 
 
 def bundle_rounds(

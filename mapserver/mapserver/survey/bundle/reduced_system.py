@@ -101,18 +101,6 @@ def solve_dense(system: ReducedSystem) -> Array | None:
     return np.asarray(step, np.float64).reshape(system.rhs.shape)
 
 
-def marginal_blocks(system: ReducedSystem, slots: AnyArray) -> Array:
-    """(n, 6, 6) pose blocks of the inverse of S, dense; scaled first, as biases and metres differ by magnitudes."""
-    upper = dense_lower(system)
-    scale = 1.0 / np.sqrt(np.diag(upper))
-    factor = scipy.linalg.cho_factor(upper * np.outer(scale, scale), lower=False, overwrite_a=True, check_finite=False)
-    rows = (system.rhs.shape[1] * slots[:, None] + np.arange(6)).astype(np.int64)
-    units = np.zeros((len(upper), rows.size))
-    units[rows.ravel(), np.arange(rows.size)] = scale[rows.ravel()]
-    columns = scipy.linalg.cho_solve(factor, units, check_finite=False) * scale[:, None]
-    return np.array([columns[rows[n], 6 * n : 6 * n + 6] for n in range(len(slots))]).reshape(-1, 6, 6)
-
-
 def solve_pcg(system: ReducedSystem, settings: BundleSettings) -> Array | None:
     """The step by preconditioned conjugate gradients, None where they stall."""
     count, size = system.rhs.shape

@@ -55,23 +55,19 @@ class MemoryImageStore:
         self._pictures: list[Pictures] = []
 
     def put(self, pictures: Pictures) -> int:
-        """See ImageStore."""
         self._pictures.append(pictures)
         return len(self._pictures) - 1
 
     def get(self, number: int) -> Pictures:
-        """See ImageStore."""
         return self._pictures[number]
 
     def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        """See ImageStore."""
         return list(arrays)
 
     def release(self) -> None:
         """See ImageStore."""
 
     def another(self) -> AbstractContextManager[ImageStore]:
-        """See ImageStore."""
         return nullcontext(MemoryImageStore())
 
 

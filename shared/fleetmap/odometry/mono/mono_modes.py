@@ -133,7 +133,6 @@ class MonocularMode(Mode):
 
     @property
     def stamp_ns(self) -> int:
-        """See Mode."""
         return self._stamp_ns
 
     def resume(self, mode: VisualMode) -> None:
@@ -152,7 +151,6 @@ class MonocularMode(Mode):
         return self._visual_odometry.points_in_camera(ids)
 
     def predict(self, stamp_ns: int) -> None:
-        """See Mode."""
         self._stamp_ns = stamp_ns
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
@@ -164,7 +162,6 @@ class MonocularMode(Mode):
         return None
 
     def will_forget(self, frame_index: int) -> bool:
-        """See Mode."""
         return True
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:

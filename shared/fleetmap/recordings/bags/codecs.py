@@ -63,7 +63,6 @@ class RosCodec:
         return ros_messages.decode_image(self.cdr(channel, data), where)
 
     def imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
-        """Imu messages."""
         return ros_messages.decode_imu([self.cdr(channel, data) for data in messages])
 
     def pose(self, channel: Channel, data: bytes) -> tuple[int, Array]:

@@ -98,11 +98,9 @@ class BagFile(KeptBytes):
             )
 
     def issues(self) -> list[DataIssue]:
-        """See Container."""
         return self._issues
 
     def read(self, place: Place) -> bytes:
-        """See Container."""
         number, stamp_ns, count = place
         try:
             found = self._reader.messages([self._connections[number]], stamp_ns, stamp_ns + 1)
@@ -111,7 +109,6 @@ class BagFile(KeptBytes):
             raise RecordingError(f"{self.path}: {_reason(error, self.path)}") from error
 
     def close(self) -> None:
-        """See Container."""
         if self._reader.bio is not None:
             self._reader.close()
 

@@ -106,11 +106,9 @@ class SqliteFiles(KeptBytes):
             self._issues.append(DataIssue(f"{self.files[number].name}: damaged messages", f"{odd} rows left out"))
 
     def issues(self) -> list[DataIssue]:
-        """See Container."""
         return self._issues
 
     def read(self, place: Place) -> bytes:
-        """See Container."""
         number, row, _ = place
         try:
             found = self._databases[number].execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
@@ -124,7 +122,6 @@ class SqliteFiles(KeptBytes):
         return _unpacked(found[0])
 
     def close(self) -> None:
-        """See Container."""
         for database in self._databases:
             database.close()
 

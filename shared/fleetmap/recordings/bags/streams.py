@@ -137,7 +137,6 @@ class MessageFrames(SeriesFrames[tuple[_Stream, Place]]):
         self._is_closed = False
 
     def part(self, indices: NDArray[np.int64]) -> "MessageFrames":
-        """See FrameSource."""
         return self.like(MessageFrames(self._opener, None, self._read_files, *self.taken(indices)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:

@@ -92,7 +92,6 @@ class FileFrames(SeriesFrames[Path]):
         self.root, self.read_files = root, read_files
 
     def part(self, indices: NDArray[np.int64]) -> "FileFrames":
-        """See FrameSource."""
         return self.like(FileFrames(self.root, self.read_files, *self.taken(indices)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:

@@ -138,7 +138,6 @@ class RegisteredFrames:
         return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
 
     def part(self, indices: NDArray[np.int64]) -> "RegisteredFrames":
-        """See FrameSource."""
         return RegisteredFrames(self._files.part(indices), self._registration)
 
     def hash_into(self, digest: "hashlib._Hash") -> None:

@@ -41,12 +41,10 @@ class McapFile:
 
     @property
     def name(self) -> str:
-        """See Container."""
         return self._written("name")
 
     @property
     def attachments(self) -> Mapping[str, bytes]:
-        """See Container."""
         return self._scan.attachments
 
     def _written(self, key: str) -> str:
@@ -54,19 +52,15 @@ class McapFile:
         return self._scan.metadata.get("fleetmap", {}).get(key, "")
 
     def messages(self) -> Iterator[Message]:
-        """See Container."""
         return self._scan.messages()
 
     def issues(self) -> list[DataIssue]:
-        """See Container."""
         return [*self._scan.damage.all(), *([UNCERTAIN_STAMPS] if self._written("stamps") else [])]
 
     def read(self, place: Place) -> bytes:
-        """See Container."""
         return self._reader.read(Location(*place))
 
     def close(self) -> None:
-        """See Container."""
         self._file.close()
 
 

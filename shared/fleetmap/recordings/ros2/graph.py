@@ -70,19 +70,15 @@ class RmwZenohKeys:
         self._domain = domain
 
     def key(self, name: str, type_name: str) -> str:
-        """See KeyLayout."""
         return ros_key(self._domain, name, type_name)
 
     def subscription(self, topic: str) -> str:
-        """See KeyLayout."""
         return ros_key_expr(self._domain, topic)
 
     def type_of(self, key: str) -> str:
-        """See KeyLayout."""
         return type_of_key(key)
 
     def node_token(self, node: NodeName) -> str:
-        """See KeyLayout."""
         return f"@ros2_lv/{self._domain}/{node.session}/0/0/NN/{self._place(node)}"
 
     def token(self, node: NodeName, endpoint: Endpoint) -> str:
@@ -101,15 +97,12 @@ class BridgedDdsKeys:
     """Keys as zenoh-bridge-ros2dds makes them for robots on DDS."""
 
     def key(self, name: str, _: str) -> str:
-        """See KeyLayout."""
         return topic_chunks(name)
 
     def subscription(self, topic: str) -> str:
-        """See KeyLayout."""
         return topic_chunks(topic)
 
     def type_of(self, _: str) -> str:
-        """See KeyLayout."""
         return ""
 
     def node_token(self, node: NodeName) -> str:

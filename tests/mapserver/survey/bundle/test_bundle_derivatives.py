@@ -9,7 +9,6 @@ from mapserver.survey.bundle.bundle_adjustment import (
     MotionPrior,
     PriorTerm,
     RelativeTerm,
-    keyframe_covariances,
 )
 from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
 from mapserver.survey.bundle.reduced_system import dense_lower, solve_dense, solve_pcg, solve_sparse
@@ -117,15 +116,3 @@ def test_solvers_agree(inertial: bool) -> None:
     np.testing.assert_allclose(sparse, dense, atol=1e-8 * np.abs(dense).max())
     np.testing.assert_allclose(iterated, dense, atol=1e-6 * np.abs(dense).max())
     assert (dense[~system.structure.free] == 0).all()
-
-
-@pytest.mark.parametrize("inertial", [False, True])
-def test_covariances_are_blocks_of_the_inverse(inertial: bool) -> None:
-    problem = _problem(inertial=inertial)
-    matrix, _ = _eliminated(problem)
-    inverse = np.linalg.inv(matrix)
-    start = (9 if inertial else 0) + (15 if inertial else 6)  # keyframe 0 is held, only its motion is free
-    ours = keyframe_covariances(problem, np.array([0, 2]), huber_sigmas=1e9)
-    np.testing.assert_allclose(ours[0], 0.0)
-    expected = inverse[start : start + 6, start : start + 6]
-    np.testing.assert_allclose(ours[1], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
