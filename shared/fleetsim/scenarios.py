@@ -221,14 +221,14 @@ def _whole_drive(layout: Layout) -> Route:
 _CENTRE = Layout(aisles=60, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
 
 
-def _block_surveys(layout: Layout, south: range, north: range, rate_hz: float = 15.0) -> dict[str, Run]:
+def _block_surveys(layout: Layout, south: range, north: range) -> dict[str, Run]:
     """Two blocks of neighbouring aisles, each driven there and, for `-back`, the other way."""
     drives = [
         (name, block, is_back) for is_back in (False, True) for name, block in (("south", south), ("north", north))
     ]
     return {
         f"survey-{name}" + ("-back" if is_back else ""): Run(
-            "surveyor", (_block_drive(layout, block, is_reversed=is_back),), rate_hz, is_sharp=True, zone_period_s=20.0
+            "surveyor", (_block_drive(layout, block, is_reversed=is_back),), is_sharp=True, zone_period_s=20.0
         )
         for name, block, is_back in drives
     }
@@ -241,12 +241,6 @@ def _fulfilment_centre() -> Scenario:
     return Scenario("a centre of 40,000 m2: 60 like aisles, cross aisles, packing; four surveys see all", _CENTRE, runs)
 
 
-def _fulfilment_wing() -> Scenario:
-    runs = _block_surveys(_CENTRE, range(6), range(6, 12), rate_hz=10.0)
-    runs["tote-1"] = Run("tote", (_loop(_CENTRE, 4, 7, shift_m=0.2),), zone_period_s=20.0)
-    return Scenario("twelve aisles of that centre: four surveys of 3 km in all see them both ways", _CENTRE, runs)
-
-
 # Functions, so that listing them builds nothing.
 SCENARIOS = {
     "clip": _clip,
@@ -257,7 +251,6 @@ SCENARIOS = {
     "identical-aisles": _identical,
     "marked-ends": _marked_ends,
     "site": _site,
-    "fulfilment-wing": _fulfilment_wing,
     "fulfilment-centre": _fulfilment_centre,
 }
 

@@ -131,8 +131,6 @@ class ImagePipeline:
 IMAGE_PIPELINES = {
     "clean": ImagePipeline(),
     "soft": ImagePipeline(blur_px=1.5, corner_loss=0.4, gain=1.0),
-    "bayer-sharp": ImagePipeline(blur_px=0.7, gain=1.0, has_bayer=True, gamma=2.2, sharpening=(1.0, 1.0)),
-    "rescaled-jpeg": ImagePipeline(blur_px=0.5, gain=1.0, rescaling=0.8, jpeg_quality=80),
     "phone": ImagePipeline(
         blur_px=1.0, corner_loss=0.3, flicker=0.08, gain=4.0, has_bayer=True, gamma=2.2, sharpening=(1.2, 1.5),
         rescaling=1.25, jpeg_quality=80,
