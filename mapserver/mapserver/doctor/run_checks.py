@@ -19,6 +19,7 @@ from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.depth import depth_share, measured_depth
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
+from mapserver.doctor.flicker import flicker_check
 from mapserver.doctor.gyro_images import AXES, CameraTurns, gyro_check, turn_upside_down
 from mapserver.doctor.lens import lens_check
 from mapserver.doctor.metres import ImageMetres, Metres
@@ -153,7 +154,8 @@ def run_checks(
         checked = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in checked]
     axes, metres = judged(turns)
     findings += [*checked, axes, metres.wheels_finding(), metres.metres_finding()]
-    findings += [*calibration.findings, sharpness(seen.variances), _readable(frames)]
+    findings += [*calibration.findings, sharpness(seen.variances), flicker_check(recording, frames.read)]
+    findings += [_readable(frames)]
     findings += [repeated_images(frames.repeats, min(turn_frames, len(recording)))] if len(imu) else []
     return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
 

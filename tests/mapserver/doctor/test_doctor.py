@@ -19,6 +19,7 @@ from mapserver.calibration import CalibrationParameter
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.findings import grouped, not_judged, summary
+from mapserver.doctor.flicker import flicker_check
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro, gyro_check
 from mapserver.doctor.inertial import gravity_magnitude
 from mapserver.doctor.run_checks import TURN_FRAMES, _camera_turns, _Frames
@@ -91,7 +92,7 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
     bad = {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK}
     assert set(bad.values()) == {Verdict.NOT_JUDGED}
     assert "baseline" in bad  # a second of turning on the spot excites no accelerometer
-    assert len({f.name for f in findings}) == len(findings) == 20 + len(CalibrationParameter)
+    assert len({f.name for f in findings}) == len(findings) == 21 + len(CalibrationParameter)
 
 
 @pytest.mark.parametrize(
@@ -111,6 +112,25 @@ def test_faults_in_the_images(
     assert says in finding.sentence
     if name == "epipolar error":
         assert finding.value == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("share", "bands", "verdict"),
+    [(0.0, 0, Verdict.OK), (0.1, 0, Verdict.WARN), (0.2, 0, Verdict.FAIL), (0.2, 2, Verdict.WARN)],
+)
+def test_light_that_flickers_is_named(good: Recording, share: float, bands: int, verdict: Verdict) -> None:
+    """Every other frame is darker; or, with a rolling shutter, stripes of it wander."""
+
+    def lit(frame: CameraFrame) -> CameraFrame:
+        number = int(np.searchsorted(good.frame_stamps_ns, frame.stamp_ns))
+        rows = np.arange(frame.left.shape[0])[:, None] / frame.left.shape[0]
+        wave = np.sin(2 * np.pi * (0.4 * number + bands * rows)) if bands else (-1.0) ** number
+        return replace(frame, left=np.clip(frame.left * (1 + share * wave), 0, 255).astype(np.uint8))
+
+    flickering = replace(good, frames=ChangedFrames(good, lit))
+    finding = flicker_check(flickering, flickering.read_frame)
+    assert finding.verdict is verdict, finding
+    assert ("10 ms where the mains have 50 Hz" in finding.sentence) == (verdict is not Verdict.OK)
 
 
 @pytest.mark.parametrize("late_s", [-0.040, 0.030])
