@@ -12,6 +12,7 @@ from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.wheel_images import WheelFit
 
 WHEELS, METRES = "wheels", "metric scale"
+_RESTS_MPS = 0.05  # images of a camera at rest show less, by their noise
 _OFF = 1.3  # a ratio beyond this contradicts; what is nearer to 1 is measured with the calibration
 _SURE_SIGMAS = 3.0
 _KNOWN_SHARE = 0.2  # a ratio that is not known to a fifth decides nothing
@@ -101,6 +102,8 @@ class Metres:
             and _is_off(*self.by_gravity)
             and (ratio is None or fit is None or _is_off(ratio, fit.speed_sigma))
         )
+        if self._disagree and fit is not None:
+            measured = f"the wheels drive at {fit.wheel_mps:.2g} m/s where the images move at {fit.image_mps:.2g} m/s, in no steady ratio"
         if self._blamed() in ("images", "either") or (is_off and self._blamed() != WHEELS):
             if self._blamed() == "either":
                 advice += " and the wheels' unit and radius: nothing tells which of them is wrong"
@@ -117,11 +120,20 @@ class Metres:
         shown += f" and the cameras move at {self.image_mps:.2g} m/s" if self.image_mps else ""
         return not_judged(METRES, shown, "record an IMU, with starts, stops and turns, or wheel odometry")
 
+    @property
+    def _disagree(self) -> bool:
+        """True for images that move by their own metres, but in no ratio to the wheels, as with depths ten times too small."""
+        fit = self.wheels
+        is_unknown = fit is not None and fit.speed is not None and not np.isfinite(fit.speed)
+        return fit is not None and is_unknown and fit.image_mps > _RESTS_MPS
+
     def _wheel_fault(self, fit: WheelFit) -> str:
         speed = fit.speed
         if speed is not None:
-            if not np.isfinite(speed):
+            if not np.isfinite(speed) and not self._disagree:
                 return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: see whether the pictures change"
+            if self._disagree:
+                return ""
             if abs(speed) < 0.01 and fit.wheel_mps < 0.01 * fit.image_mps:
                 return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: see whether odometry is published"
             angle_deg = float(np.degrees(np.angle(speed)))
@@ -151,6 +163,8 @@ class Metres:
     def _blamed(self) -> str:
         """Which of wheels and images is wrong about metres: `either` where nothing tells, empty where they agree or one is not known."""
         fit = self.wheels
+        if self._disagree:
+            return "either"
         ratio = None if fit is None else _size(fit)
         if fit is None or ratio is None or not _is_off(ratio, fit.speed_sigma):
             return ""

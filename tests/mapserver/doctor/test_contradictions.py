@@ -143,6 +143,43 @@ def test_what_everything_contradicts_is_named(ride: Recording, case: str) -> Non
         assert words in failed[name]
 
 
+class ScaledDepths:
+    """The frames of a recording, their depths in another unit."""
+
+    def __init__(self, recording: Recording, factor: float) -> None:
+        self._frames, self._factor = recording.frames, np.float32(factor)
+        self.stored, self.hash_into, self.close = self._frames.stored, self._frames.hash_into, self._frames.close
+
+    def frame(self, index: int) -> CameraFrame:
+        found = self._frames.frame(index)
+        assert found.depth_m is not None
+        return replace(found, depth_m=found.depth_m * self._factor)
+
+
+@pytest.mark.parametrize(
+    ("factor", "has_wheels", "says"),
+    [
+        (1.0, True, ""),
+        (10.0, True, "0.0998 m by the wheels; check the unit of the depth images and the wheels"),
+        (0.1, True, "in no steady ratio; check the unit of the depth images"),
+        (1000.0, False, "a median depth of 2817 m"),
+        (0.001, False, "a median depth of 0.002817 m"),
+    ],
+)
+def test_depths_in_another_unit(
+    tmp_path_factory: pytest.TempPathFactory, factor: float, has_wheels: bool, says: str
+) -> None:
+    """Whose fault it is nothing tells where wheels and depths alone know metres: no wheels are left out for it."""
+    path = tmp_path_factory.mktemp("rgbd") / "ride.mcap"
+    write_ride(path, Ride(4.0, 2.4), SensorSet.RGBD)
+    with open_recording(path) as good:
+        wheels = good.wheel if has_wheels else ()
+        found = run_checks.run_checks(replace(good, frames=ScaledDepths(good, factor), wheel=wheels), sampled=20)
+    failed = {f.name: f.sentence for f in found.findings if f.verdict is Verdict.FAIL}
+    assert (says in failed["metric scale"]) if says else not failed
+    assert "wheels" not in failed
+
+
 @pytest.mark.parametrize(("brightness", "verdict"), [(0, Verdict.OK), (90, Verdict.FAIL)])
 def test_dots_of_a_projector_that_moves_with_the_camera(ride: Recording, brightness: int, verdict: Verdict) -> None:
     """And nothing is found in the same pictures without them."""
