@@ -1,12 +1,13 @@
-"""Check of the accelerometer: at rest it measures gravity."""
+"""Checks by the IMU alone: the accelerometer at rest measures gravity, and how turns skew the images of a rolling shutter."""
 
 import numpy as np
 
+from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.timing import RECORD_IMU
 
-NAME = "gravity magnitude"
+NAME, ROLLING = "gravity magnitude", "rolling shutter"
 GRAVITY_MPS2 = 9.81
 # What a calm accelerometer shows instead, by a tenth: what that is
 _ODD = {
@@ -17,6 +18,22 @@ _ODD = {
     1000.0: "it is in thousandths of g: multiply it by 0.00980665",
 }
 _WINDOW_S = 0.5
+
+
+def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]:
+    """By how much turns skew an image whose rows are read one after another; nothing for a global shutter."""
+    readout_s = camera.line_delay_s * camera.height_px
+    if not readout_s:
+        return []
+    told = f"the rows of an image are read within {readout_s * 1e3:.1f} ms by the calibration's line_delay, which is not corrected"
+    if not len(imu):
+        return [not_judged(ROLLING, told, "record an IMU, or use a camera with a global shutter")]
+    rate_radps = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 95))
+    skew_px = rate_radps * readout_s * float(camera.intrinsics_px[0])
+    words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is {skew_px:.1f} px from where the first would be"
+    verdict = Verdict.WARN if skew_px > 1.0 else Verdict.OK
+    advice = "" if verdict is Verdict.OK else "; turn more slowly, or use a camera with a global shutter"
+    return [Finding(ROLLING, verdict, skew_px, "warn above 1 px", words + advice)]
 
 
 def gravity_magnitude(imu: ImuSamples) -> Finding:

@@ -187,7 +187,8 @@ class _Seen:
 def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen, frames: _Frames) -> list[Finding]:
     imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
     overlap = timing.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
-    findings = [overlap, inertial.gravity_magnitude(imu), fixed_pattern(seen.structures)]
+    shutter = inertial.rolling_shutter(recording.calibration.cameras[0], imu)
+    findings = [overlap, inertial.gravity_magnitude(imu), *shutter, fixed_pattern(seen.structures)]
     if recording.sensor_set in _PAIRS:
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
     if recording.sensor_set is SensorSet.RGBD:

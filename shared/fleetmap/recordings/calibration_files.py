@@ -133,6 +133,8 @@ def format_calibration(calibration: RigCalibration) -> str:
         out.write(f"  intrinsics: {_row(camera.intrinsics_px)}\n  distortion_coeffs: {_row(camera.distortion)}\n")
         out.write(f"  resolution: [{camera.width_px}, {camera.height_px}]\n")
         out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
+        if camera.line_delay_s:
+            out.write(f"  line_delay: {camera.line_delay_s!r}\n")
         out.write(f"  T_cam_imu:\n{_rows(se3_inverse(camera.body_from_cam), '  ')}")
         out.write(f"  body_from_cam:\n{_rows(camera.body_from_cam, '  ')}")
     if calibration.imu is None:
@@ -270,7 +272,14 @@ def _camera(values: Values, distortion_key: str, where: str) -> CameraCalibratio
         _need(values, distortion_key, where)
     coefficients = _numbers(values.get(distortion_key, []), None, f"{where}: {distortion_key}")
     model, distortion = lens_of(name, coefficients, where)
-    return CameraCalibration(model, int(width), int(height), intrinsics, distortion, np.eye(4))
+    line_delay_s = float(_numbers([values.get("line_delay", 0.0)], 1, f"{where}: line_delay")[0])
+    if not 0 <= line_delay_s * height < 1.0:
+        raise CalibrationError(
+            f"{where}: line_delay is {line_delay_s:g} s, {line_delay_s * height:g} s for {height:g} rows; write the seconds from row to row"
+        )
+    return CameraCalibration(
+        model, int(width), int(height), intrinsics, distortion, np.eye(4), line_delay_s=line_delay_s
+    )
 
 
 def _imu_noise(values: Values, where: str) -> ImuNoise | None:

@@ -14,7 +14,8 @@ class CameraCalibration:
     """One camera.
 
     model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy. body_from_cam (4, 4).
-    imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu).
+    imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu). line_delay_s: from
+    one row to the next of a rolling shutter, 0 for a global one; it is reported and not corrected.
     """
 
     model: str
@@ -24,11 +25,12 @@ class CameraCalibration:
     distortion: Array
     body_from_cam: Array
     imu_minus_cam_s: float = 0.0
+    line_delay_s: float = 0.0
 
     def __post_init__(self) -> None:
         # Files are read by numpy, whose scalars no encoder knows.
         _set_numbers(self, int, "width_px", "height_px")
-        _set_numbers(self, float, "imu_minus_cam_s")
+        _set_numbers(self, float, "imu_minus_cam_s", "line_delay_s")
 
     def pixel_from_ray(self, rays_cam: Array) -> Array:
         """(N, 2) pixels of rays (N, 3)."""

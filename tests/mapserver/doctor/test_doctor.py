@@ -10,8 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from fleetmap.errors import CalibrationError
 from fleetmap.geometry import so3_exp
-from fleetmap.recordings import Recording, open_recording
+from fleetmap.recordings import Recording, format_calibration, open_recording, read_calibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.build.sensor_subset import reduced
@@ -21,7 +22,7 @@ from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.findings import grouped, not_judged, summary
 from mapserver.doctor.flicker import flicker_check
 from mapserver.doctor.gyro_images import CameraTurns, fit_gyro, gyro_check
-from mapserver.doctor.inertial import gravity_magnitude
+from mapserver.doctor.inertial import gravity_magnitude, rolling_shutter
 from mapserver.doctor.run_checks import TURN_FRAMES, _camera_turns, _Frames
 from mapserver.doctor.sharpness import sharpness
 from mapserver.doctor.timing import camera_gaps, camera_imu_overlap, camera_rate, imu_gaps, imu_rate, stamp_order
@@ -112,6 +113,26 @@ def test_faults_in_the_images(
     assert says in finding.sentence
     if name == "epipolar error":
         assert finding.value == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("line_delay_s", "verdict"), [(1e-6, Verdict.OK), (1e-4, Verdict.WARN)])
+def test_a_rolling_shutter_is_said_as_far_as_it_is_known(
+    good: Recording, tmp_path: Path, line_delay_s: float, verdict: Verdict
+) -> None:
+    """Kalibr's line_delay; not a word of a shutter that nobody told of."""
+    camera = good.calibration.cameras[0]
+    assert rolling_shutter(camera, good.imu) == []
+    rig = replace(good.calibration, cameras=(replace(camera, line_delay_s=line_delay_s),))
+    (path := tmp_path / "rig.yaml").write_text(format_calibration(rig))
+    read = read_calibration(path).cameras[0]
+    assert read.line_delay_s == line_delay_s
+    (finding,) = rolling_shutter(read, good.imu)
+    assert finding.verdict is verdict
+    assert f"within {line_delay_s * camera.height_px * 1e3:.1f} ms" in finding.sentence
+    assert "not corrected" in finding.sentence
+    path.write_text(format_calibration(rig).replace(f"line_delay: {line_delay_s!r}", "line_delay: 33.0"))
+    with pytest.raises(CalibrationError, match="line_delay is 33 s"):
+        read_calibration(path)
 
 
 @pytest.mark.parametrize(
