@@ -65,6 +65,11 @@ class InitialPosePrior:
         made.hypothesis, made.contradictions = copied(state.hypothesis), list(all_copied(state.contradictions))
         return made
 
+    @property
+    def is_new(self) -> bool:
+        """True if no frame has come since."""
+        return self._since is None
+
     def capture(self) -> PriorState:
         """All of it, as values."""
         hypotheses = copied(self._since), copied(self.hypothesis), all_copied(self.contradictions)

@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Cause, Status
 from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry import OdometryEstimate, OdometryStatus, is_away
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
@@ -153,6 +153,10 @@ class Localizer:
         judged_s = self._clock()
         odometry, image = self.perception.follow(frame, image)
         tracked_s = self._clock()
+        if self._last_ns is not None and is_away(self._last_ns, odometry):
+            given = self._prior  # one that came since the last frame says where the robot is now
+            self.forget_pose()
+            self._prior = given if given is not None and given.is_new else None
         # Tracks are lost though the picture is sound: something came before the cameras, or the robot is elsewhere.
         has_broken = odometry.status is OdometryStatus.DEGRADED and image.cause is Cause.NONE
         self._propagate(odometry, has_broken)

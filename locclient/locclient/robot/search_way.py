@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from fleetmap.failure_definition import FIND_DRIVING_S, is_driving, is_usable, radius_95_m
 from fleetmap.messages import Cause, Status
+from fleetmap.sensors.samples import PAUSE_NS
 from locclient.localization.estimate import Estimate
 from locclient.robot.failure_monitor import failure_cause
 
@@ -39,8 +40,9 @@ class SearchWay:
     _last_ns: int | None = None
 
     def handle(self, estimate: Estimate, speed_mps: float | None, *, may_be_mapped: bool) -> None:
-        """Counts a frame, which speaks for the time since the one before."""
-        dt_s = 0.0 if self._last_ns is None else max(0, estimate.stamp_ns - self._last_ns) * 1e-9
+        """Counts a frame, which speaks for the time since the one before unless that was a pause."""
+        dt_ns = 0 if self._last_ns is None else max(0, estimate.stamp_ns - self._last_ns)
+        dt_s = dt_ns * 1e-9 if dt_ns <= PAUSE_NS else 0.0  # no speed is that of a whole pause
         self._last_ns = estimate.stamp_ns
         self._frames += 1
         is_fixed = estimate.fix is not None and is_usable(estimate.status, radius_95_m(estimate.cov_rot_trans))

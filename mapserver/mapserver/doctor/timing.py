@@ -19,6 +19,7 @@ _NOT_LOST = (
     "not sound",
     "stamps of zero",
     "stamps repeated",
+    "stamps far apart",
     "bits in 16",
     "not optical",
 )

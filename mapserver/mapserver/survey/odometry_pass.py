@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
-from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, make_odometry
+from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away, make_odometry
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
@@ -18,6 +18,7 @@ from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
+_AWAY_RAD, _AWAY_MPS = np.pi, 1.0  # in a pause: any turn, and the way at the speed of one who carries a robot
 _NO_IDS = np.zeros(0, np.int64)
 
 
@@ -168,22 +169,26 @@ class FrameChain:
 class ContinuedCovariance:
     """Covariance (6, 6) that continues across restarts of the odometry, whose own covariance is zero there.
 
-    A restart that loses gravity adds a wide one: the estimate before it is hardly worth more than that it did not jump.
+    A restart that loses gravity adds a wide one: the estimate before it is hardly worth more than that it did not jump. After a
+    pause whose motion the images do not show, a robot may be anywhere.
     """
 
     def __init__(self) -> None:
         self._carried, self._last = np.zeros((6, 6)), np.zeros((6, 6))
-        self._begun = False
+        self._last_ns: int | None = None
 
     def handle(self, estimate: OdometryEstimate) -> Array:
         """That of one more estimate, in its odom axes."""
         change = estimate.new_odom_from_old_odom
-        if self._begun and change is not None:
+        if self._last_ns is not None and change is not None:
             turn = np.kron(np.eye(2), change[:3, :3])
             self._carried = turn @ self._last @ turn.T
             if not estimate.inertial:
                 self._carried = self._carried + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
-        self._begun, self._last = True, self._carried + estimate.cov_rot_trans
+        if self._last_ns is not None and is_away(self._last_ns, estimate):
+            away_m = _AWAY_MPS * (estimate.stamp_ns - self._last_ns) * 1e-9
+            self._carried = self._carried + np.diag([_AWAY_RAD**2] * 3 + [away_m**2] * 3)
+        self._last_ns, self._last = estimate.stamp_ns, self._carried + estimate.cov_rot_trans
         return self._last
 
 

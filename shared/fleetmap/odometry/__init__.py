@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus
+    from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
     from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
     from fleetmap.odometry.odometry import Odometry
     from fleetmap.odometry.settings import OdometrySettings
@@ -19,10 +19,11 @@ __all__ = [
     "OdometryEstimate",
     "OdometrySettings",
     "OdometryStatus",
+    "is_away",
     "make_odometry",
 ]
 _NAMES = {
-    "estimate": "ContinuousFrame OdometryEstimate OdometryStatus",
+    "estimate": "ContinuousFrame OdometryEstimate OdometryStatus is_away",
     "mono.mono_modes": "MonocularOdometry make_odometry",
     "odometry": "Odometry",
     "settings": "OdometrySettings",

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.samples import PAUSE_NS
 
 
 class OdometryStatus(StrEnum):
@@ -52,6 +53,11 @@ class OdometryEstimate:
     imu_minus_cam_sigma_s: float = np.inf
     track_pixels: Array | None = None
     previous_from_body: Array | None = None
+
+
+def is_away(last_ns: int, estimate: OdometryEstimate) -> bool:
+    """True if nothing ties an estimate to the one at last_ns, a pause before it: the robot may have been carried anywhere."""
+    return estimate.stamp_ns - last_ns > PAUSE_NS and estimate.status is OdometryStatus.DEGRADED
 
 
 class ContinuousFrame:

@@ -19,7 +19,7 @@ from fleetmap.odometry.odometry_checks import ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.sensors.samples import Trajectory
+from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
@@ -138,6 +138,8 @@ class VisualMode(WindowMode):
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; where the state will be is known only when the frame was tracked."""
+        if stamp_ns - self.stamp_ns > PAUSE_NS:
+            self._cam_from_previous = np.eye(4)  # a robot that was off did not go on at its last speed
         self.window.stamp_ns, self.window.rate_body_radps = stamp_ns, np.zeros(3)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
@@ -211,7 +213,10 @@ class StartingMode(VisualMode):
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; the motion to expect is the last one, turned as the gyro says: in a turn that begins the last one is far off."""
-        self._turned = self._imu.samples.rotation_between(self.stamp_ns, stamp_ns, self._imu.noise)
+        is_pause = stamp_ns - self.stamp_ns > PAUSE_NS
+        self._turned = (
+            None if is_pause else self._imu.samples.rotation_between(self.stamp_ns, stamp_ns, self._imu.noise)
+        )
         if self._turned is not None:
             body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
             body_from_next[:3, :3] = self._turned
@@ -295,7 +300,7 @@ class InertialMode(WindowMode):
     """Stereo-inertial: the state moves by the IMU, images correct it, rest and wheels help."""
 
     inertial = True
-    rotation_sigma_rad = _ROTATION_SIGMA_RAD
+    rotation_sigma_rad: float | None = _ROTATION_SIGMA_RAD
 
     def __init__(self, window: SlidingWindow, imu: ImuInputs) -> None:
         super().__init__(window)
@@ -304,6 +309,7 @@ class InertialMode(WindowMode):
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.state.odom_from_body  # at the frame before
         self._seen: Array | None = None  # the last motion that images showed
+        self._is_pause = False
 
     @classmethod
     def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
@@ -314,6 +320,10 @@ class InertialMode(WindowMode):
         window, imu = self.window, self._imu
         self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
+        if end_ns - window.stamp_ns > PAUSE_NS:
+            self._is_pause, self.rotation_sigma_rad = True, None
+            window.stamp_ns = end_ns
+            return
         gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
         if gap_ns > IMU_GAP_NS and len(window.filter.clone_ids) > 1:
             self._bridge_gap(end_ns)
@@ -329,6 +339,8 @@ class InertialMode(WindowMode):
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; an IMU that contradicts the images is given up, a filter that diverged begins again."""
         window, monitor = self.window, self._imu.monitor
+        if self._is_pause:
+            return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
         self._seen = seen = tracked.cam_from_previous
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more

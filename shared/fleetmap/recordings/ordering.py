@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
-from fleetmap.sensors.samples import DataIssue, ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Trajectory
 
 _MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
@@ -29,6 +29,10 @@ _SHORTEST_OTHER_NS, _LONGEST_NS = (
 )  # no camera or odometry has more than 2 kHz or less than 0.05 Hz
 _EPOCH_NS = (9e17, 5e18)  # 1998 to 2128
 _FEWEST = 10  # values whose steps tell a unit
+# Of a part of a stream with a pause on either side: what is shorter than the second in which an odometry begins serves nothing, so
+# that a recording that was interrupted loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
+_SHORTEST_PART_NS, _PAUSE_STEPS, _STRAY_SHARE = 1_000_000_000, 10, 0.05
+_NEVER_STRAY = ("position priors", "ground truth")  # which come as they like
 
 
 @dataclass(slots=True)
@@ -65,19 +69,50 @@ def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadL
 
 
 def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of a longest strictly increasing subsequence; the other stamps are noted in `log`.
+    """(N,) mask of a longest strictly increasing subsequence without single stamps far from all others; what it lacks is noted in `log`.
 
     Stamps are never sorted: values that arrive out of order carry stamps that cannot be trusted. One stamp far in the
     future costs itself, not all that follow. RecordingError where more than half would be left out, and for stamps of
     another unit.
     """
     _check_steps(stamps_ns, what)
+    kept = np.flatnonzero(_increasing(stamps_ns, what, log))
+    mask = np.zeros(len(stamps_ns), np.bool_)
+    mask[kept if what in _NEVER_STRAY else kept[~_strays(stamps_ns[kept], what, log)]] = True
+    return mask
+
+
+def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) mask of the few increasing stamps that stand alone, a pause away from all others; noted in `log`."""
+    strays = np.zeros(len(stamps_ns), np.bool_)
+    steps = np.diff(stamps_ns)
+    if len(steps) == 0:
+        return strays
+    pause_ns = max(PAUSE_NS, _PAUSE_STEPS * int(np.median(steps)))
+    parts = np.split(np.arange(len(stamps_ns)), np.flatnonzero(steps > pause_ns) + 1)
+    largest = max(parts, key=len)
+    for part in parts:
+        strays[part] = part is not largest and stamps_ns[part[-1]] - stamps_ns[part[0]] < _SHORTEST_PART_NS
+    if not 0 < strays.sum() <= max(1, _STRAY_SHARE * len(stamps_ns)):
+        return np.zeros(len(stamps_ns), np.bool_)
+    others = stamps_ns[~strays]
+    away = [(stamp, (stamp - others[nearest(others, np.array([stamp]))[0]]) * 1e-9) for stamp in stamps_ns[strays]]
+    named = ", ".join(f"{stamp} ({seconds:+.1f} s)" for stamp, seconds in away[:3])
+    detail = (
+        f"{len(away)} of {len(stamps_ns)} left out: {named}{', ...' if len(away) > 3 else ''} from the nearest other"
+    )
+    log.note(f"{what}: stamps far apart", f"{detail}; was the clock set?")
+    return strays
+
+
+def _increasing(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) mask of `forward_only` before single stamps are looked for."""
     steps = np.diff(stamps_ns)
     odd = np.flatnonzero(steps <= 0)
     if len(odd) == 0:
         return np.ones(len(stamps_ns), np.bool_)
     kept = _longest_increasing(stamps_ns)
-    dropped, first = int((~kept).sum()), int(odd[0])
+    dropped, first, out = int((~kept).sum()), int(odd[0]), int(np.flatnonzero(~kept)[0])
     share, is_repeated = f"{dropped} of {len(kept)}", not (steps < 0).any()
     if is_repeated:
         log.note(
@@ -87,7 +122,7 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
     else:
         log.note(
             f"{what}: stamps not increasing",
-            f"{share} left out; the first is {stamps_ns[first + 1]} after {stamps_ns[first]}",
+            f"{share} left out; the first is {stamps_ns[out]}, {_step_s(stamps_ns, out):+.3f} s from the one before",
         )
     if dropped > len(kept) // 2:
         fault = (
@@ -98,6 +133,10 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
         )
         raise RecordingError(f"{what}: {fault}")
     return kept
+
+
+def _step_s(stamps_ns: Stamps, index: int) -> float:
+    return float(stamps_ns[index] - stamps_ns[max(index - 1, 0)]) * 1e-9
 
 
 def _check_steps(stamps_ns: Stamps, what: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.ordering import UNITS, wrong_unit
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
+from fleetmap.sensors.samples import PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
@@ -48,6 +48,27 @@ class _ImuQueue:
         return ImuSamples(stamps, np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:]))
 
 
+class _Forward:
+    """Takes stamps that increase. After a pause the first one waits for a second that confirms it: a wrong one costs itself alone."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._ahead_ns: int | None = None
+
+    def takes(self, stamp_ns: int) -> bool:
+        """Whether the value with this stamp is taken."""
+        last_ns, ahead_ns, self._ahead_ns = self._last_ns, self._ahead_ns, None
+        if last_ns is not None and stamp_ns <= last_ns:
+            return False
+        if last_ns is not None and stamp_ns - last_ns > PAUSE_NS:
+            is_confirmed = ahead_ns is not None and 0 < stamp_ns - ahead_ns <= PAUSE_NS
+            if not is_confirmed:
+                self._ahead_ns = stamp_ns
+                return False
+        self._last_ns = stamp_ns
+        return True
+
+
 class Intake:
     """Put to from any thread; taken from by one. unreadable_why: the reason of the last message or picture that could not be read."""
 
@@ -61,6 +82,7 @@ class Intake:
         self._has_imu, self._imu_wait_s = has_imu, imu_wait_s
         self._changed = threading.Condition()
         self._imu, self._last_imu_ns, self._last_frame_ns = _ImuQueue(), -(2**62), -(2**62)
+        self._frame_stamps, self._imu_stamps = _Forward(), _Forward()
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = self._forget = False
@@ -68,17 +90,18 @@ class Intake:
         self._set_back = ""
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """A frame; the oldest that waits makes room. One that is not newer than all before is refused and counted.
+        """A frame; the oldest that waits makes room. One that is not newer than all before, or alone far ahead, is refused and counted.
 
         RecordingError for a stamp in another unit than the IMU's.
         """
         with self._changed:
             _check_unit("images'", frame.stamp_ns, self._last_imu_ns)
             if _coarser_unit(self._last_imu_ns, frame.stamp_ns):
-                self._imu, self._last_imu_ns = _ImuQueue(), -(2**62)
-            if frame.stamp_ns <= self._last_frame_ns:
+                self._imu, self._last_imu_ns, self._imu_stamps = _ImuQueue(), -(2**62), _Forward()
+            if not self._frame_stamps.takes(frame.stamp_ns):
                 self.counts.frames_disordered += 1
-                self._note_older("images", frame.stamp_ns, self._last_frame_ns)
+                if frame.stamp_ns <= self._last_frame_ns:
+                    self._note_older("images", frame.stamp_ns, self._last_frame_ns)
                 return
             self._older_since_ns.pop("images", None)
             self._last_frame_ns = frame.stamp_ns
@@ -100,9 +123,9 @@ class Intake:
             values = np.hstack([samples.gyro_radps, samples.accel_mps2])
             possible = np.asarray((np.abs(values) < _ABSURD).all(axis=1))
             for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
-                if not good or stamp_ns <= self._last_imu_ns:
+                if not good or not self._imu_stamps.takes(stamp_ns):
                     self.counts.imu_refused += 1
-                    if good:
+                    if good and stamp_ns <= self._last_imu_ns:
                         self._note_older("imu", stamp_ns, self._last_imu_ns)
                     continue
                 self._older_since_ns.pop("imu", None)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, modes
+from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, is_away, modes
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
@@ -20,6 +20,7 @@ from fleetmap.odometry.tracking.tracker import Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
+from mapserver.survey.odometry_pass import continued_covariances
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
@@ -333,3 +334,23 @@ def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
         np.linalg.norm((b.odom_from_body - a.odom_from_body)[:3, 3]) for a, b in pairwise(said[began[0] : again])
     ]
     assert max(steps_m) < 0.3
+
+
+@pytest.mark.parametrize("imu", [IMU, None])
+@pytest.mark.parametrize("is_elsewhere", [False, True])
+def test_no_motion_is_carried_through_a_pause(imu: ImuNoise | None, is_elsewhere: bool) -> None:
+    """The robot is off for five hours; then it stands where it was, or before a picture that shows nothing that it knows."""
+    before, hours_ns = 40, 5 * 3600 * 10**9
+    frames = [stereo_frame(k * FRAME_NS) for k in range(1, before + 1)]
+    again = [black_frame((before + 1) * FRAME_NS) if is_elsewhere else stereo_frame((before + 1) * FRAME_NS)]
+    _, estimates = run([*frames, *(replace(frame, stamp_ns=frame.stamp_ns + hours_ns) for frame in again)], imu)
+    last, resumed = estimates[-2:]
+    assert resumed.new_odom_from_old_odom is not None or not is_elsewhere
+    change = np.eye(4) if resumed.new_odom_from_old_odom is None else resumed.new_odom_from_old_odom
+    assert np.linalg.norm(resumed.odom_from_body[:3, 3] - (change @ last.odom_from_body)[:3, 3]) < 0.3
+    assert not resumed.inertial
+    assert (resumed.status is OdometryStatus.DEGRADED) == is_elsewhere
+    assert is_away(last.stamp_ns, resumed) == is_elsewhere
+    cov_before, cov_after = continued_covariances([last, resumed])
+    if is_elsewhere:
+        assert np.sqrt(np.trace((cov_after - cov_before)[3:, 3:])) > 1000

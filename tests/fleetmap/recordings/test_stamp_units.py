@@ -1,10 +1,12 @@
 """Stamps in another unit are refused by its name, and no stamp costs more than the values there are."""
 
+import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import open_recording
@@ -104,7 +106,7 @@ def test_work_is_bounded_whatever_stamps_say(tmp_path: Path) -> None:
         file.write_text("\n".join([*rows, f"{int(SAMPLE.stamps_ns[-1]) + 170 * YEAR_NS},{last.partition(',')[2]}"]))
     recording = open_recording(folder)
     assert len(recording) == len(SAMPLE.stamps_ns) - 1
-    assert any("more than a day" in issue.detail for issue in recording.issues)
+    assert any(issue.what == "cam0: stamps far apart" for issue in recording.issues)
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(10**3, "microseconds"), (10**6, "milliseconds"), (10**9, "seconds")])
@@ -124,3 +126,49 @@ def test_a_live_source(factor: int, unit: str) -> None:
             put(value)  # type: ignore[operator]
     intake.finish()
     assert len(intake.take(1.0).imu) == 0
+
+
+HOURS_NS = 5 * 3600 * 10**9
+
+
+@pytest.mark.parametrize("what", ["cam0", "imu", "wheel odometry", "depth images"])
+@pytest.mark.parametrize(
+    ("row", "shift_ns"), [(-1, HOURS_NS), (0, -HOURS_NS), (40, HOURS_NS), (40, -HOURS_NS), (-1, 12 * 10**9)]
+)
+def test_one_stamp_far_away_costs_itself(what: str, row: int, shift_ns: int) -> None:
+    stamps_ns = 10**18 + 50_000_000 * np.arange(100)
+    bad_ns = stamps_ns.copy()
+    bad_ns[row] += shift_ns
+    log = ReadLog()
+    kept = forward_only(bad_ns, what, log)
+    np.testing.assert_array_equal(np.flatnonzero(~kept), [row % 100])
+    (issue,) = log.issues
+    assert f"{bad_ns[row]}" in issue.detail
+    assert re.search(r" [(]?[-+]\d+\.\d+ s", issue.detail)
+
+
+@pytest.mark.parametrize(
+    "stamps_s",
+    [
+        np.r_[0:5:0.05, 3605:3610:0.05],  # switched off for an hour
+        np.r_[0:5:0.05, 3605:3610:0.05, 8000:8002:0.05],
+        np.r_[0:200:5.0, 230],  # photographs
+        np.r_[0:5:1.0, 20, 40, 60, 80],  # wheels that are heard of when they turn
+    ],
+)
+def test_a_pause_loses_nothing(stamps_s: NDArray[np.float64]) -> None:
+    log = ReadLog()
+    assert forward_only((1e9 * stamps_s).astype(np.int64), "cam0", log).all()
+    assert not log.issues
+
+
+def test_frames_stamped_hours_late_are_named(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    for number in (0, 1):
+        file = folder / f"mav0/cam{number}/data.csv"
+        *rows, last = file.read_text().splitlines()
+        file.write_text("\n".join([*rows, f"{int(SAMPLE.stamps_ns[-1]) + HOURS_NS},{last.partition(',')[2]}"]))
+    recording = open_recording(folder)
+    assert len(recording) == len(SAMPLE.stamps_ns) - 1
+    assert [issue.what for issue in recording.issues] == ["cam0: stamps far apart", "cam1: stamps far apart"]
+    assert f"{int(SAMPLE.stamps_ns[-1]) + HOURS_NS} (+18000.1 s)" in recording.issues[0].detail

@@ -117,3 +117,13 @@ def test_a_clock_that_was_set_back_is_an_error_and_not_waited_for() -> None:
     inertial.put_imu(imu(*range(600)))
     with pytest.raises(RecordingError, match="imu: the stamps went back"):
         inertial.take(0)
+
+
+def test_one_stamp_far_ahead_costs_itself_and_a_pause_one_frame() -> None:
+    queue = intake(frames=9)
+    for stamp_ms in (0, 50, 18_000_000, 100, 150, 36_000_000, 36_000_050, 36_000_100):
+        queue.put_imu(imu(stamp_ms))
+        queue.put_frame(frame(stamp_ms))
+    stamps_ms = [bundle.frame.stamp_ns // MS for _ in range(6) if (bundle := queue.take(0)).frame is not None]
+    assert stamps_ms == [0, 50, 100, 150, 36_000_050, 36_000_100]
+    assert (queue.counts.frames_disordered, queue.counts.imu_refused) == (2, 2)
