@@ -3,10 +3,14 @@
 import importlib
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.geometry import Array
 from fleetmap.preparation.painted_room import Ride, write_ride
@@ -16,6 +20,7 @@ from mapserver.build.sensor_subset import reduced
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
+from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
@@ -141,6 +146,50 @@ def test_what_everything_contradicts_is_named(ride: Recording, case: str) -> Non
     assert failed.keys() == faults.keys(), failed
     for name, words in faults.items():
         assert words in failed[name]
+
+
+def negated(message: Any) -> None:
+    vector = message.linear_acceleration
+    vector.x, vector.y, vector.z = -vector.x, -vector.y, -vector.z
+
+
+def rotated(message: Any) -> None:
+    message.data = message.data[::-1].copy()  # grey rows without padding
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "name", "says"),
+    [
+        ("sensor_msgs/Imu", negated, "accelerometer axes", "has the wrong sign:"),
+        ("sensor_msgs/Image", rotated, "left and right", "images of both cameras are rotated by 180 degrees"),
+    ],
+)
+def test_a_ros_1_bag_with_a_fault_is_named_alike(
+    ride: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    change: Callable[[Any], None],
+    name: str,
+    says: str,
+) -> None:
+    """The messages of the ride, changed and written by rosbags; its CameraInfo has five coefficients."""
+    monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))
+    messages, store = [], get_typestore(Stores.ROS2_JAZZY)
+    with ride.path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None
+            data, full = message.data, schema.name
+            if full.replace("/msg/", "/") == kind:
+                value = store.deserialize_cdr(data, full)
+                change(value)
+                data = bytes(store.serialize_cdr(value, full))
+            messages.append((channel.topic, full.replace("/msg/", "/"), message.log_time, data))
+    with open_recording(write_rosbag1(tmp_path / "ride.bag", messages)) as bag:
+        assert (len(bag), len(bag.imu), bag.issues) == (len(ride), len(ride.imu), ())
+        found = {f.name: f for f in run_checks.run_checks(bag, sampled=20, turn_frames=60).findings}
+    assert found[name].verdict is Verdict.FAIL
+    assert says in found[name].sentence
 
 
 class ScaledDepths:
