@@ -2,6 +2,7 @@
 
 import re
 import struct
+import zlib
 from dataclasses import dataclass, replace
 
 import cv2
@@ -281,6 +282,23 @@ def is_cut(head: bytes, tail: bytes) -> bool:
     return end is not None and end not in tail.rstrip(b"\0")[-64:]
 
 
+def is_damaged_png(data: bytes) -> bool:
+    """Whether the checksum of a part of a PNG file says that its bytes are not those that were written; False for other files.
+
+    A JPEG file has no checksums.
+    """
+    at = len(_PNG_START) if file_kind(data) == "png" else len(data)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data) or zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            return True
+        if data[at + 4 : at + 8] == b"IEND":
+            return False
+        at = end + 4
+    return at < len(data)
+
+
 def store_frame(frame: CameraFrame) -> StoredFrame:
     """A decoded frame as rows of pixels."""
     right = None if frame.right is None else grey_image(frame.right)
@@ -385,6 +403,8 @@ def _check_file(stored: StoredImage) -> tuple[int, int]:
         raise RecordingError(
             f"{stored.where}: the {file_kind(data)} image is cut off after {len(data)} bytes; remove it from the recording"
         )
+    if is_damaged_png(data):
+        raise RecordingError(f"{stored.where}: the png image is damaged; remove it from the recording")
     size = image_size(data)
     if size is None:
         raise _not_an_image(stored)

@@ -10,6 +10,7 @@ import pytest
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
+from fleetmap.recordings.images import StoredImage, decode_grey
 from fleetmap.sensors.samples import DataIssue
 from support.recordings.recording_samples import (
     HEIGHT,
@@ -101,6 +102,21 @@ def test_cut_image_is_left_out_instead_of_filled_with_grey(tmp_path: Path, image
     assert len(recording) == 3
     (issue, _) = recording.issues
     assert issue == DataIssue("cam0: images cut off", f"1 of 4, the first is image2.{image_type}")
+
+
+def test_png_that_is_damaged_inside_costs_one_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    file = folder / "mav0/cam0/data/image2.png"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 0x55
+    file.write_bytes(data)
+    recording = open_recording(folder)
+    assert SAMPLE.stamps_ns[2] not in recording.frame_stamps_ns
+    assert len([recording.read_frame(index) for index in range(len(recording))]) == 3
+    assert recording.issues[0] == DataIssue("cam0: images damaged inside", "1 of 4, the first is image2.png")
+    with pytest.raises(RecordingError, match="the png image is damaged"):
+        decode_grey(StoredImage("file", bytes(data), "a robot's own"))
+    assert capfd.readouterr().err == "", "libpng has nothing to say"
 
 
 def test_image_that_is_none(euroc: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
-from fleetmap.recordings.images import MAX_PIXELS, StoredImage, file_kind, image_size, is_cut
+from fleetmap.recordings.images import MAX_PIXELS, StoredImage, file_kind, image_size, is_cut, is_damaged_png
 from fleetmap.recordings.ordering import ReadLog, usual_size
 from fleetmap.recordings.strange_files import what_instead
 
@@ -60,12 +60,17 @@ def _whole_image_size(path: Path, file_bytes: int) -> tuple[int, int] | None:
             head = file.read(_HEAD_BYTES)
             file.seek(max(0, file_bytes - _TAIL_BYTES))
             tail = file.read(_TAIL_BYTES)
+            is_whole_read = file_kind(head) == "png" and file_bytes <= _MAX_IMAGE_BYTES
+            file.seek(0)
+            is_damaged = is_whole_read and is_damaged_png(file.read(file_bytes))
     except OSError as error:
         raise RecordingError(f"that cannot be read ({error.strerror})") from error
     if fault := what_instead(head):
         raise RecordingError(f"that are {fault}")
     if is_cut(head, tail):
         raise RecordingError("cut off")
+    if is_damaged:
+        raise RecordingError("damaged inside")
     size_px = image_size(head)
     if size_px is None and file_kind(head) == "other" and not head.startswith(_TIFF):  # whose header may be at its end
         raise RecordingError("of no format that is read")
