@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 
 from fleetmap.bow import decode_vocabulary
-from fleetmap.errors import LinkError
+from fleetmap.errors import LinkError, RecordingError
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.recordings import Recording
@@ -68,7 +68,8 @@ def replay(
 ) -> ReplayResult:
     """Plays the source; prior: a coarse pose at its beginning.
 
-    Raises LinkError where no map can be fetched, RecordingError for frames that cannot be read.
+    A frame that cannot be read is left out, which a note says. Raises LinkError where no map can be fetched, RecordingError where no
+    frame can be read.
     """
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
     loaded, tiles, note = load_map(connection.source)
@@ -89,14 +90,21 @@ def replay(
     if options.viewer is not None:
         options.viewer.begin(loaded, profile, rectifier)
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
+    unread: list[str] = []
     for number, imu in enumerate(source.imu_before_each()):
         decode_s = time.process_time()
-        raw = source.frame(number)
+        wheel, priors = list(source.wheel_before(number)), source.priors_before(number)
+        try:
+            raw = source.frame(number)
+        except RecordingError as error:
+            unread.append(str(error))
+            robot.handle(SensorBundle(None, imu, wheel, priors))
+            continue
         decode_s = time.process_time() - decode_s
         if options.realtime:
             time.sleep(max(0.0, (raw.stamp_ns - first_ns) * 1e-9 - (time.monotonic() - begun_s)))
         wall_s = time.monotonic()
-        bundle = SensorBundle(raw, imu, list(source.wheel_before(number)), source.priors_before(number))
+        bundle = SensorBundle(raw, imu, wheel, priors)
         outcome = robot.handle(bundle)
         assert outcome is not None, "the bundle holds a frame"
         wall_s = time.monotonic() - wall_s
@@ -108,6 +116,10 @@ def replay(
         if options.viewer is not None:
             options.viewer.handle(outcome)
         options.progress(number)
+    if unread and not result.frames:
+        raise RecordingError(f"none of {len(unread)} frames can be read; the first: {unread[0]}")
+    if unread:
+        result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
     if robot.ring is not None:
         robot.ring.finish()
     result.search = reporter.figures.search

@@ -160,3 +160,28 @@ def test_a_robot_of_another_building_says_so_and_ends_with_6(
     assert found["localised_share_of_all"] == 0.0
     assert found["not_localised_m"] > 5.0
     assert [note for note in found["notes"] if words in note]
+
+
+def test_frames_that_cannot_be_decoded_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said
+) -> None:
+    """The Huffman tables of JPEG files are destroyed, which no reader notices before decoding."""
+    store, report = tmp_path / "store", tmp_path / "report.json"
+    with MapStore.open(store, create=True) as maps:
+        robot_world.save(maps)
+    walk = write_euroc(tmp_path / "walk", make_sample(3), image_type="jpg")
+    files = sorted((walk / "mav0/cam0/data").iterdir())
+    for number, count in ((1, 1), (0, 2), (2, 3)):
+        data = bytearray(files[number].read_bytes())
+        at = data.index(b"\xff\xc4") + 5
+        data[at : at + 16] = b"\xff" * 16
+        files[number].write_bytes(data)
+        ended = status(monkeypatch, "replay", walk, "--site", "room", "--store", store, "--report", report)
+        told = capsys.readouterr()
+        if count < 3:
+            assert ended == 0, told.err
+            (note,) = (note for note in json.loads(report.read_text())["notes"] if "left out" in note)
+            assert note.startswith(f"{count} of 3 frames are left out; the first: {files[number]}")
+        else:
+            assert ended == 3
+            assert "image0.jpg: " in told.err
