@@ -22,7 +22,6 @@ BUILD_ROWS = (
     ("keyframes", "keyframes", 1, "{:d}"),
     ("landmarks", "landmarks", 1, "{:d}"),
     ("map that a robot downloads", "map_bytes", 1e-3, "{:.0f} kB"),
-    ("vocabulary, once per site", "vocabulary_bytes", 1e-3, "{:.0f} kB"),
     ("loops looked at", "loops.candidates", 1, "{:d}"),
     ("loops refused by position", "loops.gated_out", 1, "{:d}"),
     ("loops refused by geometry", "loops.rejected", 1, "{:d}"),

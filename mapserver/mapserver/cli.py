@@ -33,7 +33,6 @@ from mapserver.commands.store.operators import OPERATORS
 from mapserver.commands.store.robots import ROBOTS
 from mapserver.commands.store.trust import TRUST
 from mapserver.commands.store.verify import verify
-from mapserver.commands.train_vocabulary import train_vocabulary
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
@@ -57,7 +56,6 @@ COMMANDS: Commands = {
     "doctor": doctor,
     "calibrate": calibrate,
     "evaluate": evaluate,
-    "train-vocabulary": train_vocabulary,
     "align": align,
     "areas": AREAS_GROUP,
     "fleet": FLEET,

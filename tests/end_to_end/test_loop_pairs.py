@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.bow import train_vocabulary
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, so3_exp
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.calibration_files import read_euroc_camera
@@ -32,6 +31,7 @@ from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 from support.recordings.realdata import real_data
+from support.worlds.vocabulary_training import train_vocabulary
 
 REVISITS = [(0, 1), (1, 0), (2, 3), (3, 2)]
 WRONG = [(0, 2), (2, 0), (0, 3), (3, 0), (1, 2), (2, 1), (1, 3), (3, 1)]

@@ -8,8 +8,18 @@ from fleetmap.errors import UsageError
 from mapserver.config import read_config
 
 
-def test_a_retired_key_names_its_successor(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "[gate]\nallow_unjudged_calibration = true\n",
+            r"`\$\.gate`; `mapserver publish --trust-calibration .* replaces it",
+        ),
+        ("[train_vocabulary]\nlevels = 3\n", "maps use the vocabulary that ships"),
+    ],
+)
+def test_a_retired_key_names_its_successor(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "mapserver.toml"
-    file.write_text("[gate]\nallow_unjudged_calibration = true\n")
-    with pytest.raises(UsageError, match=r"`\$\.gate`; `mapserver publish --trust-calibration .* replaces it"):
+    file.write_text(text)
+    with pytest.raises(UsageError, match=words):
         read_config(file, {})

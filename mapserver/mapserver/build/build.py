@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleetmap.bow import encode_vocabulary
+from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.config import to_dict
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
@@ -55,7 +55,6 @@ from mapserver.build.survey_recordings import (
     survey_recording,
 )
 from mapserver.build.trajectory import OtherTrajectory
-from mapserver.build.vocabulary_selection import ChosenVocabulary, choose_vocabulary, first_vocabulary, judged
 from mapserver.build.worker import (
     SideProcess,
     open_executor,
@@ -98,7 +97,6 @@ class BuildOptions:
     calibration: Path | None = None
     topics: Topics = field(default_factory=Topics)
     zones: Path | None = None
-    vocabulary: Path | None = None
     report: Path | None = None
     trajectory_out: Path | None = None
     picture: Path | None = None
@@ -165,7 +163,6 @@ class Built:
     surveyed: list[Surveyed]
     joined: Joined
     accuracy: Accuracy
-    vocabulary: ChosenVocabulary
     is_first: bool
 
     @property
@@ -210,9 +207,8 @@ def build_draft(
             recorded_job(maps, request.site, "build") if recorded else nullcontext(Job(number=options.job)) as job,
         ):
             parent = _parent(request, maps)
-            chosen = choose_vocabulary(maps, request.site, options.vocabulary)
             told = JobProgress(maps, job.number)
-            built = _survey(run, admitted, None if parent is None else parent.survey, chosen, told)
+            built = _survey(run, admitted, None if parent is None else parent.survey, told)
             draft = _keep(run, built, parent, maps)
             draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
@@ -222,8 +218,9 @@ def build_draft(
 def _admitted(run: _Run) -> dict[Path, Admission]:
     request, options = run.request, run.request.options
     run.times.begin("examination")
-    first = first_vocabulary(request.store, request.site, options.vocabulary) if len(request.recordings) == 1 else None
-    config = None if first is None else SurveyConfig(run.settings, first.vocabulary, run.zones)
+    config = None
+    if len(request.recordings) == 1 and _is_first(request):
+        config = SurveyConfig(run.settings, default_vocabulary(), run.zones)
     with ProgressView(run.console) as view, open_executor(options.threads, None, run.side) as executor:
         beginnings = SurveyBeginnings(config, run.tools(executor, view))
         return admit_recordings(
@@ -235,6 +232,15 @@ def _admitted(run: _Run) -> dict[Path, Admission]:
             beginnings=beginnings,
             look_at=options.look_at,
         )
+
+
+def _is_first(request: BuildRequest) -> bool:
+    """True if the site has no version yet; later maps have their own camera."""
+    try:
+        with MapStore.open(request.store) as maps:
+            return request.site not in {info.site for info in maps.sites()} or maps.current(request.site) is None
+    except StoreError:  # there is none; what else is wrong with it is said where it is made
+        return True
 
 
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
@@ -256,16 +262,14 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
     return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
 
 
-def _survey(
-    run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, chosen: ChosenVocabulary, told: JobProgress
-) -> Built:
+def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, told: JobProgress) -> Built:
     """Surveys all recordings and joins them to the current map."""
     options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
         open_executor(options.threads, options.scheduler, run.side) as executor,
     ):
-        survey_options = SurveyConfig(settings, chosen.vocabulary, run.zones)
+        survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
 
         pinhole, joining = None if base is None else base.camera, Joining(base, settings)
@@ -281,8 +285,6 @@ def _survey(
             options.look_at(list(admitted))
             tools.progress("joining", 0, 1)
         joined = joining.finish()
-    run.times.begin("vocabulary")
-    chosen = judged(chosen, surveyed[0].survey, settings)
     run.times.begin("storing")
     say_left_out(run.console, run.request.site, surveyed, joined)
     found = accuracy(joined.map, joined_truth(surveyed, joined))
@@ -293,7 +295,7 @@ def _survey(
                 "--frame-from-ground-truth"
             )
         joined = replace(joined, map=transform_map(joined.map, found.rigid.frame_from_estimate))
-    return Built(surveyed, joined, found, chosen, is_first=base is None)
+    return Built(surveyed, joined, found, is_first=base is None)
 
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
@@ -312,10 +314,8 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
     archive = encode_archive(survey_map)
-    vocabulary = encode_vocabulary(built.vocabulary.vocabulary)
     held_bytes = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, run.side.peak_rss_bytes if run.side else 0]
     cost = BuildCost(
-        vocabulary_bytes=built.vocabulary.download_bytes(len(vocabulary)),
         seconds=time.perf_counter() - run.started_s,
         peak_rss_mb=sum(held_bytes) / 1e6,
     )
@@ -335,7 +335,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     )
     job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=vocabulary, details=details, archive=archive, grid=grid, surfels=surfels,
+        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive, grid=grid, surfels=surfels,
         evidence=evidence, job=job,
     )  # fmt: skip
     version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
@@ -360,7 +360,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
     trajectories = map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
-    drafted = DraftMap(tiles, built.vocabulary.vocabulary, camera)
+    drafted = DraftMap(tiles, default_vocabulary(), camera)
     with open_executor(options.threads, None, run.side) as executor:
         evidence = examine_draft(drafted, before, sessions, replayed, executor)
     known = [] if before is None else before.calibrations
@@ -377,7 +377,6 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
     always = {
         "frames": options.frames,
-        "own_vocabulary": options.vocabulary is not None,
         "frame_from_ground_truth": options.frame_from_ground_truth or kept,
         "own_calibration": options.calibration is not None,
         "use": None if options.use is None else options.use.value,
@@ -406,6 +405,4 @@ def _write_files(run: _Run, built: Built, draft: Draft) -> None:
     if options.report is not None:
         full: dict[str, Any] = {"site": site, "version": draft.version}
         full = draft.report | full | report_details(built.taken, built.joined, built.accuracy, run.times.seconds)
-        full["vocabulary"] = {"source": built.vocabulary.source, "sha256": built.vocabulary.sha256()}
-        full["vocabulary"]["trial"] = to_plain(built.vocabulary.trial)
         write_file(options.report, to_json(full, indent=2) + b"\n")

@@ -61,7 +61,6 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     keyframes: int
     landmarks: int
     map_bytes: int | None
-    vocabulary_bytes: int
     loops: dict[str, int]
     ate_rmse_m: float | None
     ate_sim3_rmse_m: float | None
@@ -127,9 +126,8 @@ def path_length_m(trajectory: Trajectory) -> float:
 
 
 class BuildCost(msgspec.Struct, frozen=True):
-    """What a build cost: bytes of the vocabulary for a robot, wall seconds, most memory in 10^6 bytes."""
+    """What a build cost: wall seconds, most memory in 10^6 bytes."""
 
-    vocabulary_bytes: int
     seconds: float
     peak_rss_mb: float
 
@@ -152,7 +150,6 @@ def make_report(
         keyframes=len(survey_map.keyframe_stamps_ns),
         landmarks=len(survey_map.landmark_ids),
         map_bytes=None,
-        vocabulary_bytes=cost.vocabulary_bytes,
         loops={key: sum(count[key] for count in loops) for key in loops[0]},
         ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
         ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import vocabulary_hash
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -68,10 +67,8 @@ class BegunSurvey:
     held_out: Work[list[HeldOut]] | None = None
 
     def finished(self, config: SurveyConfig, tools: SurveyTools) -> Survey:
-        """All of it; with the vocabulary that it was finished with nothing is left to do."""
-        if self.done is not None and vocabulary_hash(self.done.vocabulary) == vocabulary_hash(config.vocabulary):
-            return self.done
-        return finish_survey(self.chain, config, tools)
+        """All of it."""
+        return self.done or finish_survey(self.chain, config, tools)
 
 
 class _InVainError(Exception):

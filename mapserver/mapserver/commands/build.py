@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 class BuildCommandOptions(SurveyOptions):
     """Options of `build` beside those of `nightly`."""
 
-    vocabulary: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Vocabulary of `train-vocabulary` for the site's first map.")
-    ] = None
     trajectory_out: Annotated[
         Path | None, typer.Option(metavar="FILE.tum", help="Write the poses of all frames to this file.")
     ] = None

@@ -29,7 +29,6 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
     import msgspec
     import numpy as np
 
-    from fleetmap.bow import train_vocabulary
     from fleetmap.preparation.painted_room import HEIGHT_PX, WIDTH_PX, Ride, write_ride
     from fleetmap.recordings import open_recording
     from fleetmap.sensors.rectification import StereoCamera
@@ -81,10 +80,6 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         surfels = Surfels(points, normals, np.zeros(1, np.uint8), np.zeros(1, np.uint8))
         expected_view(surfels, pinhole(camera), np.eye(4))
 
-    def train() -> None:
-        descriptors = np.random.default_rng(0).integers(0, 256, (200, 32), dtype=np.uint8)
-        train_vocabulary(descriptors, 4, 2, np.random.default_rng(0))
-
     return {
         "survey with a stereo camera and an IMU": lambda: build("room", SensorSet.STEREO_INERTIAL),
         "second survey of the same place": lambda: build("room", SensorSet.STEREO),
@@ -94,5 +89,4 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
         "depth images of another camera": register_depth,
         "grid of planners": look_at_grid,
         "expected view": draw_view,
-        "vocabulary": train,
     }

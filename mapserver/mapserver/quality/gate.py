@@ -55,7 +55,6 @@ class GateVerdict:
 def judge(
     draft: Manifest,
     current: Manifest | None,
-    site_vocabulary: str | None,
     settings: GateSettings,
     evidence: Evidence | None = None,
 ) -> GateVerdict:
@@ -89,7 +88,7 @@ def judge(
         report |= {"compared_with": current.version, **shares}
         found.reasons.extend(_size_reasons(shares, current.version, settings))
     report |= {"evidence": to_plain(examined), "not_judged": found.not_judged}
-    return GateVerdict(tuple(found.reasons), _hard_reasons(draft, site_vocabulary), report, tuple(found.unjudged))
+    return GateVerdict(tuple(found.reasons), _hard_reasons(draft), report, tuple(found.unjudged))
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,17 +202,12 @@ def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings
     ]
 
 
-def _hard_reasons(draft: Manifest, site_vocabulary: str | None) -> tuple[str, ...]:
+def _hard_reasons(draft: Manifest) -> tuple[str, ...]:
     reasons = []
     if not draft.tiles or draft.landmarks == 0:
         reasons.append(
             f"it has {len(draft.tiles)} tiles and {draft.landmarks} landmarks: no robot could localise in it; look at "
             "the build's report and at `mapserver doctor` for its recordings"
-        )
-    if site_vocabulary is not None and site_vocabulary != draft.vocabulary.sha256:
-        reasons.append(
-            f"it uses vocabulary {draft.vocabulary.sha256}, site {draft.site} keeps {site_vocabulary}; build it again "
-            "so that it takes the site's"
         )
     joins = draft.report.get("joins")  # drafts of older servers do not say
     verdicts = {} if joins is None else {entry.name: joins.get(entry.name, "none") for entry in draft.recordings}

@@ -80,7 +80,6 @@ def judge_draft(store: MapStore, draft: VersionInfo, gate: GateSettings) -> Gate
     return judge(
         store.manifest(draft.site, draft.version),
         None if current is None else store.manifest(draft.site, current.version),
-        next(info.vocabulary_sha256 for info in store.sites() if info.site == draft.site),
         gate,
         store.evidence(draft.site, draft.version),
     )

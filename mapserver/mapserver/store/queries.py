@@ -146,16 +146,6 @@ class StoreQueries:
         sha256 = self.version(site, version).archive_sha256
         return None if sha256 is None else self._blobs.get(sha256)
 
-    def site_vocabulary(self, site: str) -> bytes | None:
-        """The vocabulary that new surveys of a site must use: the published one, else the newest draft's, else None."""
-        check_name(site, "site")
-        rows = self._transactions.query(
-            """SELECT coalesce(s.vocabulary_sha256, v.vocabulary_sha256) sha256
-               FROM sites s JOIN versions v USING (site) WHERE s.site = ? ORDER BY v.version DESC LIMIT 1""",
-            (site,),
-        )
-        return self._blobs.get(rows[0]["sha256"]) if rows else None
-
     def site_file(self, site: str, kind: str) -> bytes | None:
         """What a site keeps beside its versions under this kind, such as `plan`; None without. Errors as of `blob`."""
         sha256 = self.site_file_sha256(site, kind)

@@ -78,14 +78,6 @@ class SingleCameraSettings(Section, frozen=True):
     scale_walk: float = 0.01  # sigma of the scale's logarithm per keyframe, where nothing observes the scale
 
 
-class VocabularySettings(Section, frozen=True):
-    """The tree trained on a site's first survey."""
-
-    branching: int = 10  # children of each node
-    levels: int = 4  # of the tree: up to branching ** levels words
-    max_descriptors: int = 200_000  # for training
-
-
 class BudgetSettings(Section, frozen=True):
     """How much of a survey robots get."""
 
@@ -169,7 +161,6 @@ class SurveySettings(Section, frozen=True):
     final_bundle: BundleSettings = BundleSettings(
         max_iterations=20, relative_cost_tolerance=1e-4, huber_sigmas=0.7, cutoff_sigmas=2.5
     )
-    vocabulary: VocabularySettings = VocabularySettings()
     budget: BudgetSettings = BudgetSettings()
     cull: CullSettings = CullSettings()
     sessions: SessionSettings = SessionSettings()

@@ -1,7 +1,7 @@
 """Bag of binary words: a vocabulary of descriptors and an index that ranks places by appearance."""
 
 from fleetmap.bow.place_index import PlaceIndex
-from fleetmap.bow.vocabulary import BowVector, Vocabulary, train_vocabulary
+from fleetmap.bow.vocabulary import BowVector, Vocabulary
 from fleetmap.bow.vocabulary_codec import (
     MAX_NODES,
     VOCABULARY_FORMAT,
@@ -18,6 +18,5 @@ __all__ = [
     "Vocabulary",
     "decode_vocabulary",
     "encode_vocabulary",
-    "train_vocabulary",
     "vocabulary_hash",
 ]

@@ -1,10 +1,9 @@
-"""Inner loops of the vocabulary tree: clustering of binary descriptors, and descent to the words."""
+"""Inner loops of the vocabulary tree: descent of binary descriptors to the words."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.matching_kernels import FAR, Indices, Packed, hamming
-from fleetmap.geometry import Array
+from fleetmap.features.matching_kernels import FAR, Packed, hamming
 from fleetmap.numerics.kernel import kernel
 
 
@@ -46,65 +45,3 @@ def two_nearest(packed: Packed, centres: Packed) -> NDArray[np.int32]:
                 runner_up = distance
                 found[i, 1] = c
     return found
-
-
-@kernel
-def seed_centres(packed: Packed, members: Indices, branching: int, uniforms: Array) -> Packed:
-    """Up to `branching` distinct members, spread out; fewer where there are fewer. Source: Arthur 2007 (k-means++)."""
-    centres = np.empty((branching, 4), np.uint64)
-    squared = np.full(len(members), FAR * FAR, np.int64)
-    chosen = 0
-    pick = int(uniforms[0] * len(members))
-    while True:
-        centres[chosen] = packed[members[pick]]
-        chosen += 1
-        total = 0
-        for m in range(len(members)):
-            distance = hamming(packed, members[m], centres, chosen - 1)
-            squared[m] = min(squared[m], distance * distance)
-            total += squared[m]
-        if chosen == branching or total == 0:
-            return centres[:chosen].copy()
-        target, passed = uniforms[chosen] * total, 0
-        for m in range(len(members)):
-            passed += squared[m]
-            if passed > target:
-                pick = m
-                break
-
-
-@kernel
-def cluster(packed: Packed, members: Indices, centres: Packed, iterations: int) -> Indices:
-    """Label (len(members),) of the nearest centre after refining `centres` in place. Source: Grana 2013 (k-majority).
-
-    A centre is the bit-wise majority of its members (ties: 0). One that nobody belongs to stays where it is.
-    """
-    labels = np.full(len(members), -1, np.int64)
-    for _ in range(iterations):
-        ones = np.zeros((len(centres), 256), np.int64)
-        counts = np.zeros(len(centres), np.int64)
-        changed = False
-        for m in range(len(members)):
-            best, nearest = FAR, 0
-            for c in range(len(centres)):
-                distance = hamming(packed, members[m], centres, c)
-                if distance < best:
-                    best, nearest = distance, c
-            changed = changed or labels[m] != nearest
-            labels[m] = nearest
-            counts[nearest] += 1
-            for word in range(4):
-                bits = packed[members[m], word]
-                for bit in range(64):
-                    ones[nearest, 64 * word + bit] += np.int64((bits >> np.uint64(bit)) & np.uint64(1))
-        if not changed:
-            break
-        for c in range(len(centres)):
-            for word in range(4):
-                majority = np.uint64(0)
-                for bit in range(64):
-                    if 2 * ones[c, 64 * word + bit] > counts[c]:
-                        majority |= np.uint64(1) << np.uint64(bit)
-                if counts[c] > 0:
-                    centres[c, word] = majority
-    return labels

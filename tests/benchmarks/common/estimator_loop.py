@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
@@ -27,6 +27,7 @@ from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from support.estimator.simulated_run import EstimatorSession, Found
+from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = LocalizerSettings()
 _TILE_M = 1024.0

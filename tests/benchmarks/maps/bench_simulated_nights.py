@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from benchmarks.common.estimator_loop import is_new_place, map_view, run_localizer
 from benchmarks.common.simulated_survey import GreyPictures, _keyframe
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
 from fleetmap.mapformat import decode_tile, encode_tile
@@ -49,6 +49,7 @@ from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
 from studies.thirty_nights import CLOSED, DARK, NIGHTS, SCENARIO, scenario
 from support.estimator.simulated_run import EstimatorSession, Found
+from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 EVENINGS = range(10, 20)

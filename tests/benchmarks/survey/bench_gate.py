@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.back_end.bench_aliasing import replace_layout
 from benchmarks.common.estimator_loop import blank
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from fleetsim.motion.routes import Route
@@ -36,6 +36,7 @@ from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession
+from support.worlds.vocabulary_training import train_vocabulary
 
 NAME = "site-identical"
 END_M = 2.7

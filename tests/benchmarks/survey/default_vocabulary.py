@@ -1,7 +1,9 @@
 """Makes the vocabulary that ships with fleetmap, from pictures of simulated warehouses and nothing else.
 
-`python tests/benchmarks/survey/default_vocabulary.py FILE.fmvb [--features FILE.npz]` writes the same bytes every time (some minutes). The
-warehouses are others than those that tests, demo and benches use, so that these measure how the vocabulary fares elsewhere.
+    PYTHONPATH=tests python tests/benchmarks/survey/default_vocabulary.py FILE.fmvb [--features FILE.npz]
+
+It writes the same bytes every time, in some minutes. The warehouses are others than those that tests, demo and benches use, so
+that these measure how the vocabulary fares elsewhere.
 """
 
 import argparse
@@ -11,12 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, encode_vocabulary, train_vocabulary, vocabulary_hash
+from fleetmap.bow import Vocabulary, encode_vocabulary, vocabulary_hash
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare
+from support.worlds.vocabulary_training import train_vocabulary
 
 BRANCHING, LEVELS, SEED = 10, 4, 0
 PICTURES = 60  # of each run, evenly spread

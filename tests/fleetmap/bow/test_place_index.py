@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fleetmap.bow import BowVector, PlaceIndex, train_vocabulary
+from fleetmap.bow import BowVector, PlaceIndex
+from support.worlds.vocabulary_training import train_vocabulary
 
 WORDS = 300
 

@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.bow import PlaceIndex, train_vocabulary
+from fleetmap.bow import PlaceIndex
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
 from support.recordings.realdata import real_data
+from support.worlds.vocabulary_training import train_vocabulary
 
 
 @lru_cache(maxsize=1)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary, train_vocabulary, vocabulary_hash
+from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary, vocabulary_hash
 from fleetmap.errors import MapFormatError, NewerFormatError
+from support.worlds.vocabulary_training import train_vocabulary
 
 
 def _clustered(rng: np.random.Generator, clusters: int, each: int, noise: float = 0.05) -> np.ndarray:

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.features.matching import packed
 from fleetmap.relocalization.descriptor_index import DescriptorIndex
 from fleetmap.relocalization.descriptor_index_kernels import nearest_cells
+from support.worlds.vocabulary_training import train_vocabulary
 
 Descriptors = NDArray[np.uint8]
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.bow import train_vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
 from support.storage.map_samples import random_tile
+from support.worlds.vocabulary_training import train_vocabulary
 
 CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
 SURVEY_FOCAL_PX = 350.0

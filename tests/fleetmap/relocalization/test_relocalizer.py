@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.bow import train_vocabulary
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array, se3
 from fleetmap.numerics.time_sliced import finished
@@ -15,6 +14,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
 from support.storage.map_samples import random_tile
+from support.worlds.vocabulary_training import train_vocabulary
 
 CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
 PLACES = 20

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from hashlib import sha256
 from pathlib import Path
 
 import cv2
@@ -12,13 +11,12 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from fleetmap.bow import decode_vocabulary
-from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256, default_vocabulary_bytes
-from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, UsageError
+from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256
+from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import decode_tile
-from mapserver import releases
 from mapserver.cli import app
-from mapserver.store import Actor, MapStore
+from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -26,7 +24,7 @@ FRAMES = 24
 SAMPLE = make_sample(FRAMES)
 KEYS = [
     *("recordings", "duration_s", "seconds", "realtime_factor", "path_m", "keyframes", "landmarks", "map_bytes"),
-    *("vocabulary_bytes", "loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "scale", "scale_error"),
+    *("loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "scale", "scale_error"),
     *("peak_rss_mb", "findings", "corrections", "culled", "sessions", "joins", "directions"),
     *("starts", "lookalike_recall", "grid", "surfels", "surveyed_requests"),
 ]
@@ -93,7 +91,6 @@ def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
         manifest_bytes = len(maps.blob(maps.version("lab", 1).manifest_sha256))
         assert report["map_bytes"] == sum(sizes) + manifest_bytes
         assert report["landmarks"] == landmarks > 100
-        assert report["vocabulary_bytes"] == 0
         assert decode_vocabulary(maps.blob(manifest.vocabulary.sha256)).word_count == 10_000
         archive = maps.archive("lab", 1)
     assert archive is not None
@@ -157,7 +154,7 @@ def test_the_picture_shows_the_map_on_the_left_and_its_errors_on_the_right(done:
     assert count("14924b", right) + count("d1342f", right) == 0
 
 
-def test_building_again_gives_the_same_tiles_with_the_same_vocabulary(euroc: Path, done: Path, tmp_path: Path) -> None:
+def test_building_again_gives_the_same_tiles(euroc: Path, done: Path, tmp_path: Path) -> None:
     common = [euroc, "--site", "lab", "--frame-from-ground-truth", "--store"]
     built(*common, tmp_path, "--threads", 2)
     assert "draft 2" in built(*common, tmp_path, "--threads", 1)  # without a process beside it
@@ -166,33 +163,7 @@ def test_building_again_gives_the_same_tiles_with_the_same_vocabulary(euroc: Pat
         assert maps.archive("lab", 1) == maps.archive("lab", 2)
         assert maps.evidence("lab", 1) == maps.evidence("lab", 2)
     assert first.tiles == second.tiles == other.tiles
-    assert first.vocabulary == second.vocabulary == other.vocabulary
-
-
-def test_a_site_keeps_its_vocabulary_whatever_is_surveyed(euroc: Path, done: Path, tmp_path: Path) -> None:
-    """A first map speaks the words that ship, or those of a file; the next one the site's."""
-    words = tmp_path / "words.fmvb"
-    said = CliRunner().invoke(
-        app, ["train-vocabulary", str(euroc), "--out", str(words), "--frames", "::4", "--levels", "2"]
-    )
-    assert said.exit_code == 0, said.output
-    lab = [euroc, "--site", "lab", "--store", tmp_path / "store"]
-    built(*lab, "--frames", ":16", "--vocabulary", words)
-    built(*lab, "--frames", "6:", "--report", tmp_path / "r.json")
-    report = json.loads((tmp_path / "r.json").read_text())
-    given = sha256(words.read_bytes()).hexdigest()
-    assert (report["vocabulary"]["source"], report["vocabulary"]["sha256"]) == ("site", given)
-    assert report["vocabulary_bytes"] == words.stat().st_size
-    with MapStore.open(tmp_path / "store") as maps, MapStore.open(done / "store") as shipped:
-        assert maps.manifest("lab", 2).vocabulary == maps.manifest("lab", 1).vocabulary
-        assert maps.manifest("lab", 1).vocabulary.sha256 == given
-        assert maps.manifest("lab", 2).tiles != maps.manifest("lab", 1).tiles
-        assert shipped.manifest("lab", 1).vocabulary.sha256 == DEFAULT_VOCABULARY_SHA256
-        with pytest.raises(GateRefusedError, match="nothing judged the pair geometry"):  # the sample turns on the spot
-            releases.publish(maps, "lab", 2)
-        releases.publish(maps, "lab", 2, actor=Actor("kim", "the rig is the laboratory's"), force=True)
-    (tmp_path / "shipped.fmvb").write_bytes(default_vocabulary_bytes())
-    assert "has published" in str(refused(*lab, "--vocabulary", tmp_path / "shipped.fmvb"))
+    assert first.vocabulary.sha256 == second.vocabulary.sha256 == DEFAULT_VOCABULARY_SHA256
 
 
 def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fleetmap.bow import decode_vocabulary, train_vocabulary
+from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
@@ -176,16 +176,6 @@ def test_a_survey_whose_calibration_is_wrong_is_not_finished(tmp_path: Path, mon
     assert stopped == ["loops"]
     assert admission.begun is not None
     assert admission.begun.done is None
-
-
-def test_a_survey_is_finished_anew_with_other_words(tmp_path: Path) -> None:
-    path = write_euroc(tmp_path / "turn", make_sample(24))
-    with open_side_process(2) as side, open_executor(2, None, side) as executor:
-        begun = admitted(path, RecordingOptions(), executor).begun
-    assert begun is not None
-    assert begun.finished(OPTIONS, SurveyTools()) is begun.done
-    own = train_vocabulary(begun.chain.odometry.keyframes[0].features.descriptors, 4, 2, np.random.default_rng(0))
-    assert begun.finished(replace(OPTIONS, vocabulary=own), SurveyTools()) is not begun.done
 
 
 def test_a_survey_under_another_calibration_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

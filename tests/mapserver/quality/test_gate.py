@@ -94,7 +94,7 @@ def verdict(
     before = Before(manifest(current, 1), done.map, current, []) if has_current else None
     session = JudgedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
     evidence = examine_draft(DraftMap(tiles, done.vocabulary, survey_map.camera), before, [session], [])
-    said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, None, GateSettings(), evidence)
+    said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, GateSettings(), evidence)
     return said, evidence
 
 
@@ -317,7 +317,7 @@ def test_a_torn_survey_is_refused_though_its_tiles_agree_with_it() -> None:
     motion = trajectory_breaks(stamps, torn, odom, np.zeros((200, 6, 6)), np.ones(200, bool))
     evidence = Evidence(motion=motion)
     tiles = tiles_from_survey(sound()[0].map)
-    said = judge(manifest(tiles, 1), None, None, GateSettings(), evidence)
+    said = judge(manifest(tiles, 1), None, GateSettings(), evidence)
     assert any("torn in 2 places" in reason for reason in said.reasons)
     assert "held_out_frames" in said.report["not_judged"]
 
@@ -328,7 +328,7 @@ STRAIGHT = RigEvidence("a1", not_judged={"pair geometry": "drive curves"})
 def with_calibrations(*rigs: RigEvidence, has_current: bool) -> GateVerdict:
     tiles = tiles_from_survey(sound()[0].map)
     evidence = Evidence(calibrations=merged(rigs))
-    return judge(manifest(tiles, 2), manifest(tiles, 1) if has_current else None, None, GateSettings(), evidence)
+    return judge(manifest(tiles, 2), manifest(tiles, 1) if has_current else None, GateSettings(), evidence)
 
 
 def test_a_first_version_whose_calibration_nobody_could_judge_waits_for_a_person() -> None:
@@ -358,12 +358,12 @@ def test_a_calibration_that_a_person_trusts_passes_and_another_one_does_not(rig:
     draft = msgspec.structs.replace(
         manifest(tiles_from_survey(sound()[0].map), 1), configuration={TRUSTED_KEY: [choice]}
     )
-    said = judge(draft, None, None, GateSettings(), Evidence(calibrations=[STRAIGHT]))
+    said = judge(draft, None, GateSettings(), Evidence(calibrations=[STRAIGHT]))
     assert (said.accepted, said.reasons) == (passes, said.unjudged)
     words = "pair geometry of calibration a1: drive curves (ada trusts it: a board)"
     assert (words in said.report["not_judged"]) is passes
     doubt = RigEvidence("a1", doubted={"metric scale": "4 % off"})
-    assert not judge(draft, None, None, GateSettings(), Evidence(calibrations=[doubt])).accepted
+    assert not judge(draft, None, GateSettings(), Evidence(calibrations=[doubt])).accepted
 
 
 @pytest.mark.parametrize("has_current", [False, True])
@@ -375,13 +375,13 @@ def test_doubts_about_a_calibration_wait_for_a_person(has_current: bool) -> None
 
 def test_without_evidence_only_hard_limits_refuse() -> None:
     tiles = tiles_from_survey(sound()[0].map)
-    said = judge(manifest(tiles, 1), None, None, GateSettings())
+    said = judge(manifest(tiles, 1), None, GateSettings())
     assert said.accepted
     assert set(said.report["not_judged"]) == {
         "held_out_frames", "yesterdays_recordings", "last_versions_places", "aliasing_probes", "motion",
         "size_against_last_version", "calibration", "joining",
     }  # fmt: skip
-    assert not judge(manifest([], 1), None, None, GateSettings()).accepted
+    assert not judge(manifest([], 1), None, GateSettings()).accepted
 
 
 @pytest.mark.parametrize(
@@ -397,7 +397,7 @@ def test_a_recording_that_was_not_shown_to_belong_to_the_site_stops_a_draft(
         recordings=(entry,),
         report={} if joins is None else {"joins": joins},
     )
-    said = judge(draft, None, None, GateSettings())
+    said = judge(draft, None, GateSettings())
     assert said.accepted is passes
     assert bool(said.hard_reasons) is not passes
     assert ("joining" in said.report["not_judged"]) is (joins is None)

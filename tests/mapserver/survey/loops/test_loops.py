@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from fleetmap.bow import Vocabulary, train_vocabulary
+from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
@@ -22,6 +22,7 @@ from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
+from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = SurveySettings(loops=LoopSettings(min_gap_keyframes=6))
 WALL, AGAIN = range(4), range(10, 14)
