@@ -115,7 +115,10 @@ class RecordingOptions:
         whole = open_recording(path, self.opening)
         try:
             recording = reduced(whole, self.use)
-            return with_depths(recording, FrameSelection.parse(self.frames).apply(recording), self.trajectory)
+            chosen, indices = with_depths(
+                recording, FrameSelection.parse(self.frames).apply(recording), self.trajectory
+            )
+            return chosen.readable(indices)
         except FleetmapError:
             whole.close()
             raise

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
+from fleetmap.recordings.decoder_messages import with_messages
 from fleetmap.recordings.strange_files import what_instead
 from fleetmap.sensors.samples import CameraFrame, Image
 
@@ -142,6 +143,9 @@ _UNREAD_STARTS = (
 )
 _MOSAIC_SHARE, _LEAST_MOSAIC_PX, _LEAST_MOSAIC_GREY = 0.04, 100, 20.0
 MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of an image is an error of ours
+# What libjpeg and libpng say of pixels that are lost; colour profiles and comments may be damaged
+_DAMAGED = re.compile("Corrupt JPEG data|Premature end|libpng error|IDAT")
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Images with sensor noise have no repetitions worth a search: run-length coding is faster and, measured, smaller.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
@@ -383,9 +387,15 @@ def _inverse_depth_scale(stored: StoredImage) -> tuple[float, float]:
 def _decode_file(stored: StoredImage) -> AnyArray:
     _check_file(stored)
     try:
-        pixels = cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels, said = with_messages(lambda: cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED))
     except cv2.error:
-        pixels = None
+        pixels, said = None, ""
+    kind = file_kind(stored.data)
+    if kind != "other" and (pixels is None or _DAMAGED.search(said)):
+        raise RecordingError(
+            f"{stored.where}: the {kind} image of {len(stored.data)} bytes is damaged inside; copy the recording again, or "
+            "remove the image"
+        )
     if pixels is None:
         raise _not_an_image(stored)
     return np.asarray(pixels)

@@ -67,6 +67,29 @@ class FrameSource(Protocol):
 
 
 @dataclass(frozen=True)
+class _SomeFrames:
+    """The frames of a source at indices (K,), numbered anew, which are closed with it."""
+
+    source: FrameSource
+    indices: NDArray[np.int64]
+
+    def stored(self, index: int) -> StoredFrame:
+        return self.source.stored(int(self.indices[index]))
+
+    def frame(self, index: int) -> CameraFrame:
+        return self.source.frame(int(self.indices[index]))
+
+    def part(self, indices: NDArray[np.int64]) -> FrameSource:
+        return self.source.part(self.indices[indices])
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.source.hash_into(digest)
+
+    def close(self) -> None:
+        self.source.close()
+
+
+@dataclass(frozen=True)
 class Recording:
     """One recording, opened: everything but the images in memory, the images read on demand.
 
@@ -114,6 +137,28 @@ class Recording:
                 f"{colour_width}x{colour_height}; record depth registered to colour"
             )
         return frame
+
+    def readable(self, indices: NDArray[np.int64]) -> tuple["Recording", NDArray[np.int64]]:
+        """The recording without those of its frames at indices (K,) whose images are damaged, and the others' indices in it.
+
+        They are noted in its issues. RecordingError where most are damaged.
+        """
+        faults: dict[int, str] = {}
+        for index in indices.tolist():
+            try:
+                self.read_frame(index)
+            except RecordingError as error:
+                faults[index] = str(error)
+        if not faults:
+            return self, indices
+        first = next(iter(faults.values()))
+        if 2 * len(faults) > len(indices):
+            raise RecordingError(f"{len(faults)} of {len(indices)} frames cannot be read; the first: {first}")
+        issue = DataIssue("images damaged", f"{len(faults)} of {len(indices)} frames left out; the first: {first}")
+        kept = np.setdiff1d(np.arange(len(self)), list(faults))
+        frames = _SomeFrames(self.frames, kept)
+        sound = replace(self, frame_stamps_ns=self.frame_stamps_ns[kept], frames=frames, issues=(*self.issues, issue))
+        return sound, np.searchsorted(kept, np.setdiff1d(indices, list(faults)))
 
     def stored_frame(self, index: int) -> StoredFrame:
         """Frame `index` with its images as they were stored, for copying without loss."""
