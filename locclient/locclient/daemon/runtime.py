@@ -31,7 +31,6 @@ from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTrac
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
-from locclient.robot.sensor_agreement import WORDS
 from locclient.vda5050.mqtt_link import MqttLink
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
@@ -171,9 +170,9 @@ class Runtime:
             held = frozenset(loaded.version for loaded in parts.robot.held)
             parts.fleet_manager.adapter.after_frame(outcome, held)
         was_lost = self._figures.search.is_long
-        before = () if self._figures.last is None else self._figures.last.left_out
-        for flag in set(outcome.left_out).difference(before):
-            _log.warning(WORDS[flag])
+        before = {} if self._figures.last is None else self._figures.last.left_out
+        for flag in outcome.left_out.keys() - before.keys():
+            _log.warning("%s", outcome.left_out[flag])
         self._figures.handle(outcome)
         if self._figures.search.is_long != was_lost:
             _log.warning("%s", "localised again" if was_lost else self._figures.search.words)

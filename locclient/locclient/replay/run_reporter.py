@@ -19,7 +19,6 @@ from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome
-from locclient.robot.sensor_agreement import WORDS
 
 _HEALTH_EVERY_NS, _POSE_EVERY_NS = 1_000_000_000, 500_000_000
 
@@ -48,7 +47,7 @@ class RunReporter:
     def handle(self, outcome: Outcome) -> None:
         """Sends what is due after a frame, which stands in the result already."""
         self.figures.handle(outcome)
-        self._result.notes.extend(WORDS[f] for f in outcome.left_out if WORDS[f] not in self._result.notes)
+        self._result.notes.extend(words for words in outcome.left_out.values() if words not in self._result.notes)
         if outcome.failure is not None:
             self.figures.count_failure()
             self._report_failure(outcome.failure)

@@ -1,7 +1,7 @@
 """One robot, frame by frame: localization, detection of failures, trials of new map versions. Pure."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
@@ -24,7 +24,7 @@ from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
-from locclient.robot.sensor_agreement import IMU_REFUSED, WHEELS_REFUSED, WheelAgreement
+from locclient.robot.sensor_agreement import IMU_REFUSED, WHEELS_REFUSED, WheelAgreement, accelerometer_refused
 from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
@@ -70,7 +70,7 @@ class Outcome:
 
     cpu_s: from the images as they came to the estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
     an arrival. speed_mps: by the wheels, else by the odometry, None where neither knows it. may_be_mapped: False where the robot is not
-    localised and the map has no tile near. left_out: flags of sensors that everything else contradicts.
+    localised and the map has no tile near. left_out: flags of sensors that everything else contradicts, with words.
     """
 
     estimate: Estimate
@@ -81,7 +81,7 @@ class Outcome:
     dock_error_m: float | None = None
     speed_mps: float | None = None
     may_be_mapped: bool = True
-    left_out: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def pose_message(self) -> PoseMessage | None:
         """The pose for the server; None while there is no single one with a covariance."""
@@ -216,10 +216,12 @@ class Robot:
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out()
         )
 
-    def _left_out(self) -> tuple[str, ...]:
-        perception = self.localizer.perception
-        refuses_imu = isinstance(perception, SensorPerception) and perception.odometry.refuses_imu
-        return (*([IMU_REFUSED] if refuses_imu else []), *([WHEELS_REFUSED] if self._wheels.is_refused else []))
+    def _left_out(self) -> dict[str, str]:
+        perception, found = self.localizer.perception, WHEELS_REFUSED if self._wheels.is_refused else {}
+        if not isinstance(perception, SensorPerception):
+            return found
+        imu = IMU_REFUSED if perception.odometry.refuses_imu else {}
+        return {**imu, **accelerometer_refused(perception.odometry.accelerometer_fault), **found}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""

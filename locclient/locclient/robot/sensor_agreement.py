@@ -8,12 +8,20 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import WheelSample
 
-IMU_REFUSED, WHEELS_REFUSED = "imu_refused", "wheels_refused"
-"""Flags of RobotHealth: the camera's motion contradicts the sensor, which is not used."""
-WORDS = {
-    IMU_REFUSED: "the IMU is left out: it turns otherwise than the images; record a drive and ask `mapserver doctor` which axis is wrong",
-    WHEELS_REFUSED: "the wheels are left out: their speed contradicts the images and the IMU; `mapserver doctor` on a recording says how",
+_ASK = "record a drive and ask `mapserver doctor`"
+IMU_REFUSED = {"imu_refused": f"the IMU is left out: it turns otherwise than the images; {_ASK} which axis is wrong"}
+WHEELS_REFUSED = {
+    "wheels_refused": f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
 }
+"""Flags of RobotHealth with their words: the camera's motion contradicts the sensor, which is not used."""
+
+
+def accelerometer_refused(fault: str) -> dict[str, str]:
+    """The flag of an accelerometer with such a fault, with its words; empty without one."""
+    words = f"the accelerometer is left out, the images contradict it: {fault}; mend its driver, or how the calibration mounts it"
+    return {"accelerometer_refused": words} if fault else {}
+
+
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # of the speed, and of slow ones: slip of a tyre is far less
 _LIMIT_M = 3.0  # of driving against the images: a spinning wheel or a person before the camera takes less
 _FOLLOWED_SHARE = 0.5  # of the tracks

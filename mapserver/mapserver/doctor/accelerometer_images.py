@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, so3_exp
+from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.doctor.findings import Finding, Verdict, not_judged
-from mapserver.doctor.gyro_images import SIGNED_AXES, CameraTurns, axes_in_words
+from mapserver.doctor.gyro_images import CameraTurns
 
 NAME = "accelerometer axes"
 _HALF_WINDOW_S = 0.3
@@ -47,6 +48,11 @@ class AxesFit:
     def is_given(self) -> bool:
         """True for the axes that the recording states."""
         return bool((self.body_from_accel == np.eye(3)).all())
+
+    @property
+    def is_reversed(self) -> bool:
+        """True for all axes of the wrong sign."""
+        return bool((self.body_from_accel == -np.eye(3)).all())
 
 
 def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[AxesFit]:
@@ -102,7 +108,8 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
     if not possible:
         words = "no order of the accelerometer's axes lets a robot on wheels stand upright"
     else:
-        likely = max(possible, key=lambda fit: float(np.trace(fit.body_from_accel)))
+        # All axes reversed is one fault, of a driver that reports gravity; it goes before two or three of them.
+        likely = max(possible, key=lambda fit: 0.5 if fit.is_reversed else float(np.trace(fit.body_from_accel)))
         words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: so the images accelerate"
     if given is not None:
         words += f"; as given, up is {np.round(given, 1) + 0.0} of the base"

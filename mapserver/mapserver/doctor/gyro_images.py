@@ -1,11 +1,11 @@
 """The gyro against the images: time offset, scale and axes of their rotation rates."""
 
 from dataclasses import dataclass, field
-from itertools import permutations, product
 
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
+from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words, in_axes
 from fleetmap.sensors.samples import ImuSamples, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 from mapserver.doctor.timing import RECORD_IMU
@@ -15,12 +15,6 @@ _SEARCH_S, _STEP_S = 0.2, 0.002
 _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
-# The orders and signs of three axes, as matrices body_from_sensor.
-SIGNED_AXES = [
-    np.eye(3)[list(order)] * np.array(signs)[:, None]
-    for order in permutations(range(3))
-    for signs in product((1.0, -1.0), repeat=3)
-]
 AXES = "gyro axes"
 _NAMES = ("camera-imu time offset", "gyro scale", AXES)
 
@@ -201,21 +195,3 @@ def _axes_finding(fit: GyroFit) -> Finding:
     advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
     bad = f"{words} ({in_axes(fit.body_from_gyro)}); {advice}"
     return judge(_NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, bad)
-
-
-def axes_in_words(body_from_sensor: Array) -> str:
-    """What is wrong with a sensor that a signed permutation (3, 3) turns to the body's axes."""
-    signs = np.diag(body_from_sensor)
-    if not (np.abs(signs) == 1.0).all():
-        return f"has its axes exchanged ({in_axes(body_from_sensor)})"
-    wrong = [name for name, sign in zip("xyz", signs, strict=True) if sign < 0]
-    return "has the wrong sign" if len(wrong) == 3 else f"has the wrong sign on its {' and '.join(wrong)} axis"
-
-
-def in_axes(body_from_gyro: Array) -> str:
-    """The nearest axis for each body axis, such as `x is -y`."""
-    words = []
-    for name, row in zip("xyz", body_from_gyro, strict=True):
-        nearest = int(np.argmax(np.abs(row)))
-        words.append(f"{name} is {'-' if row[nearest] < 0 else ''}{'xyz'[nearest]}")
-    return ", ".join(words)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.filter.sliding_window import OdometryRig
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.odometry.sensor_buffer import SensorBuffer
@@ -10,12 +11,16 @@ from fleetmap.sensors.calibration import ImuNoise
 
 @dataclass(frozen=True, slots=True)
 class ImuInputs:
-    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the monitor of its faults."""
+    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the monitors of its faults.
+
+    accelerometer: None for one camera, whose metres come from it.
+    """
 
     samples: SensorBuffer
     noise: ImuNoise
     weighing_noise: ImuNoise
     monitor: DivergenceMonitor
+    accelerometer: AccelerometerCheck | None = None
 
 
 def imu_inputs(rig: OdometryRig, noise: ImuNoise, samples: SensorBuffer) -> ImuInputs:

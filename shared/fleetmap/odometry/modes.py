@@ -23,6 +23,7 @@ from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
+_FOLLOWED_SHARE = 0.5  # of the tracks
 _NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
 
 
@@ -96,6 +97,17 @@ class WindowMode(Mode):
 
     def will_forget(self, frame_index: int) -> bool:
         return frame_index not in self.window.filter.clone_ids[1:]
+
+    def _is_accelerometer_wrong(self, imu: ImuInputs, stamp_ns: int, tracked: Tracked) -> bool:
+        """Shows a frame to the check of the accelerometer; stamp_ns on the IMU's clock."""
+        if imu.accelerometer is None:
+            return False
+        seen = tracked.cam_from_previous
+        if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE:
+            seen = None  # pictures that could hardly be followed accuse no sensor
+        moved = None if seen is None else self._rig.body_from_cam @ se3_inverse(seen) @ self._rig.cam_from_body
+        imu.accelerometer.handle(stamp_ns, moved, imu.samples.imu, on_wheels=imu.samples.on_wheels)
+        return bool(imu.accelerometer.fault)
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
         window_filter, used = self.window.filter, step.used
@@ -193,22 +205,12 @@ class VisualMode(WindowMode):
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 
-class StartingMode(VisualMode):
-    """Vision alone until gravity is known, by rest or by motion."""
+class GyroMode(VisualMode):
+    """Vision and the gyro, of an IMU whose accelerometer is not used: the gyro says how the body turns."""
 
-    waits_for_gravity = True
-
-    def __init__(
-        self,
-        window: SlidingWindow,
-        imu: ImuInputs,
-        not_before_ns: int = -(2**62),
-        cam_from_previous: Array | None = None,
-    ) -> None:
-        """not_before_ns: earlier samples led to a static start that was wrong."""
+    def __init__(self, window: SlidingWindow, imu: ImuInputs, cam_from_previous: Array | None = None) -> None:
         super().__init__(window, cam_from_previous)
-        self._imu, self.not_before_ns = imu, not_before_ns
-        self._trajectory: list[tuple[int, Array]] = []
+        self._imu = imu
         self._turned: Array | None = None
 
     def predict(self, stamp_ns: int) -> None:
@@ -223,6 +225,40 @@ class StartingMode(VisualMode):
             self._cam_from_previous = self._rig.cam_from_body @ se3_inverse(body_from_next) @ self._rig.body_from_cam
         super().predict(stamp_ns)
 
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode; a gyro that contradicts the images is given up."""
+        predicted, seen = None if self._turned is None else self._cam_from_previous, tracked.cam_from_previous
+        if self._imu.monitor.is_wrong_imu(predicted, seen):
+            return VisualMode(self.window, seen).process(frame_index, tracked)
+        return super().process(frame_index, tracked)
+
+    def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
+        """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""
+        settings = self._rig.settings
+        free_rad = settings.filter.free_rotation_sigma_rad
+        sigma_rad = max(settings.start.steady_gyro_mean_radps * duration_s, _ROTATION_SIGMA_RAD)
+        if self._turned is None or rotation_angle_rad(self._turned.T @ body_from_next[:3, :3]) > 2.0 * sigma_rad:
+            return free_rad
+        return min(sigma_rad, free_rad)
+
+
+class StartingMode(GyroMode):
+    """Vision and the gyro until gravity is known, by rest or by motion."""
+
+    waits_for_gravity = True
+
+    def __init__(
+        self,
+        window: SlidingWindow,
+        imu: ImuInputs,
+        not_before_ns: int = -(2**62),
+        cam_from_previous: Array | None = None,
+    ) -> None:
+        """not_before_ns: earlier samples led to a static start that was wrong."""
+        super().__init__(window, imu, cam_from_previous)
+        self.not_before_ns = not_before_ns
+        self._trajectory: list[tuple[int, Array]] = []
+
     def begin(self, stamp_ns: int) -> Mode:
         """See Mode: stereo-inertial at once where the IMU rested before the first frame."""
         start = self._static_start(stamp_ns)
@@ -230,7 +266,9 @@ class StartingMode(VisualMode):
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to stereo-inertial once gravity is known, which redefines `odom`."""
-        step = super().process(frame_index, tracked)
+        step = VisualMode.process(self, frame_index, tracked)
+        if self._is_accelerometer_wrong(self._imu, self.stamp_ns, tracked):
+            return step._replace(mode=GyroMode(self.window, self._imu, self._cam_from_previous))
         stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.state.odom_from_body
         if tracked.lost:
             self._trajectory.clear()
@@ -244,15 +282,6 @@ class StartingMode(VisualMode):
         change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
         begun = step.new_odom_from_old_odom
         return Step(mode, step.used, change if begun is None else change @ begun)
-
-    def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
-        """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""
-        settings = self._rig.settings
-        free_rad = settings.filter.free_rotation_sigma_rad
-        sigma_rad = max(settings.start.steady_gyro_mean_radps * duration_s, _ROTATION_SIGMA_RAD)
-        if self._turned is None or rotation_angle_rad(self._turned.T @ body_from_next[:3, :3]) > 2.0 * sigma_rad:
-            return free_rad
-        return min(sigma_rad, free_rad)
 
     def _static_start(self, stamp_ns: int) -> InitialState | None:
         since = self._imu.samples.imu.between(self.not_before_ns, stamp_ns + 1)
@@ -337,7 +366,7 @@ class InertialMode(WindowMode):
         return self.window.cam_from_earlier(frame_index)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode; an IMU that contradicts the images is given up, a filter that diverged begins again."""
+        """See Mode; a gyro or accelerometer that contradicts the images is given up, a filter that diverged begins again."""
         window, monitor = self.window, self._imu.monitor
         if self._is_pause:
             return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
@@ -345,6 +374,8 @@ class InertialMode(WindowMode):
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
+        if self._is_accelerometer_wrong(self._imu, self._frame_ns, tracked):
+            return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
         matched = window.matched_body(tracked)
         if matched is not None:
             window.filter.inflate(matched[0], matched[1], window.seconds_since(matched[0]))
@@ -392,7 +423,7 @@ class InertialMode(WindowMode):
         self.window.filter.correct_with(at_rest, gate=_GATE_6)
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
-        """Vision alone from where the last frame was, until gravity is known anew.
+        """Without the accelerometer from where the last frame was, until gravity is known anew.
 
         What was called `odom` goes on, but nothing of before is known as well as it was said to be.
         """
@@ -403,4 +434,6 @@ class InertialMode(WindowMode):
         window = self.window.restarted(state, np.diag([1e-10] * 15), self._frame_ns)
         window.seed(frame_index, tracked)
         self._imu.monitor.begin_again()
+        if self._imu.accelerometer is not None and self._imu.accelerometer.fault:
+            return GyroMode(window, self._imu, motion)
         return StartingMode(window, self._imu, self._frame_ns, motion)

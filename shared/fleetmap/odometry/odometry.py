@@ -4,11 +4,13 @@ Never touches a file, a socket or a clock.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
@@ -42,6 +44,7 @@ class Odometry:
             camera, body_from_cam, cam_from_body, base_from_body, imu_minus_cam_s, calibration.imu, settings
         )
         self._samples = SensorBuffer()
+        self._accelerometer = AccelerometerCheck(base_from_body)
         self._tracker = Tracker(camera, settings.tracker, stereo_settings)
         self._mode = self._first_mode()
         self._frame_index = 0
@@ -75,6 +78,11 @@ class Odometry:
         """True if the images contradicted the IMU's turns, so that it is used no more."""
         return self._rig.imu is not None and type(self._mode) is VisualMode
 
+    @property
+    def accelerometer_fault(self) -> str:
+        """Why the accelerometer is not used, by its axes or its unit; empty where it is, or may be."""
+        return self._accelerometer.fault
+
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
@@ -92,4 +100,5 @@ class Odometry:
         window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
         if self._rig.imu is None:
             return VisualMode(window)
-        return StartingMode(window, imu_inputs(self._rig, self._rig.imu, self._samples))
+        inputs = replace(imu_inputs(self._rig, self._rig.imu, self._samples), accelerometer=self._accelerometer)
+        return StartingMode(window, inputs)

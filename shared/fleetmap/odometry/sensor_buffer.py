@@ -76,6 +76,11 @@ class SensorBuffer:
             return None
         return preintegrate(self.imu, start_ns, end_ns, np.zeros(3), np.zeros(3), noise).delta_rotation
 
+    @property
+    def on_wheels(self) -> bool:
+        """Whether wheel odometry came lately: the robot stands on a floor."""
+        return bool(self._wheel)
+
     def wheel_between(self, start_ns: int, end_ns: int) -> list[WheelSample]:
         """The wheel samples from start_ns until end_ns that are still there; none is taken."""
         return [sample for sample in self._wheel if start_ns <= sample.stamp_ns <= end_ns]

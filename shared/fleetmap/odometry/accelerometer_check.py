@@ -1,0 +1,140 @@
+"""The accelerometer against the images while a robot drives: signs and order of its axes, and its unit.
+
+Places of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the integral of
+the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, whatever the velocity was; and the same integral
+of the specific force, turned as the images say, less gravity and the accelerometer's bias.
+"""
+
+import numpy as np
+
+from fleetmap.geometry import Array, so3_exp, so3_log
+from fleetmap.inertial import GRAVITY_MPS2
+from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
+from fleetmap.sensors.samples import ImuSamples
+
+_HALF_NS, _LONGEST_NS = 200_000_000, 350_000_000  # half a window, and the longest between two frames
+_CHANGE_SIGMA_MPS, _BIAS_SIGMA_MPS2 = 0.05, 0.3
+_KEPT = 0.97  # of what was seen, with each window: turns add up errors of the images
+_MIN_WINDOWS, _SIZE_WINDOWS, _MANY_WINDOWS = 4, 10, 20
+# What other axes must explain better than the given ones before these are ruled out: in variances of a window, and times as well
+_SURE_SQUARES, _SURE_RATIO = 60.0, 4.0
+_NAMED_SQUARES = 12.0  # less well than the best: may be as well
+_REACH_SIGMAS = 4.0
+_GRAVITY_OFF_MPS2 = 2.0  # a bias and errors of the images make less
+_NO_GRAVITY_MPS2 = 4.0  # what motion shows of it where there is none
+_UPRIGHT = 0.7  # cosine of the angle between the base's up and the accelerometer's: ramps are far within
+
+
+class AccelerometerCheck:
+    """Follows images and samples frame by frame.
+
+    fault: why the accelerometer cannot be used, in words that name its axes or unit; empty while nothing says so.
+    """
+
+    def __init__(self, base_from_body: Array) -> None:
+        self._base_from_body = base_from_body
+        self.fault = ""
+        self._run: list[tuple[int, Array, Array]] = []  # stamps, places, rotations, in the axes of the run's first body
+        # Normal equations of body_from_sensor (9), bias (3), up in the run's axes times gravity (3), and a change of velocity
+        self._normal = np.zeros((16, 16))
+        self._windows = 0.0
+
+    def handle(self, stamp_ns: int, earlier_from_body: Array | None, imu: ImuSamples, *, on_wheels: bool) -> None:
+        """A frame on the IMU's clock; earlier_from_body (4, 4): by images, since the frame before, None where they do not show it.
+
+        on_wheels: whether the base stands upright.
+        """
+        if self.fault:
+            return
+        if earlier_from_body is None or not self._run or stamp_ns - self._run[-1][0] > _LONGEST_NS:
+            self._begin_run(stamp_ns)
+            return
+        _, place, rotation = self._run[-1]
+        moved = place + rotation @ earlier_from_body[:3, 3], rotation @ earlier_from_body[:3, :3]
+        self._run.append((stamp_ns, *moved))
+        stamps_ns = [each[0] for each in self._run]
+        middle = next((k for k, stamp in enumerate(stamps_ns) if stamp - stamps_ns[0] >= _HALF_NS), None)
+        if middle is None or stamp_ns - stamps_ns[middle] < _HALF_NS:
+            return
+        self._add(middle, imu)
+        del self._run[:middle]
+        self._judge(imu, on_wheels)
+
+    def _begin_run(self, stamp_ns: int) -> None:
+        """What was seen of axes and bias stays; which way is up in the axes of this frame is not known."""
+        self._run = [(stamp_ns, np.zeros(3), np.eye(3))]
+        up, others = self._normal[12:15], np.linalg.pinv(self._normal[12:15, 12:15], hermitian=True)
+        self._normal = self._normal - up.T @ others @ up
+        self._normal[12:15], self._normal[:, 12:15] = 0.0, 0.0
+
+    def _add(self, middle: int, imu: ImuSamples) -> None:
+        (t0, p0, _), (t1, p1, _), (t2, p2, _) = self._run[0], self._run[middle], self._run[-1]
+        samples = imu.between(t0, t2)
+        if len(samples) < 8 or np.diff(samples.stamps_ns, prepend=t0, append=t2).max() > _HALF_NS // 4:
+            return
+        stamps = samples.stamps_ns
+        weights = np.minimum((stamps - t0) / (t1 - t0), (t2 - stamps) / (t2 - t1))
+        weights *= 0.5e-9 * (t2 - t0) / weights.sum()
+        at_ns = np.array([each[0] for each in self._run])
+        number = np.clip(np.searchsorted(at_ns, stamps, "right") - 1, 0, len(at_ns) - 2)
+        shares = (stamps - at_ns[number]) / (at_ns[number + 1] - at_ns[number])
+        turns = [so3_log(a[2].T @ b[2]) for a, b in zip(self._run, self._run[1:], strict=False)]
+        turned = np.array(
+            [self._run[n][2] @ so3_exp(share * turns[n]) for n, share in zip(number, shares, strict=True)]
+        )
+        weighted = weights[:, None, None] * turned
+        rows = np.zeros((3, 16))
+        rows[:, :9] = np.einsum("iab,ic->abc", weighted, samples.accel_mps2).reshape(3, 9)
+        rows[:, 9:12] = -weighted.sum(axis=0)
+        rows[:, 12:15] = -0.5e-9 * (t2 - t0) * np.eye(3)
+        rows[:, 15] = 1e9 * ((p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0))
+        self._normal = _KEPT * self._normal + rows.T @ rows / _CHANGE_SIGMA_MPS**2
+        self._windows = _KEPT * self._windows + 1.0
+
+    def _judge(self, imu: ImuSamples, on_wheels: bool) -> None:
+        if self._windows < _MIN_WINDOWS:
+            return
+        normal = self._normal.copy()
+        normal[range(9, 12), range(9, 12)] += _BIAS_SIGMA_MPS2**-2
+        known = np.append(range(9), 15)
+        normal[range(12, 15), range(12, 15)] += 1e-3  # where images broke off it is not known
+        solved = np.linalg.solve(normal[9:15, 9:15], normal[9:15][:, known])
+        left = normal[np.ix_(known, known)] - normal[9:15][:, known].T @ solved
+        axes = np.array([[*each.ravel(), -1.0] for each in SIGNED_AXES])
+        squares = np.einsum("ka,ab,kb->k", axes, left, axes)
+        ups = -(axes @ solved.T)[:, 3:]
+        given = next(k for k, each in enumerate(SIGNED_AXES) if (each == np.eye(3)).all())
+        size = float(np.linalg.norm(ups[given]))
+        best = float(squares.min())
+        variance = max(1.0, best / max(3.0 * self._windows - 6.0, 1.0))
+        sigma_mps2 = float(np.sqrt(variance * np.trace(np.linalg.inv(normal[9:15, 9:15])[3:, 3:])))
+        if abs(size - GRAVITY_MPS2) > _GRAVITY_OFF_MPS2 + _REACH_SIGMAS * sigma_mps2:
+            self.fault = (
+                _size_in_words(size, float(np.median(np.linalg.norm(imu.accel_mps2, axis=1))))
+                if self._windows >= _SIZE_WINDOWS
+                else ""
+            )
+            return
+        ups_base = ups @ (self._base_from_body[:3, :3] @ self._run[0][2].T).T / max(size, 1e-9)
+        is_up = ups_base[:, 2] > _UPRIGHT
+        is_possible = squares < best + _NAMED_SQUARES * variance
+        is_contradicted = squares[given] > max(best + _SURE_SQUARES * variance, _SURE_RATIO * best)
+        # Upside down: once it shows whether all axes are reversed, or one.
+        whole = next(k for k, each in enumerate(SIGNED_AXES) if (each == -np.eye(3)).all())
+        is_told = not is_possible[whole] or self._windows > _MANY_WINDOWS
+        is_reversed = on_wheels and ups_base[given, 2] < -_UPRIGHT and is_told
+        if not is_contradicted and not is_reversed:
+            return
+        if abs(ups_base[given, 2]) > _UPRIGHT and (is_possible & is_up).any():  # a rig that stands as its base does
+            is_possible &= is_up
+        # All axes reversed is one fault, of a driver that reports gravity; it goes before others that explain as much.
+        possible = [each for k, each in enumerate(SIGNED_AXES) if is_possible[k]]
+        likely = max(possible, key=lambda each: 4.0 if (each == -np.eye(3)).all() else float(np.trace(each)))
+        self.fault = f"it {axes_in_words(likely)}"
+
+
+def _size_in_words(size_mps2: float, median_mps2: float) -> str:
+    words = f"it shows gravity as {size_mps2:.2g} m/s^2 in place of 9.8"
+    if size_mps2 > _NO_GRAVITY_MPS2:
+        return f"{words}: check its unit and range"
+    return f"{words}: it is in g" if 0.8 < median_mps2 < 1.25 else f"{words}: gravity was taken out of it"
