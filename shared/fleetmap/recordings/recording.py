@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.recordings.images import StoredFrame
+from fleetmap.recordings.images import StoredFrame, file_kind
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import (
     CameraFrame,
@@ -141,12 +141,17 @@ class Recording:
     def readable(self, indices: NDArray[np.int64]) -> tuple["Recording", NDArray[np.int64]]:
         """The recording without those of its frames at indices (K,) whose images are damaged, and the others' indices in it.
 
-        They are noted in its issues. RecordingError where most are damaged.
+        They are noted in its issues. JPEG images alone are decoded for it: the checksums of PNG files were looked at when the recording
+        was opened. RecordingError where most are damaged.
         """
         faults: dict[int, str] = {}
         for index in indices.tolist():
             try:
-                self.read_frame(index)
+                stored = self.stored_frame(index)
+                if any(
+                    image and file_kind(image.data) == "jpeg" for image in (stored.left, stored.right, stored.depth)
+                ):
+                    self.read_frame(index)
             except RecordingError as error:
                 faults[index] = str(error)
         if not faults:
