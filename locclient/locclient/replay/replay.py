@@ -68,8 +68,8 @@ def replay(
 ) -> ReplayResult:
     """Plays the source; prior: a coarse pose at its beginning.
 
-    A frame that cannot be read is left out, which a note says. Raises LinkError where no map can be fetched, RecordingError where no
-    frame can be read.
+    A frame that cannot be read is left out, which a note says. Raises LinkError where no map can be fetched, RecordingError where most
+    frames cannot be read.
     """
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
     loaded, tiles, note = load_map(connection.source)
@@ -116,12 +116,12 @@ def replay(
         if options.viewer is not None:
             options.viewer.handle(outcome)
         options.progress(number)
-    if unread and not result.frames:
-        raise RecordingError(f"none of {len(unread)} frames can be read; the first: {unread[0]}")
-    if unread:
-        result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
     if robot.ring is not None:
         robot.ring.finish()
+    if 2 * len(unread) > number + 1:
+        raise RecordingError(f"{len(unread)} of {number + 1} frames cannot be read; the first: {unread[0]}")
+    if unread:
+        result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
     result.search = reporter.figures.search
     if words := result.search.words:
         result.notes += [words, *_lens_note(source.recording)]
