@@ -134,6 +134,7 @@ class Robot:
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
         self._wheels = WheelAgreement(calibration.base_from_body)
+        self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[str, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
         self._building_from_map: Array | None = None
@@ -182,7 +183,9 @@ class Robot:
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
-        wheel = [] if self._wheels.is_refused else bundle.wheel
+        if bundle.wheel and self._wheels_fault and not self._wheels_unused:
+            self._wheels_unused = {"wheels_unmounted": f"the wheels are left out: {self._wheels_fault}"}
+        wheel = [] if self._wheels.is_refused or self._wheels_fault else bundle.wheel
         self.localizer.handle_wheel(wheel)
         if self.ring is not None:
             self.ring.handle_commands(bundle)
@@ -203,7 +206,7 @@ class Robot:
         self._try(estimate, frame)
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
-        self._wheels.handle(bundle.wheel, estimate.odometry)
+        self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         if self.ring is not None:
@@ -217,7 +220,8 @@ class Robot:
         )
 
     def _left_out(self) -> dict[str, str]:
-        perception, found = self.localizer.perception, WHEELS_REFUSED if self._wheels.is_refused else {}
+        perception = self.localizer.perception
+        found = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
         if not isinstance(perception, SensorPerception):
             return found
         imu = IMU_REFUSED if perception.odometry.refuses_imu else {}

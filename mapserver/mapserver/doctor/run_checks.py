@@ -106,6 +106,7 @@ def run_checks(
         timing.imu_rate(imu.stamps_ns),
         timing.imu_gaps(imu.stamps_ns),
         timing.stamp_order(recording.issues),
+        *timing.imu_noise(recording.calibration),
     ]
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     calibration = MeasuredCalibration([], None)

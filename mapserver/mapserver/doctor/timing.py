@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import DataIssue, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 
@@ -48,6 +49,18 @@ def imu_rate(imu_stamps_ns: Stamps) -> Finding:
         return not_judged("imu rate", "there is no IMU", RECORD_IMU)
     rate_hz = 1 / median_period_s(imu_stamps_ns)
     return _rate("imu rate", rate_hz, _SLOWEST_IMU_HZ, "set the IMU to 200 Hz, slow ones miss vibration and turns")
+
+
+def imu_noise(calibration: RigCalibration) -> list[Finding]:
+    """That nothing says how noisy the IMU is, where that is so."""
+    if calibration.imu is None or "imu" not in calibration.assumed:
+        return []
+    noise = calibration.imu
+    words = (
+        f"nothing tells it; {noise.gyro_noise_radps_rthz:g} rad/s/sqrt(Hz) and {noise.accel_noise_mps2_rthz:g} m/s^2/sqrt(Hz) are taken, "
+        "twice those of an ADIS16448"
+    )
+    return [not_judged("imu noise", words, "give imu0 with its noise densities in a --calibration FILE")]
 
 
 def camera_gaps(frame_stamps_ns: Stamps) -> Finding:

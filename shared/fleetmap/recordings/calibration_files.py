@@ -76,7 +76,8 @@ def load_calibration(path: Path) -> CalibrationFile:
         for candidate in sorted([*path.parent.glob("imu*.yaml"), *path.parent.glob("kalibr_imu_chain.yaml")]):
             noise = _imu_noise(read_yaml(candidate), str(candidate))
             if noise is not None:
-                return replace(found, calibration=replace(found.calibration, imu=noise))
+                rest = tuple(name for name in found.calibration.assumed if name != "imu")
+                return replace(found, calibration=replace(found.calibration, imu=noise, assumed=rest))
     return found
 
 
@@ -89,7 +90,7 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
     """The calibration in the text of a camchain; `where` names it in error messages."""
     values = _parse_yaml(text, where)
     if "camera_matrix" in values:
-        return CalibrationFile(RigCalibration((_ros_camera(values, where),)), {})
+        return CalibrationFile(RigCalibration((_ros_camera(values, where),), assumed=("base_from_body",)), {})
     names = sorted((key for key in values if key.startswith("cam") and key[3:].isdigit()), key=lambda key: int(key[3:]))
     if not names:
         raise CalibrationError(
@@ -120,7 +121,14 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
     base = matrix_4x4(values["base_from_body"], f"{where}: base_from_body") if "base_from_body" in values else np.eye(4)
     if isinstance(values.get("imu0"), dict):
         topics["imu0"] = str(values["imu0"].get("rostopic", ""))
-    return CalibrationFile(RigCalibration(tuple(cameras), imu, base), {k: v for k, v in topics.items() if v})
+    assumed = [
+        name
+        for name, told in (("imu", noise or not has_imu), ("base_from_body", "base_from_body" in values))
+        if not told
+    ]
+    return CalibrationFile(
+        RigCalibration(tuple(cameras), imu, base, tuple(assumed)), {k: v for k, v in topics.items() if v}
+    )
 
 
 def format_calibration(calibration: RigCalibration) -> str:
@@ -143,7 +151,8 @@ def format_calibration(calibration: RigCalibration) -> str:
         out.write("imu0:\n")
         for field_name, key in _NOISE_KEYS.items():
             out.write(f"  {key}: {float(getattr(calibration.imu, field_name))!r}\n")
-    out.write(f"base_from_body:\n{_rows(calibration.base_from_body, '')}")
+    if "base_from_body" not in calibration.assumed:
+        out.write(f"base_from_body:\n{_rows(calibration.base_from_body, '')}")
     return out.getvalue()
 
 

@@ -146,6 +146,10 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         how = "no calibration says how the IMU is mounted; pass one with --calibration FILE"
         log.note("imu not used", f"{len(imu)} samples, but {how}")
         imu = ImuSamples.empty()
+    wheel = parts.wheel
+    if wheel and (fault := parts.calibration.wheels_fault):
+        log.note("wheels not used", f"{len(wheel)} samples, but {fault}")
+        wheel = ()
     check_imu_units(imu, str(parts.path))
     recording = Recording(
         path=parts.path,
@@ -153,12 +157,15 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         format=parts.format,
         sensor_set=_sensor_set(parts, imu),
         calibration=RigCalibration(
-            cameras[:count], parts.calibration.imu if len(imu) else None, parts.calibration.base_from_body
+            cameras[:count],
+            parts.calibration.imu if len(imu) else None,
+            parts.calibration.base_from_body,
+            parts.calibration.assumed,
         ),
         frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
         imu=imu,
         frames=parts.frames,
-        wheel=parts.wheel,
+        wheel=wheel,
         priors=parts.priors,
         ground_truth=parts.ground_truth,
     )

@@ -54,13 +54,28 @@ class ImuNoise:
         _set_numbers(self, float, *self.__slots__)
 
 
+NO_BASE = (
+    "nothing says how the body is mounted on the base whose speed they measure; add base_from_body (4x4 rows) to the calibration file, "
+    "or, without such a file, record /tf_static with base_link"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class RigCalibration:
-    """All sensors of one robot. Cameras left first; `imu` is None for a rig without one."""
+    """All sensors of one robot. Cameras left first; `imu` is None for a rig without one.
+
+    assumed: the names of the values here that nothing said, of `imu` and `base_from_body`.
+    """
 
     cameras: tuple[CameraCalibration, ...]
     imu: ImuNoise | None = None
     base_from_body: Array = field(default_factory=lambda: np.eye(4))
+    assumed: tuple[str, ...] = ()
+
+    @property
+    def wheels_fault(self) -> str:
+        """Why wheels cannot be used, and what to do; empty where they can."""
+        return NO_BASE if "base_from_body" in self.assumed else ""
 
 
 def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> None:

@@ -395,3 +395,15 @@ def test_a_pair_beside_a_colour_camera_is_noted(tmp_path: Path) -> None:
         write_foreign(tmp_path / "a.mcap", messages), OpenOptions(topics=named_topics([f"left={COLOR}"]))
     ) as recording:
         assert says_so(recording, f"images not used {INFRA[0]}, {INFRA[1]}; {COLOR} is used")
+
+
+def test_wheels_are_left_out_where_nothing_says_how_the_body_is_mounted_on_the_base(tmp_path: Path) -> None:
+    def rename_base(message: Any) -> None:
+        for link in message.transforms:
+            link.header.frame_id = link.header.frame_id.replace("base_link", "chassis")
+
+    for messages, count in ((edited(TF, ALL, rename_base), 0), (drive(), FRAMES)):
+        with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
+            assert len(recording.wheel) == count
+            assert says_so(recording, "wheels not used .*add base_from_body") == (count == 0)
+            assert recording.calibration.assumed == (("imu",) if count else ("imu", "base_from_body"))

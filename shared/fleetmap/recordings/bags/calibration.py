@@ -95,8 +95,10 @@ def calibration_of_messages(
     ]
     body_frame = imu_frame if has_imu and imu_frame else cameras[0].frame
     bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
-    base_from_body = next((base for base in bases if base is not None), np.eye(4))
-    return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base_from_body)
+    base_from_body = next((base for base in bases if base is not None), None)
+    assumed = (*(["imu"] if has_imu else []), *(["base_from_body"] if base_from_body is None else []))
+    base = np.eye(4) if base_from_body is None else base_from_body
+    return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base, assumed)
 
 
 def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:
