@@ -39,6 +39,7 @@ class ServiceManager:
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.setblocking(False)  # a manager that does not read must not hold up the robot
             try:
                 sender.connect(self._address)
                 sender.send(text.encode())

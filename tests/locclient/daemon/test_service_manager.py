@@ -25,6 +25,15 @@ def test_the_manager_is_told(tmp_path: Path, abstract: bool) -> None:
         assert [listener.recv(100) for _ in range(3)] == [b"READY=1", b"WATCHDOG=1\nSTATUS=TRACKING", b"STOPPING=1"]
 
 
+@pytest.mark.timeout(30)
+def test_a_manager_that_does_not_read_holds_nothing_up(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "notify"))
+        manager = ServiceManager(str(tmp_path / "notify"))
+        for _ in range(2000):  # far more than the system keeps of them
+            manager.alive("TRACKING")
+
+
 def test_without_a_manager_nothing_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     ServiceManager().ready()
