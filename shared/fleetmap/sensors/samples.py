@@ -15,6 +15,9 @@ Stamps = NDArray[np.int64]
 # A longer time without images is a pause, which no motion is carried through: with an accelerometer off by 0.03 m/s^2, as good ones of
 # robots are, a position drifts 1.5 m in 10 s and grows with the square of the time, and a speed says nothing of what comes after a stop.
 PAUSE_NS = 10_000_000_000
+INTEGRATED_NS = (
+    60_000_000_000  # inertial samples that are there may carry a motion for longer; in a minute that drift is 54 m
+)
 
 
 class SensorSet(StrEnum):

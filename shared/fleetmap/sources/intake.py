@@ -12,11 +12,10 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.ordering import UNITS, wrong_unit
-from fleetmap.sensors.samples import PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
+from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
-_STALE_NS = 60_000_000_000  # inertial samples integrated for longer without an image are useless
 _ABSURD = 1e5
 _SET_BACK_NS = 1_000_000_000  # by more, a stamp is not one that was late on its way
 _STAYS_NS = 500_000_000  # for so long the older stamps must go on before it is the clock that was set
@@ -134,7 +133,7 @@ class Intake:
                 self._imu.stamps_ns.append(stamp_ns)
                 self._imu.rows.append(tuple(row))
             if not self._frames:
-                self.counts.imu_stale += len(self._imu.take_until(self._last_imu_ns - _STALE_NS))
+                self.counts.imu_stale += len(self._imu.take_until(self._last_imu_ns - INTEGRATED_NS))
             self._changed.notify_all()
 
     def put_wheel(self, sample: WheelSample) -> None:
