@@ -11,7 +11,7 @@ from fleetmap.errors import FleetmapError, UsageError
 
 # `mapserver COMMAND ...` of the commands that take --store, where it is not named
 _IN_STORE = re.compile(
-    r"`(mapserver (?!(?:doctor|calibrate|convert|evaluate|prepare|train-vocabulary|config)\b)\w(?:(?!--store)[^`])*)`"
+    r"`(mapserver (?!(?:doctor|calibrate|convert|evaluate|prepare|config)\b)\w(?:(?!--store)[^`])*)`"
 )
 INTERRUPTED = 130  # the status that shells use for Ctrl-C
 

@@ -52,7 +52,7 @@ def refusal(draft: VersionInfo, verdict: GateVerdict, store: Path) -> GateRefuse
     where = f"--site {draft.site} --store {shlex.quote(str(store))} --version {draft.version}"
     option = "--trust-calibration" if trusts else "--force"
     return GateRefusedError(
-        f"{words}; `mapserver inspect` shows the draft\n{when}:\n  mapserver publish {where} {option} --reason 'WHY'"
+        f"{words}; `mapserver inspect {where}` shows the draft\n{when}:\n  mapserver publish {where} {option} --reason 'WHY'"
     )
 
 

@@ -56,8 +56,8 @@ class LensFit:
     def words(self, camera: CameraCalibration) -> str:
         """A sentence on the camera's lens, with what to do where another one fits better."""
         given = f"{camera.model}, fx {camera.intrinsics_px[0]:.1f} px at {camera.width_px}x{camera.height_px}"
-        if not self.other:
-            return f"the images fit the given lens ({given})"
+        if not self.is_doubtful:
+            return f"the images fit the given lens ({given}; {np.sqrt(self.given_px2):.2f} px), no other one clearly better"
         return (
             f"the images fit {self.other} (error {np.sqrt(self.best_px2):.2f} px) better than the given lens ({given}; "
             f"{np.sqrt(self.given_px2):.2f} px); pass this camera's calibration with --calibration FILE, or calibrate it again"

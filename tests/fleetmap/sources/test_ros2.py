@@ -81,6 +81,8 @@ def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> 
         encode_prior(PositionPrior(start_ns, np.eye(4), np.eye(6)), "map"),
     )
     send(TOPICS.imu, "sensor_msgs/Imu", b"nonsense")
+    while queue.counts.unreadable < 1 and time.monotonic() < deadline:  # topics keep no order among each other
+        time.sleep(0.01)
     send(
         "/prior",
         "geometry_msgs/PoseWithCovarianceStamped",
