@@ -57,8 +57,8 @@ class OdometryEstimate:
 
 def is_away(last_ns: int, estimate: OdometryEstimate) -> bool:
     """True if nothing ties an estimate to the one at last_ns, a pause before it: the robot may have been carried anywhere."""
-    is_carried = estimate.inertial or estimate.status is not OdometryStatus.DEGRADED
-    return estimate.stamp_ns - last_ns > PAUSE_NS and not is_carried
+    is_pause = estimate.stamp_ns - last_ns > PAUSE_NS
+    return is_pause and not estimate.inertial and estimate.status is OdometryStatus.DEGRADED
 
 
 class ContinuousFrame:

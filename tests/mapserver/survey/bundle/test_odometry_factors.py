@@ -16,7 +16,7 @@ from support.worlds.corridor_scene import scene
 
 
 def estimate(cov: float, change: np.ndarray | None = None, *, inertial: bool = True) -> SimpleNamespace:
-    return SimpleNamespace(cov_rot_trans=cov * np.eye(6), new_odom_from_old_odom=change, inertial=inertial)
+    return SimpleNamespace(stamp_ns=0, cov_rot_trans=cov * np.eye(6), new_odom_from_old_odom=change, inertial=inertial)
 
 
 def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() -> None:
@@ -54,7 +54,7 @@ def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     assert between(2, 3) > 1.0
     assert between(3, 4) == pytest.approx(np.sqrt(3 * 0.01))
     first = np.diag([0.0, 0.0, 0.0, 0.04, 0.01, 0.0])
-    seen = SimpleNamespace(cov_rot_trans=first, new_odom_from_old_odom=None, inertial=False)
+    seen = SimpleNamespace(stamp_ns=0, cov_rot_trans=first, new_odom_from_old_odom=None, inertial=False)
     begun = continued_covariances([seen, estimate(0.0, turn)])
     np.testing.assert_allclose(np.diag(begun[1]), [0.0, 0.0, 0.0, 0.01, 0.04, 0.0], atol=1e-12)
 
