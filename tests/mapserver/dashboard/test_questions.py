@@ -10,7 +10,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking
-from support.pages.browser import Chromium
+from support.pages.browser import Chromium, box_of
 from support.storage.operator_scene import WORSE, fill_shift
 
 MOST_CLICKS = 2
@@ -76,7 +76,7 @@ def test_which_robots_need_a_person_now(operator: Operator) -> None:
     expect(row).to_contain_text("lost")
     expect(row).to_contain_text(WORSE)
     expect(row).to_contain_text(re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d"))
-    assert attention.bounding_box()["y"] < 400, "the answer is the first thing on the page"
+    assert box_of(attention)["y"] < 400, "the answer is the first thing on the page"
     assert operator.clicks == 0
 
 
@@ -97,7 +97,7 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     expect(page.locator(".week")).to_have_text(
         re.compile("^This week: Aisle 2 got worse; in 1 of 4 too little was driven")
     )
-    assert page.locator(".week").bounding_box()["y"] < 800, "without scrolling"
+    assert box_of(page.locator(".week"))["y"] < 800, "without scrolling"
     operator.click(page.get_by_role("link", name="Area by area"))
     heading = page.get_by_role("heading", name="What got worse this week")
     expect(heading).to_be_in_viewport()

@@ -8,7 +8,7 @@ from playwright.sync_api import Locator, Page, expect
 
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, opened, serving, talking
-from support.pages.browser import Chromium
+from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import SIZES, WEAKEST_CONTRAST
 
 ACTS = {
@@ -35,7 +35,7 @@ def phone(browser: Chromium) -> Iterator[Page]:
 def assert_in_reach(page: Page, thing: Locator) -> None:
     """Wholly within the width of the screen, and large enough, once it stands still: a dialog opens from a point."""
     thing.click(trial=True)
-    box, size = thing.bounding_box(), page.viewport_size
+    box, size = box_of(thing), page.viewport_size
     assert box["x"] >= 0, thing
     assert box["x"] + box["width"] <= size["width"], thing
     assert min(box["width"], box["height"]) >= _LEAST_PX, (thing, box)

@@ -8,7 +8,7 @@ from playwright.sync_api import Page, expect
 
 from mapserver.dashboard.space.loops import Loop, loops_of_version
 from support.fleet.dashboard_scene import Served, build_report, marks, opened, serving
-from support.pages.browser import Chromium
+from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import assert_whole
 from support.storage.operator_scene import fill_shift
 
@@ -54,7 +54,7 @@ def test_one_walks_along_the_survey(page: Page, served: Served) -> None:
     page.wait_for_function("document.querySelector('.expected img').naturalWidth === 320", timeout=60_000)
     expect(page.locator(".expected figcaption")).to_have_text(re.compile("^Drawn from the surfels: .* at place 1$"))
     first = picture.get_attribute("src")
-    box = page.locator(".site-map").bounding_box()
+    box = box_of(page.locator(".site-map"))
     page.locator(".site-map").click(position={"x": box["width"] * 0.6, "y": box["height"] * 0.5})
     expect(page.locator(".where")).not_to_have_text(re.compile("^Place 1 of"))
     page.wait_for_function(f"document.querySelector('.expected img').src !== {first!r}", timeout=60_000)

@@ -8,7 +8,7 @@ from typing import Any
 
 import psutil
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Error, Playwright, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Error, FloatRect, Locator, Playwright, sync_playwright
 
 _CLOSE_S = 30.0
 
@@ -66,6 +66,15 @@ def running_chromium(*arguments: str) -> Iterator[Chromium]:
             yield started
         finally:
             started.close()
+
+
+def box_of(thing: Locator) -> FloatRect:
+    """Where an element stands, in CSS pixels. Asked again while there is no box: a live page replaces its elements."""
+    for _ in range(50):
+        if (box := thing.bounding_box()) is not None:
+            return box
+        thing.page.wait_for_timeout(100)
+    raise AssertionError(f"{thing} has no box: it is not visible")
 
 
 @contextmanager
