@@ -5,8 +5,8 @@
 #   make test                  every test
 #   make check                 format, lint, types, import contracts
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
-#   make bench                 how fast and how exact, in numbers
-#   make acceptance            figures that no change may make worse (tests/acceptance.toml); an hour
+#   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
+#   make acceptance            those that no change may make worse; an hour
 #   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
@@ -14,7 +14,6 @@
 PYTHON ?= python3
 RECORDING ?=
 TESTS ?= tests
-BENCHMARKS ?= tests/benchmarks
 PYTEST_ARGS ?=
 
 VENV := .venv
@@ -44,7 +43,7 @@ demo-recording:
 
 test: $(DEV_STAMP)
 	@$(COMPILE) tests
-	$(BIN)/python -m pytest $(TESTS) --ignore=$(BENCHMARKS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(TESTS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .
@@ -67,7 +66,7 @@ kernels-simulator: $(DEV_STAMP)
 		--size 160x120 --out $$folder/clip.mcap; status=$$?; rm -r $$folder; exit $$status
 
 bench: $(DEV_STAMP)
-	$(BIN)/python -m pytest $(BENCHMARKS) -s $(PYTEST_ARGS)
+	PYTHONPATH=tests $(BIN)/python tests/acceptance.py --all $(NAMES)
 
 acceptance: $(DEV_STAMP)
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)

@@ -1,8 +1,9 @@
 """Measures the figures of acceptance.toml and compares them with their limits: `make acceptance`, before and after a large change.
 
-`PYTHONPATH=tests python tests/acceptance.py [NAME...] [--out FILE.json]`. Each entry of the file is a command that writes JSON to the
-path in place of `{out}`, and limits of figures in it: keys joined by `/`, `*` for every entry of a list or table. Times are CPU
-times at the yardstick's reference. Entries whose recordings are missing are reported as not measured. Exit status 1 on any miss.
+`PYTHONPATH=tests python tests/acceptance.py [NAME...] [--all] [--out FILE.json]`: without names the entries that are not marked `long`.
+Each entry of the file is a command that writes JSON to the path in place of `{out}`, and limits of figures in it: keys joined by
+`/`, `*` for every entry of a list or table. Times are CPU times at the yardstick's reference. Entries whose recordings are missing are
+reported as not measured. Exit status 1 on any miss; a command that fails is one.
 """
 
 import argparse
@@ -26,12 +27,13 @@ COMPARISONS = {"at_most": operator.le, "at_least": operator.ge, "equals": operat
 
 
 def measured(command: str, folder: Path) -> Any:
-    """Runs a command with this interpreter in the repository's root; returns the JSON that it wrote."""
+    """Runs a command with this interpreter in the repository's root; returns the JSON that it wrote, None if it failed."""
     out = folder / "figures.json"
     out.unlink(missing_ok=True)
     words = [str(out) if word == "{out}" else word for word in shlex.split(command)]
-    subprocess.run([sys.executable, *words], cwd=TESTS.parent, env=os.environ | {"PYTHONPATH": SOURCES}, check=True)
-    return json.loads(out.read_text("utf-8"))
+    environment = os.environ | {"PYTHONPATH": SOURCES}
+    done = subprocess.run([sys.executable, *words], cwd=TESTS.parent, env=environment, check=False)
+    return None if done.returncode else json.loads(out.read_text("utf-8"))
 
 
 def figures_at(values: Any, path: str) -> Iterator[tuple[str, Any]]:
@@ -59,17 +61,22 @@ def main() -> None:
     entries: dict[str, Any] = tomllib.loads((TESTS / "acceptance.toml").read_text("utf-8"))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[[], *entries])
+    parser.add_argument("--all", action="store_true", help="also the entries that take hours")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     kept: dict[str, Any] = {}
     lines, missed = [], 0
     with tempfile.TemporaryDirectory() as scratch:
-        for name in given.names or entries:
+        for name in given.names or [name for name, entry in entries.items() if given.all or not entry.get("long")]:
             entry = entries[name]
             if absent := [needed for needed in entry.get("needs", []) if not (DATA / needed).is_dir()]:
                 lines.append(f"{name}: NOT MEASURED, {', '.join(absent)} not found in {DATA}")
                 continue
             kept[name] = measured(entry["command"], Path(scratch))
+            if kept[name] is None:
+                lines.append(f"{name}: {entry['command']} FAILED")
+                missed += 1
+                continue
             for figure, value, limit, holds in compared(entry, kept[name]):
                 shown = f"{value:.4g}" if isinstance(value, float) else value
                 lines.append(f"{name}: {figure} = {shown}, {limit}{'' if holds else '  MISSED'}")

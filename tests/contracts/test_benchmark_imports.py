@@ -1,6 +1,8 @@
 """Benchmarks run seldom: what they import from the packages must be there all the same."""
 
 import ast
+import shlex
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -27,3 +29,11 @@ def test_a_benchmark_imports_what_exists(path: Path) -> None:
                 except ModuleNotFoundError:
                     missing.append(f"{node.module}.{alias.name}")
     assert missing == []
+
+
+def test_every_entry_of_the_acceptance_file_names_a_program() -> None:
+    tests = BENCHMARKS.parent
+    entries = tomllib.loads((tests / "acceptance.toml").read_text("utf-8"))
+    programs = [tests.parent / shlex.split(entry["command"])[0] for entry in entries.values()]
+    assert [str(path) for path in programs if not path.is_file()] == []
+    assert all("--out {out}" in entry["command"] for entry in entries.values())

@@ -4,7 +4,8 @@ CPU seconds and peak memory by stage and keyframes, the slopes of their growth (
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N] [--drive FILE]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N]
+        [--drive FILE] [--out FILE.json]
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -42,7 +43,6 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 ROBOTS = ("survey-south", "survey-south-back")  # 13,000 keyframes and more
-SLOPE_LIMIT, PEAK_LIMIT_MB, ATE_LIMIT_M = 1.1, 4096.0, 0.05
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
 
 
@@ -177,6 +177,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
     parser.add_argument("--drive", type=Path, default=Path("out/site.drive"), help="as simulated; made where missing")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path)
     parser.add_argument("--one", type=int, default=None, help=argparse.SUPPRESS)
     parser.add_argument("--cut", type=Path, default=None, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -193,9 +194,13 @@ def main() -> None:
     for row in measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive, given.threads):
         rows.append(row)
         print(json.dumps(row), flush=True)
+    slopes = {}
     if len(rows) > 1:
         slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
-        print(json.dumps({"slopes": slopes, "cpu_by_observations": slope(rows, "cpu_s", "observations")}))
+        slopes["cpu by observations"] = slope(rows, "cpu_s", "observations")
+        print(json.dumps(slopes))
+    if given.out is not None:
+        given.out.write_text(json.dumps({"sizes": rows, "slopes": slopes}, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

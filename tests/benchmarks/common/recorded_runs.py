@@ -2,13 +2,12 @@
 
 import argparse
 import json
-import operator
 import os
 import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,6 @@ from locclient.replay.run_result import ReplayResult
 
 SITE = "hall"
 LIBRARIES = ("numpy", "numba", "opencv-python-headless")
-AT_MOST, AT_LEAST = operator.le, operator.ge
-Promises = dict[str, tuple[float, Callable[[float, float], bool]]]
-"""Limit and how it limits, by figure."""
-_SIGNS = {AT_MOST: "<=", AT_LEAST: ">="}
 
 
 def parsed(description: str | None, names: Iterable[str]) -> argparse.Namespace:
@@ -52,29 +47,15 @@ def resident_mb() -> dict[str, float]:
     return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
 
 
-def misses(figures: dict[str, Any], promises: Promises) -> list[str]:
-    """What is not as promised, in words."""
-    return [
-        f"{key} is {figures[key]}, not {_SIGNS[compare]} {limit:g}"
-        for key, (limit, compare) in promises.items()
-        if figures[key] is None or not compare(figures[key], limit)
-    ]
-
-
-def show_against(name: str, figures: dict[str, Any], promises: Promises) -> None:
-    """A table: figure, value, target, and what was missed."""
+def show(name: str, figures: dict[str, Any]) -> None:
+    """A table of figures."""
     print(f"\n{name}")
     for key, value in figures.items():
         if isinstance(value, dict):
             shown = "  ".join(f"{k} {v:.3g}" for k, v in value.items())
         else:
             shown = "-" if value is None else f"{value:.4g}"
-        target = ""
-        if key in promises:
-            limit, compare = promises[key]
-            good = value is not None and compare(value, limit)
-            target = f"{_SIGNS[compare]} {limit:g} {'' if good else 'MISSED'}"
-        print(f"  {key:22} {shown:>12}  {target}", flush=True)
+        print(f"  {key:22} {shown:>12}", flush=True)
 
 
 def write_results(path: Path | None, results: dict[str, Any]) -> None:

@@ -1,8 +1,9 @@
 """Cost of enrolled robots: a server's bus with 1000 of them, and a revocation.
 
-PYTHONPATH=tests python -m benchmarks.fleet.bench_bus_access
+PYTHONPATH=tests python -m benchmarks.fleet.bench_bus_access [--out FILE.json]
 """
 
+import argparse
 import json
 import os
 import tempfile
@@ -95,6 +96,16 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     return found
 
 
-if __name__ == "__main__":
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        print(json.dumps(opening_and_revoking(Path(name) / "many", 1000, 12), indent=1))
+        found = json.dumps(opening_and_revoking(Path(name) / "many", 1000, 12), indent=1)
+    print(found)
+    if options.out is not None:
+        options.out.write_text(found + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

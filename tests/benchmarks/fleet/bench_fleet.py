@@ -139,7 +139,9 @@ def measure_load(folder: Path, robots: int, seconds: int, processes: int) -> dic
         "robots": robots, "seconds": seconds, "health_said": said["health"], "health_heard": heard["health"],
         "estimates_said": said["estimates"], "estimates_heard": heard["pose"], "failures_said": said["reports"],
         "failures_kept": kept, "server_cores": cores, "rss_begin_mb": float(np.mean(rss_mb[tenth : 2 * tenth])),
-        "rss_end_mb": float(np.mean(rss_mb[-tenth:])), "robots_late_s": said["late_s"], "slowest_page_ms": slowest,
+        "rss_end_mb": float(np.mean(rss_mb[-tenth:])),
+        "rss_growth": float(np.mean(rss_mb[-tenth:]) / np.mean(rss_mb[tenth : 2 * tenth])),
+        "robots_late_s": said["late_s"], "slowest_page_ms": slowest,
     }  # fmt: skip
 
 

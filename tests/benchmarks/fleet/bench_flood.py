@@ -1,6 +1,6 @@
 """One enrolled robot floods a running server over mutual TLS, in four ways; fifty others ask for their version and deliver failures.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_flood [--seconds 60] [--others 50]
+    PYTHONPATH=tests python -m benchmarks.fleet.bench_flood [--seconds 60] [--others 50] [--out FILE.json]
 
 The server, the robot that floods and the others are three processes on loopback. Row 8 of docs/security.md.
 """
@@ -198,9 +198,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--others", type=int, default=50)
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        bench(Path(name), options.seconds, options.others)
+        found = bench(Path(name), options.seconds, options.others)
+    if options.out is not None:
+        options.out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -256,6 +256,7 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
                     found = fleet.fetch(anew=name == "whole again")
                 rows[name] = found | load.figures()
                 rows[name]["http_p99_over_idle"] = rows[name]["http_p99_ms"] / rows["idle"]["http_p99_ms"]
+                rows[name]["share_of_whole"] = rows[name]["bytes_per_robot"] / rows["whole"]["bytes_per_robot"]
                 show(name, rows[name])
         finally:
             fleet.close()

@@ -160,7 +160,9 @@ def main() -> None:
     print(f"peak memory {before_mb:.0f} MB before, {peak_mb():.0f} MB after")
     if options.out is not None:
         about = {"machine": platform.machine(), "cores": os.cpu_count(), "command": sys.argv, "peak_mb": peak_mb()}
-        options.out.write_text(json.dumps(about | {"kinds": found}, indent=2) + "\n")
+        options.out.write_text(
+            json.dumps(about | {"kinds": found, "memory_mb": peak_mb() - before_mb}, indent=2) + "\n"
+        )
 
 
 if __name__ == "__main__":

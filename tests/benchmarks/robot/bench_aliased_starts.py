@@ -1,4 +1,4 @@
-"""What the localizer says where aisles are truly identical: starts at the estimator's level, beside what is promised of them.
+"""What the localizer says where aisles are truly identical: starts at the estimator's level.
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
 Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import AT_LEAST, AT_MOST, Promises, show_against, write_results
+from benchmarks.common.recorded_runs import show, write_results
 from benchmarks.robot.aliased_starts import (
     WHOLE_SITE,
     Site,
@@ -35,24 +35,12 @@ from locclient.localization.settings import LocalizerSettings
 
 WITHIN_S, WITHIN_M = 3.0, 5.0
 _FOLLOWED_S = 3.2
-_NEVER_WRONG: Promises = {"wrong_starts": (0, AT_MOST)}
-_AMONG = _NEVER_WRONG | {"right_among_hypotheses_share": (1.0, AT_LEAST)}
 _WHOLE = "no prior, whole site"
 _OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle, whole site", 8.0, 2.0, 15.0
 _FOREIGN, _FOREIGN_MAPPED = "out of an aisle that is not in the map", (0, 1, 3, 4, 5)
 _MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
 _ONE_WAY, _ONE_WAY_STANDING = "no prior, surveyed one way", "no prior, surveyed one way, standing"
-PROMISES: dict[str, Promises] = {
-    "no prior": _AMONG,
-    _ONE_WAY: _NEVER_WRONG,
-    _ONE_WAY_STANDING: _NEVER_WRONG,
-    _WHOLE: _AMONG,
-    "prior of 0.5 m": _NEVER_WRONG | {"right_in_time_share": (0.99, AT_LEAST)},
-    "prior of 2 m": _NEVER_WRONG,
-    _OUT: _NEVER_WRONG | {"resolved_share": (1.0, AT_LEAST)},
-    _FOREIGN: _NEVER_WRONG,
-    **dict(zip(_MAPPED, ({}, _NEVER_WRONG), strict=True)),
-}
+KINDS = ("no prior", _ONE_WAY, _ONE_WAY_STANDING, _WHOLE, "prior of 0.5 m", "prior of 2 m", _OUT, _FOREIGN, *_MAPPED)
 _PRIORS_M = {"no prior": None, _WHOLE: None, _ONE_WAY: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
 
 
@@ -101,10 +89,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12])
-    parser.add_argument("--only", action="append", default=[], choices=list(PROMISES))
+    parser.add_argument("--only", action="append", default=[], choices=KINDS)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    found: dict[str, list[Start]] = {name: [] for name in arguments.only or PROMISES}
+    found: dict[str, list[Start]] = {name: [] for name in arguments.only or KINDS}
     for seed in arguments.seeds:
         begun_s = time.process_time()
         sites = {of: surveyed_site(of[0], seed, of[1]) for of in {_site_of(name) for name in found}}
@@ -121,7 +109,7 @@ def main() -> None:
                     print("  wrong:", start, flush=True)
     figures = {name: judged(name, starts) for name, starts in found.items()}
     for name, row in figures.items():
-        show_against(name, row, PROMISES[name])
+        show(name, row)
     outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
     write_results(arguments.out, {"figures": figures, "starts": outcomes})
 

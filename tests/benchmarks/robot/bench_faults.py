@@ -117,7 +117,7 @@ def main() -> None:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
         found.append(outcome(name, played(recording, store, LocalizerSettings())))
         show(found[-1])
-    write_results(arguments.out, {"faults": [asdict(o) for o in found]})
+    write_results(arguments.out, {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}})
 
 
 if __name__ == "__main__":

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_calibration_faults import cost_cm
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -31,13 +30,14 @@ from mapserver.calibration.parameters import COLUMNS, INDEX
 from mapserver.calibration.recordings import LONGEST_S
 from mapserver.config import survey_settings
 from mapserver.doctor import Verdict
-from mapserver.doctor.calibration import MeasuredCalibration, corrected, findings_of
+from mapserver.doctor.calibration import TOLERANCES, MeasuredCalibration, corrected, findings_of
 from support.recordings.calibration_faults import standard_faults
 from support.worlds.calibration_scene import Stretch, make_stretch, measured, true_corrections, with_errors
 
 P = CalibrationParameter
 SCENARIOS = ("small-loop", "busy", "identical-aisles")
 JUDGED_SCENARIOS = ("small-loop", "busy", "identical-aisles", "five-aisles", "marked-ends")
+LIMIT_CM = 3.0
 LOUD = (Verdict.WARN, Verdict.FAIL)
 DURATION_S = 60.0
 # Sigmas of the random errors that calibrations are given.
@@ -48,6 +48,29 @@ ERRORS = {
 }  # fmt: skip
 WRONG = {"focal": P.FOCAL, "baseline": P.BASELINE, "yaw": P.PAIR_YAW, "delay": P.TIME_OFFSET}
 NAMED = (P.FOCAL, P.BASELINE, P.TIME_OFFSET, P.PAIR_YAW, P.PAIR_PITCH, P.CAMERA_IMU_Y)
+
+
+def cost_cm(rig: RigCalibration, true: RigCalibration) -> float:
+    """The dearest error of `rig`: 3 cm at each limit, in proportion."""
+    off = dict.fromkeys(P, 0.0)
+    left, true_left = rig.cameras[0], true.cameras[0]
+    focal_px = float(true_left.intrinsics_px[0])
+    off[P.FOCAL] = float(left.intrinsics_px[0] / true_left.intrinsics_px[0] - 1)
+    off[P.PRINCIPAL_X], off[P.PRINCIPAL_Y] = (left.intrinsics_px - true_left.intrinsics_px)[2:].tolist()
+    off[P.TIME_OFFSET] = left.imu_minus_cam_s - true_left.imu_minus_cam_s
+    turn = so3_log(Rectifier(rig).body_from_cam[:3, :3].T @ Rectifier(true).body_from_cam[:3, :3])
+    if true.imu is not None:  # a principal point that moved with it looks the same way
+        net = turn * [1, 1, 1] + np.array([-off[P.PRINCIPAL_Y], off[P.PRINCIPAL_X], 0]) / focal_px
+        off[P.CAMERA_IMU_X], off[P.CAMERA_IMU_Y], off[P.CAMERA_IMU_Z] = np.minimum(np.abs(turn), np.abs(net)).tolist()
+    if len(rig.cameras) > 1:
+        right, true_right = rig.cameras[1], true.cameras[1]
+        ratio = right.intrinsics_px[0] / left.intrinsics_px[0]
+        off[P.FOCAL_RATIO] = float(ratio / (true_right.intrinsics_px[0] / true_left.intrinsics_px[0]) - 1)
+        pairs = [se3_inverse(r.cameras[0].body_from_cam) @ r.cameras[1].body_from_cam for r in (rig, true)]
+        lengths = [float(np.linalg.norm(pair[:3, 3])) for pair in pairs]
+        off[P.BASELINE] = lengths[0] / lengths[1] - 1
+        off[P.PAIR_PITCH], off[P.PAIR_YAW], off[P.PAIR_ROLL] = so3_log(pairs[0][:3, :3] @ pairs[1][:3, :3].T).tolist()
+    return LIMIT_CM * max(abs(value) / TOLERANCES[p].warn_above for p, value in off.items() if np.isfinite(value))
 
 
 def drives(first_seed: int, count: int, draws: int) -> dict[str, Any]:

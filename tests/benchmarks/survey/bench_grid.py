@@ -1,22 +1,16 @@
 """The grid of planners against the truth of simulated warehouses, and what a night takes away of moved stock.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED ... [--every 6] [--height 1.1] [--picture FILE.png]
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED --store DIR --site NAME [--version N] [--day N]
-    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED --nights --work DIR [--next-day 8] [--frames ::2]
+    PYTHONPATH=tests python tests/benchmarks/survey/bench_grid.py SCENARIO:SEED ... [--every 6] [--height 1.1] [--next-day 8]
+        [--picture FILE.png] [--out FILE.json]
 
-Without --store every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo
-and the cells do, without a survey's error. With it the grid of a built version is judged, which must have been built with
---frame-from-ground-truth. With --nights recordings of both days go through `mapserver build`, `publish`, `nightly` and `grid export`, and
-a robot fetches both versions. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
+Every so many frames of the scenario's first run are rendered and looked at from their true poses: what dense stereo and the cells do,
+without a survey's error. Then those of another day. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
 """
 
 import argparse
-import subprocess
-import sys
-import tempfile
+import json
 import time
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -24,23 +18,15 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.features.settings import StereoSettings
 from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
-from fleetmap.messages import WantedVersion
-from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid, read_grid
+from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, encode_grid, grid_of, occupancy
-from fleetsim.commands import record_order
+from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, encode_grid, occupancy
 from fleetsim.recorder import Order, Session, prepare
-from locclient.maps.map_client import MapClient
-from locclient.maps.tile_cache import TileCache
-from mapserver.fleet.fleet import Fleet
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
 from mapserver.grid.site_grid import SessionViews, updated
-from mapserver.serving.bus_service import BusService
-from mapserver.store import MapStore
 
 RADIUS_M = 0.3
 
@@ -144,67 +130,6 @@ def judge_moved(
     return count, left
 
 
-def exported_nights(orders: tuple[Order, Order], work: Path, frames: str, height_m: float) -> list[OccupancyGrid]:
-    """The grids that `mapserver grid export` writes after a build of the first order and a night with the second."""
-    store, inbox, config = work / "store", work / "inbox", work / "mapserver.toml"
-    config.write_text("[survey]\noccupancy_grid = true\n")
-    inbox.mkdir(exist_ok=True)
-    where, grids = ("--site", "hall", "--store", str(store)), []
-    given = ("--config", str(config), "--frames", frames)
-    for number, order in enumerate(orders):
-        recording = work / f"{order.scenario}-{order.seed}-{order.day}.mcap"
-        if not recording.exists():
-            record_order(order, recording.with_suffix(".part"), "mcap")
-            recording.with_suffix(".part").rename(recording)
-        if number == 0:
-            mapserver("build", str(recording), *where, *given, "--frame-from-ground-truth")
-            mapserver("publish", *where)
-        else:
-            (inbox / recording.name).symlink_to(recording)
-            if not mapserver("nightly", *where, *given, "--inbox", str(inbox), "--settle-s", "0", may_fail=True):
-                mapserver(
-                    "publish", *where, "--force", "--reason", "the bench moves more stock than the gate lets pass"
-                )
-        path = work / f"night-{number}.yaml"
-        mapserver("grid", "export", *where, str(path), "--robot-height", str(height_m))
-        grids.append(read_grid(path))
-    for takes_grids in (False, True):
-        print(
-            f"  a robot fetches {robot_bytes(store, work, takes_grids=takes_grids)} bytes, {takes_grids=}", flush=True
-        )
-    return grids
-
-
-def robot_bytes(folder: Path, work: Path, *, takes_grids: bool) -> list[int]:
-    """What a robot with an empty cache fetches for version 1, and then for version 2."""
-    hub, received = MemoryHub(), [0]
-    with (
-        tempfile.TemporaryDirectory(dir=work) as cache,
-        MapStore.open(folder) as store,
-        MemoryBus(hub) as bus,
-        MemoryBus(hub) as own,
-    ):
-        service = BusService(store, Fleet(store), bus, lambda *_: None)
-        client = MapClient(own, TileCache(Path(cache)), "hall", "r1")
-        client.takes_grids = takes_grids
-        for version in (1, 2):
-            sha256 = store.version("hall", version).manifest_sha256
-            client.bring(WantedVersion(site="hall", version=version, manifest_sha256=sha256))
-            received.append(client.received_bytes)
-        service.close()
-    return [after - before for before, after in pairwise(received)]
-
-
-def mapserver(*words: str, may_fail: bool = False) -> bool:
-    """Runs the command, in a process of its own; whether it succeeded, which it must unless it may fail."""
-    begun_s = time.monotonic()
-    done = subprocess.run([sys.executable, "-m", "mapserver.cli", *words], capture_output=True, text=True, check=False)
-    print(f"  mapserver {words[0]}: {time.monotonic() - begun_s:.0f} s; {done.stdout.strip()}", flush=True)
-    assert may_fail or done.returncode == 0, done.stderr
-    print(f"    {done.stderr.strip()[-300:]}" if done.returncode else "", flush=True)
-    return done.returncode == 0
-
-
 def draw(path: Path, grid: OccupancyGrid, truth: Mask) -> None:
     """The grid, and under it the truth, as map_server shades."""
     cells = in_hall(grid, truth.shape)
@@ -220,42 +145,26 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=6)
     parser.add_argument("--height", type=float, default=1.1)
     parser.add_argument("--picture", type=Path)
-    parser.add_argument("--store", type=Path)
-    parser.add_argument("--site", default="hall")
-    parser.add_argument("--version", type=int)
-    parser.add_argument("--day", type=int, default=0)
-    parser.add_argument("--next-day", type=int, default=1, help="day of the second session's stock")
-    parser.add_argument("--nights", action="store_true", help="through the commands of the map server")
-    parser.add_argument("--frames", default="::2", help="of the recordings")
-    parser.add_argument("--work", type=Path, help="empty folder for recordings and store")
+    parser.add_argument("--next-day", type=int, default=8, help="day of the second session's stock")
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    halls = {}
     for hall in options.halls:
         scenario, _, seed = hall.partition(":")
         print(f"{hall}, robots of {options.height} m", flush=True)
-        session = prepare(Order(scenario, seed=int(seed), day=options.day))
-        night = prepare(Order(scenario, seed=int(seed), day=options.next_day))
-        if options.nights:
-            orders = session.order, night.order
-            grids = exported_nights(orders, options.work, options.frames, options.height)
-            judged_nights = [
-                judge(grid, one, options.height) for grid, one in zip(grids, (session, night), strict=True)
-            ]
-            judge_moved((grids[0], grids[1]), (judged_nights[0].truth, judged_nights[1].truth))
-            continue
-        if options.store is not None:
-            with MapStore.open(options.store, read_only=True) as maps:
-                tiles = grid_of(maps.manifest(options.site, options.version or 1), maps.blob)
-        else:
-            tiles = updated(views_from_truth(session, options.every, {}))
-        grid = occupancy(tiles, options.height)
-        judged = judge(grid, session, options.height)
+        days = [prepare(Order(scenario, seed=int(seed), day=day)) for day in (0, options.next_day)]
+        first = updated(views_from_truth(days[0], options.every, {}))
+        views = views_from_truth(days[1], options.every, first)
+        second = updated(views)
+        grids = [occupancy(tiles, options.height) for tiles in (first, second)]
+        judged = [judge(grid, day, options.height) for grid, day in zip(grids, days, strict=True)]
+        moved, left = judge_night(views, second, (judged[0].truth, judged[1].truth), options.height)
         if options.picture is not None:
-            draw(options.picture, grid, judged.truth)
-        if options.store is None:
-            views = views_from_truth(night, options.every, tiles)
-            after = updated(views)
-            judged_after = judge(occupancy(after, options.height), night, options.height)
-            judge_night(views, after, (judged.truth, judged_after.truth), options.height)
+            draw(options.picture, grids[0], judged[0].truth)
+        found = [asdict(one.figures) | {"path": one.path, "crossed": one.crossed} for one in judged]
+        halls[hall] = {"days": found, "moved": moved, "left": left}
+    if options.out is not None:
+        options.out.write_text(json.dumps(halls, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
