@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 
+from fleetmap import FleetmapError
 from mapserver import Actor, build_map, open_map
 
 
@@ -29,4 +30,7 @@ def main(recording: str, store: str, site: str, picture: str | None = None, rig:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except FleetmapError as error:  # its text names the next step
+        sys.exit(f"error: {error}")

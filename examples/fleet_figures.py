@@ -7,6 +7,7 @@ the numbers behind the dashboard and `mapserver fleet report`, as Python values.
 import sys
 import time
 
+from fleetmap import FleetmapError
 from mapserver import open_store
 from mapserver.fleet.shift_summary import SummarySettings, summarise
 from mapserver.fleet_statistics.kpis import Kpis
@@ -38,4 +39,7 @@ def main(store: str, site: str, hours: str = "24") -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except FleetmapError as error:  # its text names the next step
+        sys.exit(f"error: {error}")

@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
-from fleetmap import write_tum
+from fleetmap import FleetmapError, write_tum
 from locclient import localize
 
 
@@ -29,4 +29,7 @@ def main(recording: str, store: str, site: str, out: str | None = None, picture:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except FleetmapError as error:  # its text names the next step
+        sys.exit(f"error: {error}")

@@ -12,7 +12,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap import RECORDING_FORMATS, OpenOptions, Recording, RecordingFormat, open_recording, read_calibration
+from fleetmap import (
+    RECORDING_FORMATS,
+    FleetmapError,
+    OpenOptions,
+    Recording,
+    RecordingFormat,
+    open_recording,
+    read_calibration,
+)
 from fleetmap.recordings.finalize import RecordingParts, finalize
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
 from fleetmap.recordings.ordering import ReadLog
@@ -72,5 +80,9 @@ RECORDING_FORMATS["numbered-pairs"] = RecordingFormat(
 )
 
 if __name__ == "__main__":
-    with open_recording(sys.argv[1]) as recording:
-        print(f"{recording.format}: {len(recording)} frames of {recording.sensor_set}, {recording.content_hash()[:12]}")
+    try:
+        with open_recording(sys.argv[1]) as recording:
+            found = f"{len(recording)} frames of {recording.sensor_set}, {recording.content_hash()[:12]}"
+            print(f"{recording.format}: {found}")
+    except FleetmapError as error:  # its text names the next step
+        sys.exit(f"error: {error}")

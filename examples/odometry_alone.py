@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap import OdometrySettings, Recording, Trajectory, make_odometry, open_recording, write_tum
+from fleetmap import FleetmapError, OdometrySettings, Recording, Trajectory, make_odometry, open_recording, write_tum
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet, wheel_between
 
@@ -76,4 +76,7 @@ def main(path: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    try:
+        main(*sys.argv[1:3])
+    except FleetmapError as error:  # its text names the next step
+        sys.exit(f"error: {error}")

@@ -9,10 +9,15 @@ from itertools import pairwise
 
 from fleetmap.errors import FleetmapError, UsageError
 
-# `mapserver COMMAND ...` of the commands that take --store, where it is not named
-_IN_STORE = re.compile(
-    r"`(mapserver (?!(?:doctor|calibrate|convert|evaluate|prepare|config)\b)\w(?:(?!--store)[^`])*)`"
-)
+PRINTED = re.compile(r"`(mapserver [a-z][^`]*)`")
+# Commands that need each option, by their first words
+_NEEDS = {
+    "--site": re.compile(
+        r"mapserver (build|live|nightly|publish|promote|rollback|versions|inspect|diff|export|align|areas|grid|masks|map"
+        r"|fleet (report|resurvey)|robots (enrol|revoke|remove))\b"
+    ),
+    "--store": re.compile(r"mapserver (?!(doctor|calibrate|convert|evaluate|prepare|config|trust key)\b)"),
+}
 INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
 
@@ -24,7 +29,7 @@ def run_cli(app: Callable[[], object]) -> None:
     try:
         app()
     except FleetmapError as error:
-        print(f"error: {with_store(str(error), sys.argv)}", file=sys.stderr)
+        print(f"error: {runnable(str(error), sys.argv)}", file=sys.stderr)
         sys.exit(error.exit_status)
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] in {"fleetmap", "fleetsim", "mapserver", "locclient"}:
@@ -39,13 +44,22 @@ def run_cli(app: Callable[[], object]) -> None:
         sys.exit(INTERRUPTED)
 
 
-def with_store(text: str, arguments: list[str]) -> str:
-    """A text whose commands of mapserver name the store that this command line names, so that they run as they are printed."""
-    given = [after for word, after in pairwise(arguments) if word == "--store"]
-    given += [word.partition("=")[2] for word in arguments if word.startswith("--store=")]
-    if not given:
-        return text
-    return _IN_STORE.sub(lambda found: f"`{found[1]} --store {shlex.quote(given[-1])}`", text)
+def runnable(text: str, arguments: list[str]) -> str:
+    """The text, its commands of mapserver with the site and store, or the settings file, of this command line: they run as printed."""
+    given = dict(pair for pair in pairwise(arguments) if pair[0].startswith("--"))
+    given |= dict(word.split("=", 1) for word in arguments if word.startswith("--") and "=" in word)
+
+    def completed(printed: re.Match[str]) -> str:
+        command = printed[1]
+        missing = [option for option, needs in _NEEDS.items() if needs.match(command) and option not in command]
+        for option in missing:
+            if option in given:
+                command += f" {option} {shlex.quote(given[option])}"
+            elif "--config" in given and "--config" not in command:
+                command = command.replace("mapserver", f"mapserver --config {shlex.quote(given['--config'])}", 1)
+        return f"`{command}`"
+
+    return PRINTED.sub(completed, text)
 
 
 def require_extra(extra: str, program: str) -> None:

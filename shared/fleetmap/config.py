@@ -22,7 +22,7 @@ _OF_POSES = (
 )
 RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
-    "walls": "`mapserver align --pin` replaces it; delete the key",
+    "walls": "`mapserver align --pin ...` replaces it; delete the key",
     "frozen": _IN_A_VERSION,
     "map": _IN_A_VERSION,
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},

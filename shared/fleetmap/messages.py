@@ -77,6 +77,18 @@ class Cause(StrEnum):
     CALIBRATION = "calibration"
 
 
+class Flag(StrEnum):
+    """What a robot raises in its health report beside causes; docs/service.md explains each."""
+
+    BLIND = "blind"
+    NOT_LOCALISED = "not_localised"
+    OFF_MAP = "off_map"
+    IMU_REFUSED = "imu_refused"
+    ACCELEROMETER_REFUSED = "accelerometer_refused"
+    WHEELS_REFUSED = "wheels_refused"
+    WHEELS_UNMOUNTED = "wheels_unmounted"
+
+
 class FailureKind(StrEnum):
     """`blind`: no position that may be relied upon. `suspected`: tracking, but fixes contradict it. `not_found`: it searches for itself."""
 
@@ -150,14 +162,6 @@ fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) 
 fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
 both in metres only where the robot was TRACKING. Since the run began: frames, frames_dropped, landmarks_expected and
 landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix. The others are current."""
-
-
-OFF_MAP = "off_map"
-"""Flag of RobotHealth: the robot is not localised, and where it is the map has no tile."""
-
-
-NOT_LOCALISED = "not_localised"
-"""Flag of RobotHealth: the robot has driven 5 m, or 20 s at an unknown speed, without finding itself where the map may cover."""
 
 
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from fleetmap import messages
-from fleetmap.messages import Cause
+from fleetmap.messages import Cause, Flag
 from locclient.replay.run_metrics import METRICS
 from mapserver.build.report import BuildReport
 from mapserver.fleet_statistics.kpis import Kpis
@@ -98,6 +98,10 @@ def test_bus_keys_are_documented() -> None:
 def test_causes_are_documented() -> None:
     causes = {cause.value for cause in Cause if cause is not Cause.NONE}
     assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Causes"))} == causes
+
+
+def test_flags_are_documented() -> None:
+    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Flags"))} == {flag.value for flag in Flag}
 
 
 def test_build_report_keys_are_documented() -> None:

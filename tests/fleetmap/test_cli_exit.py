@@ -1,12 +1,13 @@
 """Exit of a command line: errors become messages and statuses, bugs stay tracebacks."""
 
+import shlex
 from importlib import metadata
 from types import SimpleNamespace
 from typing import NoReturn
 
 import pytest
 
-from fleetmap.cli_exit import require_extra, run_cli, with_store
+from fleetmap.cli_exit import require_extra, run_cli, runnable
 from fleetmap.errors import GateRefusedError
 
 
@@ -39,17 +40,16 @@ def test_a_module_of_our_own_that_is_missing_is_a_bug() -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (
-            ["--store", "my maps"],
-            "`mapserver versions --site a --store 'my maps'`, `mapserver doctor x`, `mapserver gc --store b`",
-        ),
-        (["--store=m"], "`mapserver versions --site a --store m`, `mapserver doctor x`, `mapserver gc --store b`"),
-        ([], "`mapserver versions --site a`, `mapserver doctor x`, `mapserver gc --store b`"),
+        ("publish --store 'my maps' --site a", "mapserver versions --site a --store 'my maps'"),
+        ("publish --store=m --site=a", "mapserver versions --site a --store m"),
+        ("publish --config m.toml", "mapserver --config m.toml versions"),
+        ("publish --config m.toml --site a", "mapserver --config m.toml versions --site a"),
+        ("publish", "mapserver versions"),
     ],
 )
-def test_commands_in_an_error_name_the_store_that_was_named(arguments: list[str], told: str) -> None:
-    text = "`mapserver versions --site a`, `mapserver doctor x`, `mapserver gc --store b`"
-    assert with_store(text, ["mapserver", "publish", *arguments]) == told
+def test_commands_in_an_error_run_as_printed(arguments: str, told: str) -> None:
+    text = "`mapserver versions`, `mapserver doctor x`, `mapserver gc --store b`"
+    assert runnable(text, ["mapserver", *shlex.split(arguments)]) == text.replace("mapserver versions", told)
 
 
 def distribution(*requires: str) -> SimpleNamespace:

@@ -1,6 +1,7 @@
 """Assembly of the parts of `locclient run` from its configuration."""
 
 import logging
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -232,5 +233,8 @@ def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersio
     source = LocalMapSource(Path(run.store or ""), site)
     wanted = source.wanted()
     if wanted.version is None:
-        raise LinkError(f"site {site} has no published version in {run.store}; publish one with `mapserver publish`")
+        raise LinkError(
+            f"site {site} has no published version in {run.store}; "
+            f"publish one with `mapserver publish --site {site} --store {shlex.quote(run.store or '')}`"
+        )
     return source, wanted

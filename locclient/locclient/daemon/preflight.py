@@ -243,7 +243,7 @@ def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[
     finally:
         bus.close()
     if wanted.version is None:
-        hint = "publish one with `mapserver publish`"
+        hint = f"publish one with `mapserver publish --site {site} --store DIR` on the server"
         yield Finding(FAIL, "connection", f"site {site} has no published version; {hint}")
         return
     is_here = active is not None and wanted == active.wanted(site)

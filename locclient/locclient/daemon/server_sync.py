@@ -114,8 +114,11 @@ class ServerSync:
         self._learn_frame()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
-            words = "site %s has no published version at this server: publish one with `mapserver publish`, or correct [run] site"
-            self._refusals.warning("no version", words, wanted.site)
+            words = (
+                "site %s has no published version at this server: publish one with `mapserver publish --site %s --store DIR` "
+                "there, or correct [run] site"
+            )
+            self._refusals.warning("no version", words, wanted.site, wanted.site)
             return
         if not self.follows:
             running = None if self._running is None else self._running.version

@@ -1,6 +1,7 @@
 """Sources of published maps, and those without a network: the tile cache alone, or a store's folder."""
 
 import os
+import shlex
 import sqlite3
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -103,7 +104,10 @@ class LocalMapSource(MapSource):
         """Raises StoreError where `folder` is no store, UsageError for a name that no site can have."""
         super().__init__(site)
         if not (folder / "sites").is_dir():
-            raise StoreError(f"{folder} is no map store; check --store, or make one with `mapserver build`")
+            raise StoreError(
+                f"{folder} is no map store; check --store, or "
+                f"make one with `mapserver build RECORDING --site {site} --store {shlex.quote(str(folder))}`"
+            )
         self._folder, self._version = folder, version
 
     def ready(self) -> ReadyVersion:
@@ -133,7 +137,9 @@ class LocalMapSource(MapSource):
             with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)) as database:
                 known = dict(database.execute(query, (self._site,)).fetchall())
         except sqlite3.Error as error:
-            raise StoreError(f"{path} cannot be read ({error}); check the store with `mapserver verify`") from error
+            raise StoreError(
+                f"{path} cannot be read ({error}); check the store with `mapserver verify --store {shlex.quote(str(self._folder))}`"
+            ) from error
         if number not in known:
             names = ", ".join(str(version) for version in sorted(known)) or "none"
             raise UsageError(f"site {self._site} has no version {number} in {self._folder}; it has: {names}")
@@ -150,7 +156,10 @@ class LocalMapSource(MapSource):
 def address_of(wanted: WantedVersion) -> tuple[int, str]:
     """Number and manifest's address of a version; LinkError where the site has none."""
     if wanted.version is None or wanted.manifest_sha256 is None:
-        raise LinkError(f"site {wanted.site} has no published version; publish one with `mapserver publish`")
+        raise LinkError(
+            f"site {wanted.site} has no published version; publish one with `mapserver publish --site {wanted.site} --store DIR` "
+            "where its store is"
+        )
     return wanted.version, check_sha256(wanted.manifest_sha256)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fleetmap.failure_definition import is_blind, radius_95_m
-from fleetmap.messages import NOT_LOCALISED, OFF_MAP, Cause, RobotHealth, Status
+from fleetmap.messages import Cause, Flag, RobotHealth, Status
 from locclient.localization.estimate import Estimate
 from locclient.robot.robot import Outcome
 from locclient.robot.search_way import SearchWay
@@ -96,7 +96,7 @@ class HealthFigures:
     ) -> RobotHealth:
         """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
         last = None if self.last is None else self.last.estimate
-        flags: list[str] = [Cause.NO_FRAMES] if silent else []
+        flags: list[Flag | Cause] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
             "localised_share_of_all": self._localised / self._all_frames if self._all_frames else None,
             "localised_share": self._localised / self._frames if self._frames else None,
@@ -111,10 +111,10 @@ class HealthFigures:
             figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
             figures |= last.calibration.figures
             flags += [Cause.CALIBRATION] if last.calibration.is_wrong else []
-            flags += ["blind"] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
+            flags += [Flag.BLIND] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []
-            flags += [] if self.last is None or self.last.may_be_mapped else [OFF_MAP]
-            flags += [NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
+            flags += [] if self.last is None or self.last.may_be_mapped else [Flag.OFF_MAP]
+            flags += [Flag.NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
             flags += [Cause.NO_MAP] if last.map_version is None else []
             figures["not_localised_m"] = self.search.metres
             flags += [] if self.last is None else self.last.left_out

@@ -9,7 +9,7 @@ from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import building_frame
-from fleetmap.messages import Cause, PoseMessage, Status, WantedVersion
+from fleetmap.messages import Cause, Flag, PoseMessage, Status, WantedVersion
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -81,7 +81,7 @@ class Outcome:
     dock_error_m: float | None = None
     speed_mps: float | None = None
     may_be_mapped: bool = True
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[Flag, str] = field(default_factory=dict)
 
     def pose_message(self) -> PoseMessage | None:
         """The pose for the server; None while there is no single one with a covariance."""
@@ -134,7 +134,7 @@ class Robot:
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
         self._wheels = WheelAgreement(calibration.base_from_body)
-        self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[str, str]()
+        self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
         self._building_from_map: Array | None = None
@@ -184,7 +184,7 @@ class Robot:
         """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
         self.localizer.handle_imu(bundle.imu)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
-            self._wheels_unused = {"wheels_unmounted": f"the wheels are left out: {self._wheels_fault}"}
+            self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
         wheel = [] if self._wheels.is_refused or self._wheels_fault else bundle.wheel
         self.localizer.handle_wheel(wheel)
         if self.ring is not None:
@@ -219,7 +219,7 @@ class Robot:
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out()
         )
 
-    def _left_out(self) -> dict[str, str]:
+    def _left_out(self) -> dict[Flag, str]:
         perception = self.localizer.perception
         found = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
         if not isinstance(perception, SensorPerception):

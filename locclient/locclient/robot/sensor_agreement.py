@@ -5,21 +5,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.messages import Flag
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import WheelSample
 
 _ASK = "record a drive and ask `mapserver doctor`"
-IMU_REFUSED = {"imu_refused": f"the IMU is left out: it turns otherwise than the images; {_ASK} which axis is wrong"}
+IMU_REFUSED = {Flag.IMU_REFUSED: f"the IMU is left out: it turns otherwise than the images; {_ASK} which axis is wrong"}
 WHEELS_REFUSED = {
-    "wheels_refused": f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
+    Flag.WHEELS_REFUSED: f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
 }
 """Flags of RobotHealth with their words: the camera's motion contradicts the sensor, which is not used."""
 
 
-def accelerometer_refused(fault: str) -> dict[str, str]:
+def accelerometer_refused(fault: str) -> dict[Flag, str]:
     """The flag of an accelerometer with such a fault, with its words; empty without one."""
     words = f"the accelerometer is left out, the images contradict it: {fault}; mend its driver, or how the calibration mounts it"
-    return {"accelerometer_refused": words} if fault else {}
+    return {Flag.ACCELEROMETER_REFUSED: words} if fault else {}
 
 
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # of the speed, and of slow ones: slip of a tyre is far less

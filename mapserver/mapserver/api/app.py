@@ -1,5 +1,6 @@
 """The HTTP API. No page of it names an address outside; the interactive documentation of FastAPI does, so it is off."""
 
+import shlex
 import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
@@ -198,7 +199,11 @@ def _install_map_routes(app: FastAPI, store: MapStore) -> None:
         """The current version of a site."""
         info = store.current(site)
         if info is None:
-            raise HTTPException(404, f"site {site} has no published version; publish one with `mapserver publish`")
+            raise HTTPException(
+                404,
+                f"site {site} has no published version; "
+                f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(store.folder))}`",
+            )
         return version_view(store, info)
 
     @app.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)

@@ -1,5 +1,6 @@
 """Endpoints of releases: quality, differences, publishing, promoting, rolling back, canaries."""
 
+import shlex
 import time
 from typing import NamedTuple, cast
 
@@ -52,7 +53,10 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         actor = actor_of(request, act.actor, act.reason)
         if (act.force or act.trust_calibration) and settings.signer:
             option = "--force" if act.force else "--trust-calibration"
-            raise StateError(f"that is decided on the builder's account alone: `mapserver publish {option} --keys`")
+            raise StateError(
+                f"that is decided on the builder's account alone: `mapserver publish --site {site} --version {version} {option} "
+                f"--reason WHY --keys KEYS --store {shlex.quote(str(store.folder))}`"
+            )
         if act.trust_calibration:
             releases.trust_calibration(store, store.version(site, version), actor)
         if not _answered(desk.ask("publish", site, actor, version)):
@@ -81,7 +85,11 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         store.current(site)
         found = store.canaries(site)
         if not found:
-            raise HTTPException(404, f"site {site} never had a canary; `mapserver promote --canary 5%` begins one")
+            raise HTTPException(
+                404,
+                f"site {site} never had a canary; `mapserver promote VERSION "
+                f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` begins one",
+            )
         return _view(store, found[0], settings.canary)
 
     @app.post("/v1/sites/{site}/versions/{version}/canary")

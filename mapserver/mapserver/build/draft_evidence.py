@@ -164,7 +164,7 @@ def replayed_probes(
     for path in paths:
         with open_recording(path, opening) as opened:
             recording = reduced(opened, use)
-            selected = FrameSelection.parse(frames).apply(recording)
+            recording, selected = recording.readable(FrameSelection.parse(frames).apply(recording))
             entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
             known = before.trajectory_of(entry)
             if known is None:

@@ -71,7 +71,8 @@ def calibration_from_guess(
         raise RecordingError(f"{recording.path} has one camera: only the lenses of a pair can be guessed")
     tools = tools or SurveyTools()
     settings = structs.replace(settings, orb=structs.replace(settings.orb, count=700))
-    alone = replace(recording, wheel=())
+    sound, _ = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
+    alone = replace(sound, wheel=())
     rig = guessed_rig(recording.calibration, raw_matches(alone, tools.progress))
     for number in range(_MOST_PASSES):
         data = replace(followed(alone, rig, settings, tools), lens_sigmas=_WIDE_SIGMAS)

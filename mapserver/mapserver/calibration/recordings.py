@@ -99,7 +99,7 @@ def followed(
     recording: Recording, rig: RigCalibration, settings: SurveySettings, tools: SurveyTools
 ) -> CalibrationData:
     """The busiest stretch of a recording, followed under the calibration `rig`."""
-    chosen = busiest_frames(recording.frame_stamps_ns, recording.imu)
+    recording, chosen = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in chosen)
     inputs = SurveyInputs(frames, len(chosen), recording.imu, rig, rectifier, recording.wheel)

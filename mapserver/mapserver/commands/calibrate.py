@@ -15,7 +15,7 @@ from mapserver.commands.options import Calibration, check_output, topics_of
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fleetmap.recordings import Topics
+    from fleetmap.recordings import Recording, Topics
     from mapserver.calibration import CalibrationEstimate
     from mapserver.survey.survey_inputs import SurveyTools
 
@@ -65,9 +65,8 @@ def calibrate(
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
-        sources = [
-            opened.enter_context(open_recording(path, OpenOptions(options.calibration, topics))) for path in recordings
-        ]
+        how = OpenOptions(options.calibration, topics)
+        sources = [_sound(opened.enter_context(open_recording(path, how))) for path in recordings]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
         rig = sources[0].calibration
@@ -80,6 +79,16 @@ def calibrate(
         )
     text = corrected_file(estimate, rig, [source.name for source in sources])
     _write(out, text, f"check it with `mapserver doctor RECORDING --calibration {out}`")
+
+
+def _sound(recording: "Recording") -> "Recording":
+    """The recording without the damaged images of the stretch that is followed, its issues printed."""
+    from mapserver.calibration.recordings import busiest_frames
+
+    sound, _ = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
+    for issue in sound.issues:
+        typer.echo(f"issue: {sound.name}: {issue.what}: {issue.detail}", err=True)
+    return sound
 
 
 @contextmanager
@@ -125,7 +134,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         rig = first_rig(int(known[1]), int(known[2]), baseline_m)
         first.write_text(format_calibration(rig), encoding="utf-8")
         with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
-            found = calibration_from_guess(recording, survey_settings(config, recording.sensor_set), tools)
+            found = calibration_from_guess(_sound(recording), survey_settings(config, recording.sensor_set), tools)
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))
     if out is not None:

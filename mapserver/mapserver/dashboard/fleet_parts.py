@@ -147,7 +147,7 @@ def got_worse(trends: Sequence[AreaTrend], area_address: Callable[[str], str], *
     ]
     listed = table(head, rows, empty="Nothing was driven in these two weeks.", name="What got worse this week")
     more = f" {len(trends) - _TRENDS_SHOWN} more are not shown." if len(trends) > _TRENDS_SHOWN else ""
-    named = "" if has_areas else " No area is named here; `mapserver areas` names them."
+    named = "" if has_areas else " No area is named here; `mapserver areas import FILE` names them."
     remark = (
         "The last 7 days beside the 7 before. Worse and better are beyond chance: the intervals of how often hold all true values "
         f"together with 95 %.{named}{more}"

@@ -75,7 +75,8 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site_now: t
     for robot in fleet.robots(site):
         yield from _lost(robot, settings, now_ns)
         if robot.is_copied:
-            words = f"{robot.robot} of {site} was connected twice; was its certificate copied? `mapserver robots revoke` ends it"
+            ends = f"`mapserver robots revoke {robot.robot} --site {site}` ends it"
+            words = f"{robot.robot} of {site} was connected twice; was its certificate copied? {ends}"
             yield Alert("FleetmapRobotCopied", site, robot.robot, now_ns, words)
     night = store.last_night(site)
     if night is not None and night.state == "failed":

@@ -12,7 +12,7 @@ from fleetmap.failure_definition import (
     is_usable,
     is_wrong,
 )
-from fleetmap.messages import OFF_MAP, PoseMessage, RobotHealth, Status
+from fleetmap.messages import Flag, PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Counters
 
 MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
@@ -116,7 +116,7 @@ class HealthStream:
         counts.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
         counts.judged_ms = dt_ms if is_driving(speed_mps) else 0
         counts.found_ms = counts.judged_ms if is_tracking else 0
-        is_new = self._is_search_failure(dt_ms, is_tracking, is_driving(speed_mps), OFF_MAP not in health.flags)
+        is_new = self._is_search_failure(dt_ms, is_tracking, is_driving(speed_mps), Flag.OFF_MAP not in health.flags)
         if self._has_fix:
             counts.after_fix_ms = dt_ms
             counts.localised_ms = dt_ms if is_tracking else 0

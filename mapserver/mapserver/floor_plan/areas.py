@@ -163,7 +163,9 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
             f"areas: the file does not say where its coordinates are (GeoJSON alone means degrees); {words}"
         )
     if collection.frame == "building" and building is None:
-        raise UsageError("areas drawn in the building need the map's place in it; run `mapserver align` first")
+        raise UsageError(
+            "areas drawn in the building need the map's place in it; run `mapserver align --plan FILE --pin ...` first"
+        )
     map_from_building = None
     if collection.frame == "building" and building is not None:
         map_from_building = se3_inverse(building.building_from_map)

@@ -91,7 +91,7 @@ def mask_grid(masks: list[Mask], kind: MaskKind) -> OccupancyGrid:
     """
     chosen = [mask for mask in masks if mask.kind is kind]
     if not chosen:
-        raise UsageError(f"the site has no {kind.value} mask; `mapserver masks import` takes them")
+        raise UsageError(f"the site has no {kind.value} mask; `mapserver masks import FILE` takes them")
     corners = np.concatenate([ring for mask in chosen for ring in mask.area.rings])
     low, high = (
         np.floor(corners.min(axis=0) / CELL_M).astype(int),

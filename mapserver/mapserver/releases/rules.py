@@ -28,7 +28,9 @@ def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
         return _draft(rows, number)
     drafts = [info for info in rows.versions.values() if info.state == "draft"]
     if not drafts:
-        reason = f"site {rows.site} has no draft to publish; make one with `mapserver build --site {rows.site}`"
+        reason = (
+            f"site {rows.site} has no draft to publish; make one with `mapserver build RECORDING --site {rows.site}`"
+        )
         raise UsageError(reason)
     return drafts[-1]
 
@@ -76,7 +78,8 @@ def promotion(rows: SiteReleases, version: int, actor: Actor) -> ReleaseChanges:
         return ReleaseChanges()
     if wanted.state == "draft":
         raise StateError(
-            f"version {version} of site {rows.site} is a draft; `mapserver publish --version {version}` takes it through the gate"
+            f"version {version} of site {rows.site} is a draft; `mapserver publish --site {rows.site} --version {version}` takes it "
+            "through the gate"
         )
     left = None if rows.current is None else rows.current.version
     return _becomes_current(rows, version, LogEntry("promoted", f"version {version}, replacing {left}", version, actor))

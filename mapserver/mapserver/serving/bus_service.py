@@ -134,7 +134,9 @@ class BusService:
         site, robot, _ = split_key(key)
         check_name(robot, "robot")
         if self._guard is not None and not self._guard.access.has_robot(site, robot):
-            raise LinkError(f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol` does that")
+            raise LinkError(
+                f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol {robot} --site {site[:64]}` does that"
+            )
         return site, robot
 
     def _renew(self, key: str, payload: bytes) -> bytes:

@@ -99,7 +99,9 @@ class MapStore(StoreQueries):
         """
         is_new = not (path / "store.sqlite3").is_file()
         if is_new and not create:
-            raise StoreError(f"{path} holds no map store; check --store, or make one with `mapserver build`")
+            raise StoreError(
+                f"{path} holds no map store; check --store, or make one with `mapserver build RECORDING --site NAME`"
+            )
         if read_only and is_older(path / "store.sqlite3"):
             return cls(path, clock_ns, read_only=True)
         try:

@@ -70,7 +70,7 @@ class BuilderFolder:
         except FileNotFoundError as error:
             raise StateError(
                 f"version {version} of site {site} was not built by this account ({self.folder}); build it here, or take "
-                f"what was signed before with `mapserver signer --adopt {site}`"
+                f"what was signed before with `mapserver signer --adopt {site} --keys {self.folder}`"
             ) from error
         except (OSError, msgspec.MsgspecError) as error:
             raise StoreError(f"{path} cannot be read ({error}); restore the builder's folder") from error
@@ -91,7 +91,7 @@ class BuilderFolder:
         if to_release and not built.passed:
             raise StateError(
                 f"the gate did not let version {info.version} of site {info.site} pass when it was built; "
-                "`mapserver publish --keys` on the builder's account decides about it"
+                f"`mapserver publish --site {info.site} --version {info.version} --keys KEYS` on the builder's account decides about it"
             )
 
     def check_entries(self, site: str, entries: Sequence[AdmittedVersion]) -> None:

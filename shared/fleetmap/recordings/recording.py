@@ -96,7 +96,7 @@ class Recording:
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
     samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
     in issues). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
-    refers to without one). issues: what could not be read.
+    refers to without one). issues: what could not be read. damaged_ns (D,): frames that `readable` left out.
     """
 
     path: Path
@@ -111,6 +111,7 @@ class Recording:
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
     issues: tuple[DataIssue, ...] = ()
+    damaged_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.frame_stamps_ns)
@@ -161,8 +162,13 @@ class Recording:
             raise RecordingError(f"{len(faults)} of {len(indices)} frames cannot be read; the first: {first}")
         issue = DataIssue("images damaged", f"{len(faults)} of {len(indices)} frames left out; the first: {first}")
         kept = np.setdiff1d(np.arange(len(self)), list(faults))
-        frames = _SomeFrames(self.frames, kept)
-        sound = replace(self, frame_stamps_ns=self.frame_stamps_ns[kept], frames=frames, issues=(*self.issues, issue))
+        sound = replace(
+            self,
+            frame_stamps_ns=self.frame_stamps_ns[kept],
+            frames=_SomeFrames(self.frames, kept),
+            issues=(*self.issues, issue),
+            damaged_ns=np.union1d(self.damaged_ns, self.frame_stamps_ns[list(faults)]),
+        )
         return sound, np.searchsorted(kept, np.setdiff1d(indices, list(faults)))
 
     def stored_frame(self, index: int) -> StoredFrame:

@@ -76,7 +76,7 @@ def decode_bundle(data: bytes) -> Bundle:
         return msgspec.json.decode(data, type=Bundle)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(
-            f"this is no enrolment bundle ({error}); `mapserver robots enrol` on the server makes one"
+            f"this is no enrolment bundle ({error}); `mapserver robots enrol ROBOT` on the server makes one"
         ) from error
 
 

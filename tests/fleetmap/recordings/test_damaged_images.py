@@ -82,6 +82,7 @@ def test_one_damaged_picture_costs_its_frame(tmp_path: Path, spoil: Callable[[by
         assert sound.part(indices).read_frame(2).stamp_ns == all_ns[4]
         assert [issue.what for issue in sound.issues] == ["images damaged"]
         assert "1 of 5 frames left out" in sound.issues[0].detail
+        np.testing.assert_array_equal(sound.damaged_ns, all_ns[[3]])
         for number in (1, 2):
             other = file.with_name(f"image{number}.jpg")
             other.write_bytes(spoil(other.read_bytes()))

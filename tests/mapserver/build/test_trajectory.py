@@ -1,6 +1,7 @@
 """Poses of another SLAM system: noisy truth in a wrong convention, and poses of another recording, are refused."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from mapserver import BuildOptions, build_map
 from mapserver.build.sensor_subset import reduced
 from mapserver.build.trajectory import GivenPoses, OtherTrajectory, given_poses
 from mapserver.build.trajectory import given as given_module
+from mapserver.build.trajectory.formats import WrittenPoses
+from mapserver.build.trajectory.given import stamps_on_clock
 from mapserver.build.trajectory.readings import Followed, fitted_scale
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.given_poses import poses_as_odometry
@@ -139,6 +142,19 @@ def test_stamps_of_mast3r_and_dpv_slam_are_read(sample: Sample, recording: Path,
     stamps = [stamp(ns) for ns in sample.stamps_ns.tolist()]
     file = written(tmp_path / "p.txt", drifted(sample), stamps, camera=True)
     assert off_m(given(recording, OtherTrajectory(file)), sample) < 0.02
+
+
+@pytest.mark.parametrize("stamps", [False, True], ids=["rows", "numbers"])
+def test_frames_that_are_damaged_count(sample: Sample, recording: Path, tmp_path: Path, stamps: bool) -> None:
+    """A row for each frame, and numbers of frames: the other system has counted those too that are left out here."""
+    count = len(sample.stamps_ns)
+    map_from_it = np.tile(np.eye(4), (count, 1, 1))
+    rows = WrittenPoses("any", np.arange(count) * 1_000_000_000 if stamps else None, map_from_it)
+    with open_recording(recording) as opened:
+        kept = np.delete(np.arange(count), 7)
+        sound = replace(opened.part(kept), damaged_ns=opened.frame_stamps_ns[[7]])
+        found = stamps_on_clock(rows, sound, np.arange(count - 1), OtherTrajectory(tmp_path / "p.txt"))
+        np.testing.assert_array_equal(found, opened.frame_stamps_ns)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.3])

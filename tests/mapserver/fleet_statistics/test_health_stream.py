@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from fleetmap.messages import OFF_MAP, PoseMessage, RobotHealth
+from fleetmap.messages import Flag, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import ClockSkew, server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Counters, kpis
@@ -78,7 +78,7 @@ def test_a_robot_that_does_not_find_itself_fails(text: str, speed_mps: float | N
 
 
 def test_what_no_map_covers_is_no_failure() -> None:
-    reports = [msgspec.structs.replace(report, flags=(OFF_MAP,)) for report in statuses("i" * 100)]
+    reports = [msgspec.structs.replace(report, flags=(Flag.OFF_MAP,)) for report in statuses("i" * 100)]
     assert total(reports).blind_seen == 0
 
 

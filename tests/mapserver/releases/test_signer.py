@@ -216,7 +216,7 @@ def test_the_answers_over_http(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
     with serving(scene.store.folder, "--signer") as served:
         address = f"{served.http}/v1/sites/lab/versions"
         forced = httpx.post(f"{address}/{second}/publish", json=act | {"force": True})
-        assert (forced.status_code, "publish --force" in forced.json()["detail"]) == (409, True)
+        assert (forced.status_code, "--force --reason WHY --keys" in forced.json()["detail"]) == (409, True)
         late = httpx.post(f"{address}/{second}/publish", json=act, timeout=20)
         assert late.status_code == 202
         assert late.headers["location"] == late.json()["ask"]

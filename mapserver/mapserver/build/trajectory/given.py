@@ -110,12 +110,16 @@ def stamps_on_clock(
     Rows without stamps belong to all frames, or to the selected ones: UsageError where they are as many as neither. RecordingError for
     stamps of another clock.
     """
-    clock, count = recording.frame_stamps_ns, len(rows.map_from_it)
+    # The other system has read, and counted, the frames too that are damaged
+    clock, chosen = (
+        np.union1d(s, recording.damaged_ns) for s in (recording.frame_stamps_ns, recording.frame_stamps_ns[indices])
+    )
+    count = len(rows.map_from_it)
     if rows.stamps_ns is None:
-        if count in (len(clock), len(indices)):
-            return clock if count == len(clock) else clock[indices]
+        if count in (len(clock), len(chosen)):
+            return clock if count == len(clock) else chosen
         raise UsageError(
-            f"{other.file} has {count} poses without stamps, {recording.name} has {len(clock)} frames, of which {len(indices)} are "
+            f"{other.file} has {count} poses without stamps, {recording.name} has {len(clock)} frames, of which {len(chosen)} are "
             "selected; select those that the poses belong to with --frames, or pass a file with stamps"
         )
     first, last, middle = int(clock[0]), int(clock[-1]), int(np.median(rows.stamps_ns))

@@ -67,7 +67,7 @@ def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
         return maps.version(site, version)
     infos = maps.versions(site)
     if not infos:
-        raise UsageError(f"site {site} has no version; make one with `mapserver build --site {site}`")
+        raise UsageError(f"site {site} has no version; make one with `mapserver build RECORDING --site {site}`")
     return maps.current(site) or infos[-1]
 
 

@@ -120,7 +120,8 @@ def refine(
     )
     if not done.is_better:
         raise StateError(
-            f"not better, nothing is written; {said}; `mapserver map splats` writes the surfels as they are"
+            f"not better, nothing is written; {said}; `mapserver map splats {version} {file}` writes the surfels as "
+            "they are"
         )
     data = (splat_spz if file.suffix == ".spz" else splat_ply)(done.splats)
     with disk_errors(f"{file} cannot be written", "choose another place"):

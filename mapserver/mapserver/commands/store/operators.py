@@ -122,7 +122,7 @@ def list_(store: StoreFolder, json: Json = False) -> None:
 def _check_person(maps: "MapStore", name: str) -> None:
     if name.startswith(PROVIDER_PREFIX):
         raise UsageError(
-            f"{name} signs in at the provider, whose groups decide; `mapserver operators disable` keeps them out"
+            f"{name} signs in at the provider, whose groups decide; `mapserver operators disable {name}` keeps them out"
         )
     row = maps.operators.find(name)
     if row is not None and row.role == "program":

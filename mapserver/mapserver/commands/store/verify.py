@@ -1,5 +1,7 @@
 """`mapserver verify`: integrity of a store."""
 
+import shlex
+
 import typer
 
 from mapserver.commands.options import Json, StoreFolder, print_json
@@ -18,7 +20,9 @@ def verify(store: StoreFolder, json: Json = False) -> None:
     else:
         typer.echo(f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes")
         if found.orphans or found.leftovers:
-            typer.echo(f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc` removes them")
+            typer.echo(
+                f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc --store {shlex.quote(str(store))}` removes them"
+            )
         if found.open_to_others:
             typer.echo(f"other users of this machine may read the store; `chmod -R go= {store}` ends that")
         for fault in found.faults:

@@ -84,7 +84,8 @@ class OperatorQueries:
             )
             if not done.rowcount:
                 raise UsageError(
-                    f"there is an operator {name} already; `mapserver operators role` or `password` changes it"
+                    f"there is an operator {name} already; `mapserver operators role {name} ROLE` or "
+                    f"`mapserver operators password {name}` changes it"
                 )
             self._transactions.log(connection, "", LogEntry("operator added", f"{name}, {role}", None, actor))
 
