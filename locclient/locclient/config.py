@@ -19,7 +19,7 @@ from locclient.vda5050.settings import Vda5050Section
 TIERS = {
     "user": {
         "": "site store server",
-        "run": "server store site robot prior cache cache_bytes root identity insecure spool failures replays",
+        "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays",
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint map robot_height_m autostart",
         "topics": "*",
@@ -27,7 +27,7 @@ TIERS = {
         "download_token_file download_ca robot_actions factsheet frame",
     },
     "tuning": {
-        "run": "spool_bytes replays_bytes frame_queue imu_wait_s",
+        "run": "outbox_bytes replays_bytes frame_queue imu_wait_s",
         "run.window": "*",
         "run.trial": "*",
         "source": "domain keys speed width_px height_px rate_hz delay_s",
@@ -38,10 +38,10 @@ TIERS = {
         "localizer.orb": "extractor count",
         "localizer.stereo": "min_depth_m depth_sigma_px",
         "localizer.odometry.filter": "use_wheels",
-        "localizer.fix": "min_hit_share",
+        "localizer.fix": "min_recall",
         "localizer.track": "fix_interval_s settled_interval_s strong_inliers is_whole_site_mapped telling_evidence "
         "degraded_after_s degraded_radius_m lost_radius_m kidnap_fixes",
-        "localizer.sight": "dark_contrast glare_share blurred_share occluded_depth_share",
+        "localizer.image_quality": "dark_contrast glare_share blurred_share occluded_depth_share",
     },
 }
 
@@ -59,8 +59,8 @@ class RunSection(Section, frozen=True):
     root: str | None = None
     identity: str | None = None
     insecure: bool = False
-    spool: str | None = None
-    spool_bytes: int = 50_000_000
+    outbox: str | None = None
+    outbox_bytes: int = 50_000_000
     failures: str | None = None
     replays: str = "full"
     replays_bytes: int = 50_000_000

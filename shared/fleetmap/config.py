@@ -27,6 +27,10 @@ RETIRED = {  # keys of files, and options of commands with _ for -; what replace
     "map": _IN_A_VERSION,
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},
     "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
+    "spool": "it is called `outbox` now",
+    "spool_bytes": "it is called `outbox_bytes` now",
+    "sight": "it is called `image_quality` now",
+    "min_hit_share": "it is called `min_recall` now",
     **dict.fromkeys(("vocabulary", "train_vocabulary"), "maps use the vocabulary that ships with fleetmap; delete it"),
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.

@@ -40,7 +40,7 @@ def configuration(folder: Path, recording: Path, endpoint: str, *, speed: float)
     path = folder / "robot.toml"
     path.write_text(
         f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\n'
-        f'spool = "{folder}/spool.sqlite3"\nfailures = "{folder}/failures"\n'
+        f'outbox = "{folder}/spool.sqlite3"\nfailures = "{folder}/failures"\n'
         f'[source]\nkind = "recording"\nrecording = "{recording}"\nspeed = {speed}\n'
     )
     return path
@@ -170,7 +170,7 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         port = probe.getsockname()[1]
     path = tmp_path / "robot.toml"
     path.write_text(
-        f'[run]\nstore = "{tmp_path}/store"\nsite = "room"\nrobot = "r1"\nspool = "{tmp_path}/spool.sqlite3"\n'
+        f'[run]\nstore = "{tmp_path}/store"\nsite = "room"\nrobot = "r1"\noutbox = "{tmp_path}/spool.sqlite3"\n'
         f'[source]\nkind = "recording"\nrecording = "{write_walk(tmp_path / "walk", 280, range(0))}"\nspeed = 0.4\n'
         f'[output]\nformat = "ros2"\nendpoint = "tcp/127.0.0.1:{port}"\nautostart = false\n'
     )

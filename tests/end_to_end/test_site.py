@@ -34,7 +34,7 @@ REPORT_KEYS = {
     "not_localised_share": None,
     "frame_ms": ("mean", "p50", "p99", "max"),
     "frame_wall_ms": ("mean", "p50", "p99", "max"),
-    "stage_ms": ("decode", "map", "odometry", "rectify", "sight"),
+    "stage_ms": ("decode", "image_quality", "map", "odometry", "rectify"),
     "error_m": ("median", "p95", "p99", "max"),
     "error_deg": ("median", "p99"),
     "position_failures": None,

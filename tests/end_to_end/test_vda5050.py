@@ -47,7 +47,7 @@ def robot(folder: Path, endpoint: str, broker: int, http: str) -> Iterator[subpr
     recording = robot_world.write(folder / "ride", robot_world.carried(FRAMES, CARRIED_AT))
     config = folder / "robot.toml"
     config.write_text(
-        f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\nspool = "{folder}/outbox"\n'
+        f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\noutbox = "{folder}/outbox"\n'
         f'[source]\nkind = "recording"\nrecording = "{recording}"\n'
         f'[vda5050]\nbroker = "mqtt://127.0.0.1:{broker}"\nmanufacturer = "acme"\nserial_number = "0001"\n'
         f'download_from = ["{http}"]\nstate_interval_s = 0.5\ninitialize_s = 10.0\n'

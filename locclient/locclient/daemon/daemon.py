@@ -118,7 +118,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             imu_wait_s=run.imu_wait_s,
         )
         outbox_file = configured_outbox(run, site, name)
-        outbox = Outbox(outbox_file, max_bytes=run.spool_bytes, is_needed=False)
+        outbox = Outbox(outbox_file, max_bytes=run.outbox_bytes, is_needed=False)
         if outbox.fault:
             _log.error("failures are not kept: %s", outbox.fault)
         if outbox.set_aside is not None:
@@ -219,7 +219,7 @@ def _fleet_manager(
 
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
     """The file of the spool: as set, else beside the usual cache."""
-    return outbox_path(site, robot) if run.spool is None else Path(run.spool)
+    return outbox_path(site, robot) if run.outbox is None else Path(run.outbox)
 
 
 def _output_bus(config: LocclientConfig, bus: Bus | None, stack: ExitStack) -> Bus | None:

@@ -183,13 +183,13 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
     path = configured_outbox(config.run, address.site, address.robot)
-    outbox = Outbox(path, max_bytes=config.run.spool_bytes)
+    outbox = Outbox(path, max_bytes=config.run.outbox_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
     if outbox.set_aside is not None:
         yield Finding(WARN, "spool", f"was damaged and begun anew; what it held is in {outbox.set_aside}")
     elif counts["dropped"]:
-        yield Finding(WARN, "spool", f"{text}; raise [run] spool_bytes or check the connection")
+        yield Finding(WARN, "spool", f"{text}; raise [run] outbox_bytes or check the connection")
     else:
         yield Finding(OK, "spool", text)
 

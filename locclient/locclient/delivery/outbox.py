@@ -60,7 +60,7 @@ class Outbox:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:
-            reason = f"the spool {path} cannot be used ({error}); check the disk and whose file it is, or choose another with [run] spool"
+            reason = f"the spool {path} cannot be used ({error}); check the disk and whose file it is, or choose another with [run] outbox"
             raise StoreError(reason) from error
         self._is_made, self.fault = True, ""
 

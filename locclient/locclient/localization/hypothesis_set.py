@@ -72,10 +72,10 @@ def competitors(
     best = best or ranked(hypotheses)[0]
 
     def is_near(inliers: float, recall: float, best_inliers: float, best_recall: float) -> bool:
-        if inliers >= settings.rival_share * best_inliers:
+        if inliers >= settings.competitor_share * best_inliers:
             return True
-        has_recall = recall >= settings.rival_hit_share * best_recall
-        return has_recall and inliers >= settings.rival_least_share * best_inliers
+        has_recall = recall >= settings.competitor_recall_share * best_recall
+        return has_recall and inliers >= settings.competitor_least_share * best_inliers
 
     def competes(other: PoseHypothesis) -> bool:
         if is_near(other.mean_inliers, other.mean_recall, best.mean_inliers, best.mean_recall):
@@ -127,7 +127,7 @@ def is_supported(hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
 
 def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
     """Whether a fix, the only one of its query, agrees so well that no other place of this map can be meant."""
-    return fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_twin_share
+    return fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share
 
 
 def _count(

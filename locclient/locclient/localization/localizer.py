@@ -163,7 +163,11 @@ class Localizer:
         is_reversed = self.perception.is_reversed(frame, is_localized=self._confirmed is not None)
         result = QueryResult(refused=REVERSED_TEXT) if is_reversed else self._query_map(frame, odometry, has_broken)
         self._last_ns = frame.stamp_ns
-        stage_s = {"sight": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
+        stage_s = {
+            "image_quality": judged_s - begun_s,
+            "odometry": tracked_s - judged_s,
+            "map": self._clock() - tracked_s,
+        }
         estimate = Estimate(
             stamp_ns=odometry.stamp_ns,
             status=Status.INITIALISING,

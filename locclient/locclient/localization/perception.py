@@ -68,7 +68,7 @@ class SensorPerception:
     ) -> None:
         rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
         self.odometry = Odometry(*rig, settings.odometry, settings.stereo)
-        self._images = ImageQualityMonitor(settings.sight)
+        self._images = ImageQualityMonitor(settings.image_quality)
         mounting = Mounting(se3_inverse(body_from_cam), calibration.base_from_body)
         self._calibration = CalibrationMonitor(mounting, settings.relocalizer, imu_minus_cam_s)
         self.add, self.give_up, self.judged = (

@@ -19,7 +19,7 @@ class TrackSettings(Section, frozen=True):
     strong_inliers: int = STRONG_INLIERS
     strong_share: float = 0.55  # inlier share of a fix that is accepted at once
     # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
-    strong_twin_share: float = 0.5
+    strong_alias_share: float = 0.5
     tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
     # Of places that people name: one of these is weighed against its aliases, not believed. An assumption
     wrong_prior_share: float = 0.05
@@ -28,9 +28,9 @@ class TrackSettings(Section, frozen=True):
     innovation_limit: float = 22.458
     hypothesis_distance_m: float = 0.5  # within which fixes support one hypothesis
     hypothesis_angle_deg: float = 6.0  # within which fixes support one hypothesis
-    rival_share: float = 0.6  # a competitor with this share of the best one's inliers makes the pose ambiguous
-    rival_hit_share: float = 0.8  # so does one with this share of its landmark recall
-    rival_least_share: float = 0.25  # and at least this share of its inliers
+    competitor_share: float = 0.6  # a competitor with this share of the best one's inliers makes the pose ambiguous
+    competitor_recall_share: float = 0.8  # so does one with this share of its landmark recall
+    competitor_least_share: float = 0.25  # and at least this share of its inliers
     is_whole_site_mapped: bool = False
     telling_evidence: float = 4.0
     evidence_kept_share: float = 0.8  # decay of a hypothesis's inliers from fix to fix
@@ -59,7 +59,7 @@ class LocalizerSettings(Section, frozen=True):
     orb: OrbSettings = OrbSettings(count=1000)
     fix: FixSettings = FixSettings()
     track: TrackSettings = TrackSettings()
-    sight: ImageQualitySettings = ImageQualitySettings()
+    image_quality: ImageQualitySettings = ImageQualitySettings()
 
     @property
     def relocalizer(self) -> RelocalizerSettings:

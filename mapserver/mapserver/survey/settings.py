@@ -84,7 +84,7 @@ class BudgetSettings(Section, frozen=True):
     landmarks_per_m: float = 65.0
     min_landmarks: int = 2000
     view_landmarks: int = 120
-    view_distinct_landmarks: int = 60
+    view_distinctive_landmarks: int = 60
     tile_landmarks: int = 5500
 
 

@@ -57,7 +57,7 @@ def choose_landmarks(
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
     covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
     robots do not fetch another choice of equal worth every night. Of those and of the others, those come first that give every
-    keyframe view_distinct_landmarks that look like nothing else in the survey, then those that give it view_landmarks, or as many as
+    keyframe view_distinctive_landmarks that look like nothing else in the survey, then those that give it view_landmarks, or as many as
     it sees. What nothing observes is not chosen.
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
@@ -71,7 +71,7 @@ def choose_landmarks(
     per_view = _ROWS * _COLUMNS * _DEPTHS
     taken = np.zeros(len(survey.map_from_body), np.int64)
     for mask in (first, seen & ~first):
-        quotas = (settings.view_distinct_landmarks, settings.view_landmarks, _NO_LIMIT)
+        quotas = (settings.view_distinctive_landmarks, settings.view_landmarks, _NO_LIMIT)
         for part, quota in zip((mask & distinct, mask, mask), quotas, strict=True):
             left, needs = np.flatnonzero(part & ~chosen), quota - taken
             if len(left) and limit > 0:

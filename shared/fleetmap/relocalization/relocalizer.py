@@ -210,7 +210,7 @@ class Relocalizer:
         features, rows = best.matches.T
         seen = LandmarkSet(view.points_map[rows], query.features.descriptors[features])
         landmarks = LandmarkSet(view.points_map, view.descriptors)
-        limits = (settings.twin_votes_share, settings.most_twins)
+        limits = (settings.alias_votes_share, settings.most_aliases)
         aliases = yield from find_aliases(seen, landmarks, best.map_from_cam, *limits)
         fixes = [replace(best, alias_ratio=max((a.alias_ratio for a in aliases), default=0.0)), *fixes[1:]]
         for alias in aliases:
@@ -316,7 +316,7 @@ def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_IN
 
     Racks repeat: some landmarks of any agree with some of any other.
     """
-    has_recall = fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_hit_share
+    has_recall = fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_recall
     return fix.inliers >= strong_inliers or has_recall
 
 

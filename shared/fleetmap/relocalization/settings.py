@@ -13,11 +13,11 @@ class FixSettings(Section, frozen=True):
 
     min_inliers: int = 15  # of a pose
     min_cells: int = 6  # of the image with inliers
-    min_hit_share: float = 0.13
+    min_recall: float = 0.13
     top_places: int = 8  # most similar places that are tried
     top_places_found: int = 1  # the same while a pose is known that agrees
-    twin_votes_share: float = 0.2  # also try every place whose votes reach this share of the best one's
-    most_twins: int = 64  # aliases that are tried
+    alias_votes_share: float = 0.2  # also try every place whose votes reach this share of the best one's
+    most_aliases: int = 64  # aliases that are tried
     max_distance: int = 75  # bits of 256
     ratio: float = 0.9  # best over second best distance
     guided_distance: int = 70  # bits, near the predicted pixel

@@ -40,7 +40,7 @@ def config(tmp_path: Path) -> Path:
         releases.publish(maps, "lab")
     path = tmp_path / "robot.toml"
     path.write_text(
-        f'[run]\nstore = "{tmp_path}/store"\nsite = "lab"\nrobot = "r1"\nspool = "{tmp_path}/spool"\n'
+        f'[run]\nstore = "{tmp_path}/store"\nsite = "lab"\nrobot = "r1"\noutbox = "{tmp_path}/spool"\n'
         f'[source]\nkind = "recording"\nrecording = "{tmp_path}/walk"\nspeed = 0\n'
     )
     return path

@@ -19,7 +19,7 @@ from support.storage.map_samples import random_survey
 def exactly(count: int, tile_landmarks: int = 1 << 30) -> BudgetSettings:
     """What the views need, whatever it looks like: random descriptors have no twin."""
     return BudgetSettings(
-        landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks, view_distinct_landmarks=0
+        landmarks_per_m=0.0, min_landmarks=count, tile_landmarks=tile_landmarks, view_distinctive_landmarks=0
     )
 
 
@@ -139,12 +139,12 @@ def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
         obs_pixels=survey.obs_pixels[once], obs_octave=survey.obs_octave[once], obs_sigma_px=survey.obs_sigma_px[once],
     )  # fmt: skip
     wanted = seen_per_view(survey, is_alone)
-    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=60), 16.0)
+    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=60), 16.0)
     untold = choose_landmarks(survey, exactly(200), 16.0)
     assert told.sum() == untold.sum() == 200
     np.testing.assert_array_equal(seen_per_view(survey, told & is_alone), wanted)
     assert (seen_per_view(survey, untold & is_alone) < wanted).mean() > 0.5
-    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinct_landmarks=1), 16.0)
+    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=1), 16.0)
     assert (some & is_alone).sum() < is_alone.sum()
 
 

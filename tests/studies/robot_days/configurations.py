@@ -30,7 +30,7 @@ def _tracks(**changes: float) -> LocalizerSettings:
 
 
 _TAKES_BEST = {
-    "rival_share": inf, "rival_hit_share": inf, "strong_twin_share": inf, "confirming_fixes": 1, "confirming_distance_m": 0.0,
+    "competitor_share": inf, "competitor_recall_share": inf, "strong_alias_share": inf, "confirming_fixes": 1, "confirming_distance_m": 0.0,
 }  # fmt: skip
 FULL, ALONE = "the whole system", "no shared map"
 CONFIGURATIONS = {

@@ -84,7 +84,7 @@ class TlsSite:
         path = self.folder / f"{robot}.toml"
         path.write_text(
             f'[run]\nidentity = "{self.folder / robot}"\ncache = "{self.folder / robot}-cache/tiles"\n'
-            f'spool = "{self.spool(robot)}"\nfailures = "{self.failures(robot)}"\n[source]\n{source}\n'
+            f'outbox = "{self.spool(robot)}"\nfailures = "{self.failures(robot)}"\n[source]\n{source}\n'
         )
         return path
 

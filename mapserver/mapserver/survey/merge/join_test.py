@@ -51,7 +51,7 @@ class JoinEvidence:
 
     fixes: keyframes whose fixes agree with the session's own motion; places: those of them that lie a metre apart. cells_expected,
     cells_seen: parts of the map that the session should see, and sees; seen_share with its bounds share_low, share_high at error_rate.
-    rival_share: the same share at the other place that looks most alike, None without one. priors_off_m: how far the place is from
+    competitor_share: the same share at the other place that looks most alike, None without one. priors_off_m: how far the place is from
     where position priors put it, None without any.
     """
 
@@ -63,7 +63,7 @@ class JoinEvidence:
     share_low: float = 0.0
     share_high: float = 1.0
     error_rate: float = 0.0
-    rival_share: float | None = None
+    competitor_share: float | None = None
     priors_off_m: float | None = None
 
 
@@ -84,7 +84,7 @@ class Located:
     placed: Placed
     believed: int
     seen: Confirmation
-    rival_share: float | None
+    competitor_share: float | None
     priors_off_m: float | None
 
 
@@ -190,7 +190,7 @@ class JoinTest:
             share_low=low,
             share_high=high,
             error_rate=self._settings.join_error_rate,
-            rival_share=located.rival_share,
+            competitor_share=located.competitor_share,
             priors_off_m=located.priors_off_m,
         )
 
@@ -240,16 +240,16 @@ class JoinTest:
             near = [one for one in others if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
             near = [one for one in near if _speaks_for_itself(one.seen)]
             alike = [best, *near] if len(near) == 1 else alike
-        rival_share = max((round(one.seen.share, 4) for one in others), default=None)
+        competitor_share = max((round(one.seen.share, 4) for one in others), default=None)
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
-            located = _with_rival(best, rival_share)
+            located = _with_competitor(best, competitor_share)
             return NotJoined(
                 f"{len(alike)} places of the map look alike to it: it sees {seen} parts of the map there; drive on to where they "
                 "differ, or past a dock",
                 evidence=self.evidence(located, located.seen),
             )
-        chosen = _with_rival(near[0] if len(alike) > 1 else best, rival_share)
+        chosen = _with_competitor(near[0] if len(alike) > 1 else best, competitor_share)
         if chosen.priors_off_m is not None and chosen.priors_off_m >= _PRIOR_M:
             if contradicts(chosen.seen):
                 return NotJoined(
@@ -286,5 +286,5 @@ def _same_place(one: Located, other: Located) -> bool:
     return bool(np.median(apart_m) < _SAME_PLACE_M)
 
 
-def _with_rival(one: Located, rival_share: float | None) -> Located:
-    return Located(one.map_from_body, one.placed, one.believed, one.seen, rival_share, one.priors_off_m)
+def _with_competitor(one: Located, competitor_share: float | None) -> Located:
+    return Located(one.map_from_body, one.placed, one.believed, one.seen, competitor_share, one.priors_off_m)

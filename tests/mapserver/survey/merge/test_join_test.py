@@ -177,6 +177,6 @@ def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_sp
     assert (said is JoinVerdict.JOINED) == is_there
     if is_there:
         assert isinstance(located, Located)
-        assert located.rival_share is not None
-        assert located.rival_share > located.seen.share
+        assert located.competitor_share is not None
+        assert located.competitor_share > located.seen.share
         assert np.linalg.norm((located.map_from_body - places)[:12, :3, 3], axis=1).max() < 0.05
