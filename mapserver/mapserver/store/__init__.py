@@ -1,6 +1,6 @@
 """Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
 
-from mapserver.store.access.chain import AuditLine, AuditMark, chain_faults
+from mapserver.store.access.chain import AuditLine, chain_faults
 from mapserver.store.access.operators import OperatorQueries, OperatorRow, TokenRow
 from mapserver.store.fleet_queries import CounterKey, FleetBatch, tile_key
 from mapserver.store.garbage_collection import Retention
@@ -30,7 +30,6 @@ __all__ = [
     "NOBODY",
     "Actor",
     "AuditLine",
-    "AuditMark",
     "CanaryRow",
     "CounterKey",
     "DraftContent",

@@ -15,7 +15,7 @@ from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
-from mapserver.store.access.chain import AuditLine, AuditMark
+from mapserver.store.access.chain import AuditLine
 from mapserver.store.access.operators import OperatorQueries
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
@@ -231,11 +231,6 @@ class StoreQueries:
     def audit_lines(self, last: int | None = None) -> list[AuditLine]:
         """The log of all sites and of the store itself, oldest line first, or the last lines of it."""
         return self._transactions.audit_lines(last)
-
-    def audit_mark(self) -> AuditMark | None:
-        """The end of the log, to be kept where nobody who writes the log can change it; None before the first chained line."""
-        last = self.audit_lines(1)
-        return AuditMark(last[0].id, last[0].sha256) if last and last[0].sha256 else None
 
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
         """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""

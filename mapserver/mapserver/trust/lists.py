@@ -17,7 +17,6 @@ import msgspec
 from fleetmap.errors import StoreError, UntrustedError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
-from mapserver.store import AuditMark
 from mapserver.store.files import is_plain_file
 
 TIMESTAMP = "timestamp"
@@ -32,7 +31,6 @@ class _Signed(msgspec.Struct, frozen=True):
     expires: datetime
     meta: dict[str, dict[str, Any]] = {}
     delegations: dict[str, Any] | None = None
-    audit: AuditMark | None = None
 
 
 class _Signature(msgspec.Struct, frozen=True):
@@ -42,16 +40,6 @@ class _Signature(msgspec.Struct, frozen=True):
 class _File(msgspec.Struct, frozen=True):
     signed: _Signed
     signatures: tuple[_Signature, ...] = ()
-
-
-def audit_mark(path: Path) -> AuditMark | None:
-    """The line of the log that a timestamp names; None where it names none or is not there. Raises StoreError for what is none."""
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=_File).signed.audit
-    except FileNotFoundError:
-        return None
-    except (OSError, msgspec.MsgspecError) as error:
-        raise StoreError(f"{path} cannot be read as a timestamp ({error}); check the path") from error
 
 
 class SiteRole(msgspec.Struct, frozen=True):

@@ -23,7 +23,6 @@ from tuf.api.serialization.json import JSONSerializer
 
 from fleetmap.errors import StateError, StoreError, disk_errors
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
-from mapserver.store import AuditMark
 from mapserver.store.files import make_folder, write_atomically
 from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh
 
@@ -205,10 +204,8 @@ class ListRepository:
 
     # --- by the server ------------------------------------------------------------------------------------------------
 
-    def sign_online(self, online: Signer, audit: AuditMark | None = None) -> None:
+    def sign_online(self, online: Signer) -> None:
         """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
-
-        audit: the end of the store's log, which robots then keep with the timestamp.
 
         Raises StateError where root and targets do not let this key sign.
         """
@@ -226,10 +223,7 @@ class ListRepository:
         if before is None or before.meta != meta or not is_fresh("snapshot", before.expires, self.now):
             number += 1
             self._sign("snapshot", Snapshot(version=number, meta=meta), [online])
-        stamp = Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number))
-        if audit is not None:
-            stamp.unrecognized_fields["audit"] = list(audit)
-        self._sign(TIMESTAMP, stamp, [online], (root,))
+        self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), [online], (root,))
 
     def _last_snapshot(self, root: Root) -> Snapshot | None:
         """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""

@@ -66,7 +66,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
                 faults.append(error)
         online = keys.signer("online")
         if online is not None and (all_anew or _online_is_due(lists, now)):
-            repository.sign_online(online, store.audit_mark())
+            repository.sign_online(online)
     if faults:
         raise faults[0]
 

@@ -9,11 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from fleetmap.trust import TrustedMap
 from mapserver import cli, releases
 from mapserver.store import Actor, MapStore
-from mapserver.store.access.chain import COLUMNS, line_sha256
-from mapserver.trust import init_here, update_lists
+from mapserver.trust import init_here
 from support.storage.map_samples import save_sample_draft
 
 GOLDEN = Path(__file__).resolve().parents[2] / "golden"
@@ -36,43 +34,20 @@ def rewrite(folder: Path, *statements: str) -> None:
             connection.execute(statement)
 
 
-def rewrite_whole(folder: Path) -> None:
-    """A line changed, and all hashes behind it made anew."""
-    rewrite(folder, "UPDATE events SET actor = 'bob' WHERE id = 2")
-    with sqlite3.connect(folder / "store.sqlite3") as connection:
-        before = ""
-        for row in connection.execute(f"SELECT {COLUMNS} FROM events ORDER BY id").fetchall():
-            before = line_sha256(before, row[:-1])
-            connection.execute("UPDATE events SET sha256 = ? WHERE id = ?", (before, row[0]))
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A signed store of some releases, whose timestamp a robot has kept."""
+    """A signed store of some releases."""
     with MapStore.open(tmp_path / "store", create=True) as store:
         for seed in range(2):
             save_sample_draft(store, seed=seed)
             releases.publish(store, "lab", actor=Actor("ada", "monday"))
         init_here(store)
         store.audit("enrolled", "tug-7", actor=Actor("ada", "", "ada", "10.0.0.1"))
-        update_lists(store, all_anew=True)
-    robot_asks(tmp_path / "store")
     return tmp_path / "store"
 
 
-def robot_asks(store: Path) -> None:
-    """What a robot does that asks for its map."""
-
-    def ask(name: str) -> bytes | None:
-        path = store / "trust" / name
-        return path.read_bytes() if path.is_file() else None
-
-    TrustedMap(store.parent / "robot", "lab", None, ask).refresh()
-
-
 def test_an_honest_log_is_clean(folder: Path) -> None:
-    witness = str(folder.parent / "robot" / "timestamp.json")
-    assert run("--store", str(folder), "--verify", "--witness", witness) == (0, "6 lines, 2 witnesses, clean\n")
+    assert run("--store", str(folder), "--verify") == (0, "6 lines, clean\n")
     status, printed = run("--store", str(folder))
     assert (status, len(printed.splitlines())) == (0, 6)
     assert "enrolled, 'tug-7', by 'ada' (signed in), from '10.0.0.1'" in printed
@@ -86,7 +61,6 @@ def test_an_honest_log_is_clean(folder: Path) -> None:
         ("UPDATE events SET address = '10.0.0.2' WHERE id = 6", "line 6 was changed"),
         ("UPDATE events SET sha256 = '' WHERE id = 3", "line 3 was changed"),
         ("DELETE FROM events WHERE id = 3", "lines 3 to 3 are missing"),
-        ("DELETE FROM events WHERE id = 6", "the log ends at line 5"),
         ("INSERT INTO events (id, stamp_ns, site, kind, detail) VALUES (7, 1, 'lab', 'x', 'y')", "line 7 was changed"),
     ],
 )
@@ -95,18 +69,6 @@ def test_a_changed_line_is_found(folder: Path, statement: str, words: str) -> No
     status, printed = run("--store", str(folder), "--verify")
     assert status == 3
     assert words in printed
-
-
-def test_a_log_written_anew_is_found_by_what_a_robot_kept(folder: Path) -> None:
-    rewrite_whole(folder)
-    with MapStore.open(folder) as store:
-        update_lists(store, all_anew=True)  # the administrator has the online key too
-    assert run("--store", str(folder), "--verify")[0] == 0, "the control: alone the store cannot know"
-    status, printed = run(
-        "--store", str(folder), "--verify", "--witness", str(folder.parent / "robot" / "timestamp.json")
-    )
-    assert status == 3
-    assert "timestamp.json knows another line 6: the log was written anew" in printed
 
 
 @pytest.mark.parametrize(
@@ -118,9 +80,7 @@ def test_the_lines_of_an_older_store_are_covered_by_the_next_one(
     shutil.copy(GOLDEN / "store-6.sqlite3", tmp_path / "store.sqlite3")
     shutil.copytree(GOLDEN / "store-blobs", tmp_path / "blobs")
     with MapStore.open(tmp_path) as store:
-        assert store.audit_mark() is None
         store.audit("opened", "by a newer version")
-        assert store.audit_mark() is not None
     assert run("--store", str(tmp_path), "--verify")[0] == 0
     with MapStore.open(tmp_path) as store:
         before = len(store.audit_lines())
@@ -130,15 +90,3 @@ def test_the_lines_of_an_older_store_are_covered_by_the_next_one(
         is_changed = connection.execute("SELECT detail FROM events WHERE id = 1").fetchone()[0] == "x"
     assert changed[0] == (3 if is_changed else 0)
     assert not is_changed or f"line {before} was changed" in changed[1]
-
-
-def test_refusals_of_the_command(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "nonsense.json").write_text("{}")
-    for arguments, words in (
-        (["--witness", "x"], "for --verify"),
-        (["--verify", "--witness", "none"], "names no line"),
-    ):
-        with pytest.raises(Exception, match=words):
-            run("--store", str(folder), *arguments)
-    with pytest.raises(Exception, match="cannot be read as a timestamp"):
-        run("--store", str(folder), "--verify", "--witness", str(tmp_path / "nonsense.json"))

@@ -1,12 +1,10 @@
 """`mapserver audit`: who did what, and whether the log is as it was written."""
 
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.errors import UsageError
 from mapserver.commands.options import Json, StoreFolder, print_json
 from mapserver.commands.store.verify import EXIT_STATUS_FAULTS
 
@@ -17,38 +15,24 @@ if TYPE_CHECKING:
 def audit(
     store: StoreFolder,
     verify: Annotated[bool, typer.Option("--verify", help="Check the chain of lines; status 3 for a fault.")] = False,
-    witness: Annotated[
-        list[str] | None,
-        typer.Option(metavar="timestamp.json", help="Copy of the server's timestamp that a robot kept; repeat it."),
-    ] = None,
     last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
     json: Json = False,
 ) -> None:
     """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
     from mapserver.store import MapStore, chain_faults
-    from mapserver.trust import audit_mark
 
-    if witness and not verify:
-        raise UsageError("--witness is for --verify")
     with MapStore.open(store, read_only=True) as maps:
         if not verify:
             _print(maps.audit_lines(last), json=json)
             return
-        own = maps.folder / "trust" / "timestamp.json"
-        marks = [] if (mark := audit_mark(own)) is None else [(str(own), mark)]
-        for path in witness or ():
-            mark = audit_mark(Path(path))
-            if mark is None:
-                raise UsageError(f"--witness {path}: it names no line of a log; use a robot's trust/.../timestamp.json")
-            marks.append((path, mark))
         lines = maps.audit_lines()
-        faults = chain_faults(lines, marks)
+    faults = chain_faults(lines)
     if json:
         print_json({"lines": len(lines), "faults": faults})
     else:
         for fault in faults:
             typer.echo(f"fault: {fault}")
-        typer.echo(f"{len(lines)} lines, {len(marks)} witnesses, {f'{len(faults)} faults' if faults else 'clean'}")
+        typer.echo(f"{len(lines)} lines, {f'{len(faults)} faults' if faults else 'clean'}")
     if faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
