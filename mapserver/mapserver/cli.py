@@ -19,7 +19,6 @@ from mapserver.commands.nightly import nightly
 from mapserver.commands.prepare import prepare
 from mapserver.commands.releases.inspect import diff, inspect, versions
 from mapserver.commands.releases.promote import promote, publish, rollback
-from mapserver.commands.releases.signer import signer
 from mapserver.commands.serve import serve
 from mapserver.commands.site.align import align
 from mapserver.commands.site.areas import AREAS_GROUP
@@ -67,7 +66,6 @@ COMMANDS: Commands = {
     "audit": audit,
     "prepare": prepare,
     "trust": TRUST,
-    "signer": signer,
     "config": CONFIG,
 }
 

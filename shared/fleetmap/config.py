@@ -20,6 +20,7 @@ _OF_POSES = (
     "`--trajectory FILE` knows TUM, KITTI and DROID's poses.npy by their content; evo_traj writes TUM of other formats, and "
     "`--trajectory-frame camera|body` says whose poses they are"
 )
+_ONE_KEY = "one root key and one key a site sign now, each of them a file (docs/security.md); delete the key"
 RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "walls": "`mapserver align --pin ...` replaces it; delete the key",
@@ -31,6 +32,14 @@ RETIRED = {  # keys of files, and options of commands with _ for -; what replace
     "spool_bytes": "it is called `outbox_bytes` now",
     "sight": "it is called `image_quality` now",
     "min_hit_share": "it is called `min_recall` now",
+    **dict.fromkeys(("threshold", "public", "previous", "remove"), _ONE_KEY),
+    "add": "`mapserver trust rotate root --stick DIR` makes another root key",
+    **dict.fromkeys(("signer", "keys", "adopt"), "the account that serves also builds and signs; delete the key"),
+    **dict.fromkeys(
+        ("with_trust", "root"),
+        "no lists go with an export: an imported version is a draft that you judge; delete the key",
+    ),
+    "witness": "`mapserver audit --verify` checks the log by itself; delete the key",
     **dict.fromkeys(("vocabulary", "train_vocabulary"), "maps use the vocabulary that ships with fleetmap; delete it"),
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.

@@ -12,7 +12,7 @@ from support.fleet.contracts_documents import REPOSITORY, click_command
 PACKAGES = ("mapserver/mapserver", "locclient/locclient", "shared/fleetmap")
 GIVEN = ["mapserver", "any", "--store", "maps", "--site", "hall"]  # what somebody typed who reads the message
 # Named as what they are, not as a step to take
-NAMED = {"mapserver build", "mapserver calibrate", "mapserver doctor", "mapserver nightly", "mapserver signer"}
+NAMED = {"mapserver build", "mapserver calibrate", "mapserver doctor", "mapserver nightly"}
 
 
 def _texts(tree: ast.AST) -> Iterator[tuple[int, str]]:

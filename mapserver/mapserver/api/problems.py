@@ -10,7 +10,6 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
-from mapserver.store import JobInfo
 
 _log = logging.getLogger(__name__)
 
@@ -38,27 +37,12 @@ def problem(status: int, detail: str, path: str, headers: dict[str, str] | None 
     return JSONResponse(content, status, headers=headers, media_type="application/problem+json")
 
 
-class Waiting(Exception):  # noqa: N818 (no error: the request is kept)
-    """A request waits for the signer: 202, with the job to ask for."""
-
-    def __init__(self, job: JobInfo) -> None:
-        super().__init__(job.message)
-        self.job = job
-
-
 def install(app: FastAPI) -> None:
     """Makes every error of `app` a problem document."""
-    app.add_exception_handler(Waiting, _waiting)
     app.add_exception_handler(FleetmapError, _fleetmap_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(Exception, _unexpected)
-
-
-def _waiting(_: Request, waiting: Exception) -> Response:
-    assert isinstance(waiting, Waiting)
-    address = f"/v1/jobs/{waiting.job.id}"
-    return JSONResponse({"job": waiting.job.id, "state": "running", "ask": address}, 202, {"Location": address})
 
 
 def _fleetmap_error(request: Request, error: Exception) -> Response:

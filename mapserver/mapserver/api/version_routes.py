@@ -7,33 +7,29 @@ from typing import NamedTuple, cast
 from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
 
-from fleetmap.errors import StateError
 from mapserver import releases
 from mapserver.api.guard import GuardSettings, actor_of
 from mapserver.api.parameters import Site, Version
-from mapserver.api.problems import Waiting
 from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView, version_view
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet_statistics.canary_test import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_test import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
-from mapserver.store import CanaryRow, JobInfo, MapStore, VersionInfo
+from mapserver.store import CanaryRow, MapStore, VersionInfo
 
 
 class ApiSettings(NamedTuple):
-    """Who is let in, how drafts, canaries and tiles are judged, and whether another account signs."""
+    """Who is let in, and how drafts, canaries and tiles are judged."""
 
     guard: GuardSettings = GuardSettings()
     gate: GateSettings = GateSettings()
     canary: CanarySettings = CanarySettings()
     resurvey: ResurveySettings = ResurveySettings()
-    signer: bool = False
 
 
 def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
     """Adds the endpoints; the guard lets those change something who may."""
-    desk = releases.Desk(store, signer=settings.signer)
 
     @app.get("/v1/sites/{site}/versions/{version}/quality")
     def quality(site: Site, version: Version) -> QualityView:
@@ -49,34 +45,23 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
 
     @app.post("/v1/sites/{site}/versions/{version}/publish")
     def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionView:
-        """Takes a draft through the gate and makes it current; 202 with a job where the signer has not answered within 10 s."""
+        """Takes a draft through the gate and makes it current."""
         actor = actor_of(request, act.actor, act.reason)
-        if (act.force or act.trust_calibration) and settings.signer:
-            option = "--force" if act.force else "--trust-calibration"
-            raise StateError(
-                f"that is decided on the builder's account alone: `mapserver publish --site {site} --version {version} {option} "
-                f"--reason WHY --keys KEYS --store {shlex.quote(str(store.folder))}`"
-            )
         if act.trust_calibration:
             releases.trust_calibration(store, store.version(site, version), actor)
-        if not _answered(desk.ask("publish", site, actor, version)):
-            releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
+        releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
         return version_view(store, store.version(site, version))
 
     @app.post("/v1/sites/{site}/versions/{version}/promote")
     def promote(request: Request, site: Site, version: Version, act: Act) -> VersionView:
-        """Makes a version that was published before the current one; 202 with a job as `publish`."""
-        actor = actor_of(request, act.actor, act.reason)
-        if not _answered(desk.ask("promote", site, actor, version)):
-            releases.promote(store, site, version, actor=actor)
+        """Makes a version that was published before the current one."""
+        releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
         return version_view(store, store.version(site, version))
 
     @app.post("/v1/sites/{site}/rollback")
     def rollback(request: Request, site: Site, act: Act) -> VersionView:
-        """Makes the version current that was so before; the current one retires. 202 with a job as `publish`."""
-        actor = actor_of(request, act.actor, act.reason)
-        if not _answered(desk.ask("roll back", site, actor)):
-            releases.roll_back(store, site, actor=actor)
+        """Makes the version current that was so before; the current one retires."""
+        releases.roll_back(store, site, actor=actor_of(request, act.actor, act.reason))
         return version_view(store, cast(VersionInfo, store.current(site)))
 
     @app.get("/v1/sites/{site}/canary")
@@ -100,16 +85,8 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         """
         share = settings.canary.share if act.share is None else act.share
         actor = actor_of(request, act.actor, act.reason)
-        if not _answered(desk.ask("try", site, actor, version, share)):
-            releases.start_canary(store, site, version, share, actor=actor, gate=settings.gate)
+        releases.start_canary(store, site, version, share, actor=actor, gate=settings.gate)
         return _view(store, store.canaries(site)[0], settings.canary)
-
-
-def _answered(job: JobInfo | None) -> bool:
-    """Whether the signer has done it; False where the server is to act itself. Raises Waiting."""
-    if job is not None and job.state == "running":
-        raise Waiting(job)
-    return job is not None
 
 
 def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> CanaryView:

@@ -76,7 +76,7 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
-from mapserver.trust.signing import check_base, record_built
+from mapserver.trust.signing import check_base
 
 _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
 
@@ -110,7 +110,6 @@ class BuildOptions:
     job: int | None = None
     config: Path | None = None
     settings: SurveySettings | None = None
-    keys: Path | None = None
     look_at: Callable[[Sequence[Path]], None] = lambda _: None
 
     @property
@@ -253,7 +252,7 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
             f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
             "or name another --site"
         )
-    check_base(maps, current, request.options.keys)
+    check_base(maps, current)
     archive = maps.archive(site, current.version)
     if archive is None:
         raise StoreError(
@@ -338,7 +337,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive, grid=grid, surfels=surfels,
         evidence=evidence, job=job,
     )  # fmt: skip
-    version = record_built(maps.save(site, content, actor=run.request.options.actor), run.request.options.keys)
+    version = maps.save(site, content, actor=run.request.options.actor).version
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
     words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)

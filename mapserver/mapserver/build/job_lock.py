@@ -12,7 +12,6 @@ from typing import Any
 
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.store import JobInfo, MapStore
-from mapserver.store.rows import REQUEST
 
 INTERRUPTED = "interrupted"
 """Key of the report of a job that was ended here."""
@@ -50,7 +49,7 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
     """Notes as failed what stands as running though nobody runs it; returns the numbers of those jobs."""
     ended, store = [], maps.folder
     for job in maps.running_jobs():
-        if job.kind.startswith(REQUEST) or _is_young(job, now_ns) or _is_held(store, job.id):
+        if _is_young(job, now_ns) or _is_held(store, job.id):
             continue
         message = "was interrupted: its process is gone; run it again, a night goes on by itself the next time"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
+from fleetmap.cli_options import ConfigFile, config_path, expand_options
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
 
@@ -82,13 +82,4 @@ def build(
     site, store = asked.pop("site"), asked.pop("store")
     asked["trajectory"] = trajectory.given()
     built = build_map(recordings, store, site, BuildOptions(**asked))
-    if options.keys is not None:
-        from mapserver.releases.signer import note_verdict
-        from mapserver.store import MapStore
-        from mapserver.trust.builder_folder import BuilderFolder
-
-        with MapStore.open(store) as maps:
-            note_verdict(
-                maps, BuilderFolder(options.keys), maps.version(site, built.version), settings_of(context).gate
-            )
     typer.echo(built.sentence)

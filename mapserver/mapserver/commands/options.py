@@ -18,10 +18,6 @@ SiteName = Annotated[str, typer.Option(help="Name of the site.")]
 StoreFolder = Annotated[Path, typer.Option(help="Folder of the map store.")]
 NewStoreFolder = Annotated[Path, typer.Option(help="Folder of the map store; created if it does not exist.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-BuilderKeys = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="Folder of the account that builds and signs, if that is not the server's."),
-]
 Calibration = Annotated[Path | None, typer.Option(metavar="FILE", help="Kalibr camchain to use.")]
 
 
@@ -73,8 +69,6 @@ class SurveyOptions(SiteOptions):
         str | None,
         typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...); `local` starts processes here."),
     ] = None
-
-    keys: BuilderKeys = None
 
     def asked(self, context: typer.Context) -> dict[str, Any]:
         """All options by their names, topics as Topics."""

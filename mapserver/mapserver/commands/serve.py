@@ -158,9 +158,6 @@ def serve(
         str,
         typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
     ] = "tcp/127.0.0.1:7447",
-    signer: Annotated[
-        bool, typer.Option("--signer", help="Ask `mapserver signer` for releases that its lists do not admit yet.")
-    ] = False,
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
@@ -188,7 +185,7 @@ def serve(
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:
-            http = _Http(listener, guard, certificate, bool(at.http_name), signer, shown)
+            http = _Http(listener, guard, certificate, bool(at.http_name), shown)
             _run(maps, (bus, robots), http, settings)
     _end_process()
 
@@ -216,7 +213,6 @@ class _Http(NamedTuple):
     guard: "GuardSettings"
     certificate: "HttpCertificate | None"
     is_behind_proxy: bool
-    signer: bool
     shown: _Shown | None
 
 
@@ -285,7 +281,7 @@ def _run(
         await asyncio.gather(*background, return_exceptions=True)
         _bound_the_end(fleet)
 
-    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey, http.signer)
+    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
     config = uvicorn.Config(

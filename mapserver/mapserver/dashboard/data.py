@@ -72,9 +72,8 @@ EVER: Span = (None, None)
 class MapData:
     """Reads and changes maps in an open store. Methods may be called from any thread; errors are the store's."""
 
-    def __init__(self, store: MapStore, gate: GateSettings, trial_share: float, *, signer: bool = False) -> None:
+    def __init__(self, store: MapStore, gate: GateSettings, trial_share: float) -> None:
         self._store = store
-        self._desk = releases.Desk(store, signer=signer)
         self._gate = gate
         self.trial_share = trial_share
         self._plans: OrderedDict[str, Plan] = OrderedDict()
@@ -253,21 +252,15 @@ class MapData:
 
     def publish(self, site: str, version: int, actor: Actor) -> str:
         """Takes a draft through the gate and makes it current."""
-        if job := self._desk.ask("publish", site, actor, version):
-            return _asked(job)
         releases.publish(self._store, site, version, actor=actor, gate=self._gate)
         return f"Version {version} is published and current."
 
     def promote(self, site: str, version: int, actor: Actor) -> str:
         """Makes an earlier version current."""
-        if job := self._desk.ask("promote", site, actor, version):
-            return _asked(job)
         releases.promote(self._store, site, version, actor=actor)
         return f"Version {version} is current."
 
     def start_trial(self, site: str, version: int, actor: Actor) -> str:
-        if job := self._desk.ask("try", site, actor, version, self.trial_share):
-            return _asked(job)
         releases.start_canary(self._store, site, version, self.trial_share, actor=actor, gate=self._gate)
         return f"Version {version} is tried by {self.trial_share:.0%} of the robots."
 
@@ -282,11 +275,4 @@ class MapData:
         rows = self._store.releases(site)
         if rows.rollback_target != version or rows.canary is not None:
             raise StateError(f"a rollback no longer leads to version {version}; reload the page")
-        if job := self._desk.ask("roll back", site, actor):
-            return _asked(job)
         return f"Version {releases.roll_back(self._store, site, actor=actor)} is current."
-
-
-def _asked(job: JobInfo) -> str:
-    done = f"The signer has answered: {job.message}."
-    return done if job.state == "done" else f"Job {job.id} waits for the signer; the list of jobs shows its answer."

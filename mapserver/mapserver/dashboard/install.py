@@ -41,7 +41,7 @@ def install_dashboard(
 ) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     services = Services(
-        MapData(store, settings.gate, settings.canary.share, signer=settings.signer),
+        MapData(store, settings.gate, settings.canary.share),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
         settings.guard,

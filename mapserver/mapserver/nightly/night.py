@@ -25,8 +25,6 @@ from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import Recorded
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, VersionInfo
-from mapserver.trust.builder_folder import BuilderFolder
-from mapserver.trust.signing import sign_as_builder
 
 JOB = "nightly"
 _MOST_A_NIGHT = 1000  # recordings, and lines about what is left where it is
@@ -54,7 +52,6 @@ class NightRequest:
     threads: int | None = None
     scheduler: str | None = None
     config: Path | None = None
-    keys: Path | None = None
 
 
 @dataclass
@@ -270,9 +267,6 @@ class _Night:
         site, version = self._request.site, draft.version
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
         own = [recorded for recorded in recordings if recorded.sha256 in taken]
-        builder = None if self._request.keys is None else BuilderFolder(self._request.keys)
-        if builder is not None:
-            builder.check(draft)
         try:
             releases.publish(self._maps, site, version, actor=self._actor(), gate=self._gate)
         except GateRefusedError as error:
@@ -280,9 +274,6 @@ class _Night:
                 self._put_away(recorded.path, boxes.HELD, recorded.sha256, str(error))
             raise
         self._report.published.append(version)
-        if builder is not None:
-            builder.note_passed(site, version)
-            sign_as_builder(self._maps, builder, site)
         self._say(f"site {site}: version {version} is current")
         for recorded in own:
             self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {version}")

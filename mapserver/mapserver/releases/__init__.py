@@ -9,8 +9,7 @@ from mapserver.releases.release import (
     start_canary,
     trust_calibration,
 )
-from mapserver.releases.requests import Desk
 from mapserver.releases.version_diff import Difference
 
-__all__ = ["Desk", "Difference", "difference", "end_canary", "promote", "publish", "roll_back", "start_canary"]
+__all__ = ["Difference", "difference", "end_canary", "promote", "publish", "roll_back", "start_canary"]
 __all__ += ["trust_calibration"]

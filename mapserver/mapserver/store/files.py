@@ -14,7 +14,6 @@ from fleetmap.errors import StoreError, disk_errors
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
 _OWN_FILE, _OWN_FOLDER = 0o600, 0o700  # maps, positions and pictures are nobody else's business on a shared machine
-_GROUP_FILE, _GROUP_FOLDER = 0o660, 0o2770  # in a folder that its owner gave to a group, by hand
 _RESERVE_BYTES = 4 << 20  # what a transaction that removes some hundred versions writes
 TEMPORARY_SUFFIX = ".tmp"
 
@@ -77,8 +76,6 @@ def make_folder(folder: Path) -> None:
     for parent in reversed(missing):
         with suppress(FileExistsError):
             os.mkdir(parent, _OWN_FOLDER)  # noqa: PTH102
-            if is_of_group(parent.parent):
-                os.chmod(parent, _GROUP_FOLDER)  # noqa: PTH101
         sync_folder(parent.parent)
     if not missing:
         sync_folder(folder.parent)
@@ -143,18 +140,9 @@ def locked(path: Path, *, shared: bool) -> Iterator[None]:
         os.close(descriptor)
 
 
-def is_of_group(folder: Path) -> bool:
-    """Whether a folder was given to a group (mode 2770): two accounts of one machine, which serve and build, share such a store."""
-    return os.stat(folder).st_mode & (stat.S_ISGID | stat.S_IWGRP) == stat.S_ISGID | stat.S_IWGRP  # noqa: PTH116
-
-
 def _open_own(path: Path, flags: int) -> int:
-    """A file that is made if it is not there, for its owner alone or for the group of its folder."""
-    descriptor = os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE)
-    if is_of_group(path.parent):
-        with suppress(PermissionError):  # made by the other account
-            os.fchmod(descriptor, _GROUP_FILE)
-    return descriptor
+    """A file that is made if it is not there, for its owner alone."""
+    return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE)
 
 
 def _take_lock(descriptor: int, kind: int, path: Path) -> None:

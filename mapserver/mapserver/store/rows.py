@@ -101,10 +101,6 @@ class VerdictRow:
     report: dict[str, Any]
 
 
-REQUEST = "request to "
-"""The kind of a job begins so that waits for the signer (`releases.requests`)."""
-
-
 @dataclass(frozen=True, slots=True)
 class JobInfo:
     """One run of a job. state: running, done or failed; started and finished are ISO 8601 in UTC."""

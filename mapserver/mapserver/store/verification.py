@@ -8,7 +8,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
-from mapserver.store.files import is_of_group, is_plain_file
+from mapserver.store.files import is_plain_file
 from mapserver.store.rows import SiteReleases, VersionInfo
 from mapserver.store.version_rows import references, site_releases
 
@@ -42,8 +42,7 @@ def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFi
         f"{path} is a symbolic link, which a store does not follow"
         for path in (*blobs.links(), *_links(root / "trust"))
     ]
-    others = 0o007 if is_of_group(root) else 0o077
-    found.open_to_others = sum(bool(path.stat().st_mode & others) for path in (root, *root.glob("store.sqlite3*")))
+    found.open_to_others = sum(bool(path.stat().st_mode & 0o077) for path in (root, *root.glob("store.sqlite3*")))
     sound = _check_blobs(transactions, blobs, found)
     sites = transactions.query("SELECT * FROM sites ORDER BY site")
     releases = [site_releases(transactions, row["site"]) for row in sites]

@@ -15,7 +15,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives import serialization as s
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -26,7 +25,7 @@ from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.trust.enrolment import certificate_info
 from mapserver.store.files import make_folder, write_atomically
 from mapserver.trust.http_certificate import ENDS_SOON_DAYS, check_times
-from mapserver.trust.keys import credential
+from mapserver.trust.keys import credential, key_pem, load_private
 
 SERVERS_CA, ROBOTS_CA, SERVER = "servers-ca", "robots-ca", "server"
 DAYS = {SERVERS_CA: 3650, ROBOTS_CA: 1825, SERVER: 397, "robot": 365, "enrol": 1, "survey": 7}
@@ -131,7 +130,7 @@ class Authorities:
     def make_own(self, name: str, purpose: str) -> bytes:
         """PEM of a new key and its certificate, for a bundle or a program of this account."""
         key = ec.generate_private_key(ec.SECP256R1())
-        return _pem(key, None) + self._robots_ca().sign(key.public_key(), name, DAYS[purpose])
+        return key_pem(key, None) + self._robots_ca().sign(key.public_key(), name, DAYS[purpose])
 
     def days_left(self) -> dict[str, float]:
         """By file, how long each certificate lasts."""
@@ -167,7 +166,7 @@ class Authorities:
     def _sign_server(self, servers: Authority, hosts: Sequence[str]) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = servers.sign(key.public_key(), "fleetmap server", DAYS[SERVER], hosts=hosts)
-        self._write(f"{SERVER}.pem", _pem(key, None) + certificate)
+        self._write(f"{SERVER}.pem", key_pem(key, None) + certificate)
 
     def _make(self, name: str) -> Authority:
         key, subject = ec.generate_private_key(ec.SECP256R1()), _name(f"fleetmap {name}")
@@ -183,7 +182,7 @@ class Authorities:
     def _write_key(self, path: Path, key: ec.EllipticCurvePrivateKey, passphrase: str | None) -> None:
         with disk_errors(f"the key {path} cannot be written", "check the folder"):
             make_folder(path.parent)
-            write_atomically(path, [_pem(key, passphrase)])
+            write_atomically(path, [key_pem(key, passphrase)])
 
     def _write(self, file: str, data: bytes) -> None:
         with disk_errors(f"{self._path(file)} cannot be written", "check the folder"):
@@ -198,18 +197,8 @@ class Authorities:
         return self.folder / file
 
 
-def _pem(key: ec.EllipticCurvePrivateKey, passphrase: str | None) -> bytes:
-    how = s.NoEncryption() if passphrase is None else s.BestAvailableEncryption(passphrase.encode())
-    return key.private_bytes(_PEM, s.PrivateFormat.PKCS8, how)
-
-
 def _load(path: Path, passphrase: str | None) -> ec.EllipticCurvePrivateKey:
-    with disk_errors(f"the key {path} cannot be read", "check the folder and whose account this is"):
-        data = path.read_bytes()
-    try:
-        key = s.load_pem_private_key(data, None if passphrase is None else passphrase.encode())
-    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise UsageError(f"{path} is no key, or of another passphrase ({error})") from error
+    key = load_private(path, passphrase)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError(f"{path} is a key of another kind than authorities have; bring the right one")
     return key

@@ -9,12 +9,10 @@ from fleetmap.errors import StoreError, UsageError, disk_errors
 from mapserver.store.files import make_folder, sync_folder
 
 if TYPE_CHECKING:
-    from securesystemslib.signer import CryptoSigner, Key
-    from securesystemslib.signer import Signer as AnySigner
+    from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
+    from securesystemslib.signer import CryptoSigner
 
-Signer: TypeAlias = "AnySigner"
-PublicKey: TypeAlias = "Key"
-TOKEN_SCHEME = "pkcs11:"  # in the place of a file's path: a key on a token
+Signer: TypeAlias = "CryptoSigner"
 
 _LETTERS = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 of them: five bits each, none that looks like another
 _GROUPS, _GROUP = 4, 4
@@ -32,17 +30,22 @@ def new_key() -> "CryptoSigner":
     return CryptoSigner.generate_ed25519()
 
 
-def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None:
-    """Writes a key that must not be there yet; StoreError where that is not possible."""
+def key_pem(key: "PrivateKeyTypes", passphrase: str | None) -> bytes:
+    """A private key as PKCS8 PEM, encrypted with the passphrase if there is one."""
     from cryptography.hazmat.primitives import serialization as s
 
-    key = s.load_pem_private_key(signer.private_bytes, None)
     how = s.NoEncryption() if passphrase is None else s.BestAvailableEncryption(passphrase.encode())
-    data = key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
+    return key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
+
+
+def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None:
+    """Writes a key that must not be there yet; StoreError where that is not possible."""
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    data = key_pem(load_pem_private_key(signer.private_bytes, None), passphrase)
     with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
         if not path.parent.is_dir():
             make_folder(path.parent)
-            path.parent.chmod(0o700)  # also in a store that a group shares
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
@@ -51,19 +54,28 @@ def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None
         sync_folder(path.parent)
 
 
-def load_key(path: Path, passphrase: str | None) -> "CryptoSigner":
-    """A key; StoreError where its file cannot be read, UsageError for a wrong passphrase or something that is no key."""
+def load_private(path: Path, passphrase: str | None) -> "PrivateKeyTypes":
+    """The key in a file; StoreError where it cannot be read, UsageError for a wrong passphrase or something that is no key."""
     from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
-    from securesystemslib.signer import CryptoSigner, SSlibKey
 
-    with disk_errors(f"the key {path} cannot be read", "check --keys and whose account this is"):
+    with disk_errors(f"the key {path} cannot be read", "check --key and whose account this is"):
         data = path.read_bytes()
     try:
-        key = load_pem_private_key(data, None if passphrase is None else passphrase.encode())
-        return CryptoSigner(key, SSlibKey.from_crypto(key.public_key()))
+        return load_pem_private_key(data, None if passphrase is None else passphrase.encode())
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise UsageError(f"{path} is no key, or of another passphrase ({error})") from error
+
+
+def load_key(path: Path, passphrase: str | None) -> "CryptoSigner":
+    """A key that signs lists; errors as of `load_private`, UsageError for a key of another kind."""
+    from securesystemslib.signer import CryptoSigner, SSlibKey
+
+    key = load_private(path, passphrase)
+    try:
+        return CryptoSigner(key, SSlibKey.from_crypto(key.public_key()))
+    except ValueError as error:
+        raise UsageError(f"{path} is a key of another kind than lists are signed with ({error})") from error
 
 
 class KeyFolder:
@@ -78,27 +90,32 @@ class KeyFolder:
 
     def has(self, name: str) -> bool:
         """Whether the key is here, for this account."""
-        return os.access(self._path(name), os.R_OK)
+        return os.access(self.path(name), os.R_OK)
 
     def signer(self, name: str) -> "CryptoSigner | None":
         """A key, None where it is not here or not for this account; errors as of `load_key`."""
-        return load_key(self._path(name), credential(name)) if self.has(name) else None
+        return load_key(self.path(name), credential(name)) if self.has(name) else None
 
     def make(self, name: str) -> "CryptoSigner":
         """A new key of this name; StoreError where there is one already."""
         signer = new_key()
-        save_key(self._path(name), signer, credential(name))
+        save_key(self.path(name), signer, credential(name))
         return signer
 
     def replace(self, name: str) -> "CryptoSigner":
         """As `make`, in the place of a key that is kept under another name until it is removed by hand."""
-        path = self._path(name)
-        if path.exists():
-            with disk_errors(f"the key {path} cannot be moved", "check the folder's rights"):
-                path.replace(path.with_suffix(f".{secrets.token_hex(4)}.old"))
+        self.set_aside(name)
         return self.make(name)
 
-    def _path(self, name: str) -> Path:
+    def set_aside(self, name: str) -> None:
+        """Renames a key that signs no more, if there is one; StoreError where the disk refuses."""
+        path = self.path(name)
+        with disk_errors(f"the key {path} cannot be moved", "check the folder's rights"):
+            if path.exists():
+                path.replace(path.with_suffix(f".{secrets.token_hex(4)}.old"))
+
+    def path(self, name: str) -> Path:
+        """The key's file."""
         return self.folder / f"{name}.pem"
 
 

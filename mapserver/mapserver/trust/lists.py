@@ -4,7 +4,6 @@ STORE/trust/1.root.json 2.root.json ...        which keys sign what; never remov
 STORE/trust/N.targets.json                     which keys sign the list of which site
 STORE/trust/N.site-SITE.json                   the versions of a site that robots may run
 STORE/trust/N.snapshot.json timestamp.json     which of these files are the present ones
-STORE/trust/staged/site-SITE.json              a list that waits for another signature
 """
 
 import re
@@ -14,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from fleetmap.errors import StoreError, UntrustedError
+from fleetmap.errors import StoreError, UntrustedError, UsageError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
 from mapserver.store.files import is_plain_file
@@ -26,11 +25,29 @@ _NAME = re.compile(r"(?:(timestamp)|[0-9]{1,10}\.(root|targets|snapshot|site-[a-
 _NUMBERED = re.compile(r"([0-9]{1,10})\.([a-z0-9_-]+)\.json")
 
 
+class _Role(msgspec.Struct, frozen=True):
+    keyids: tuple[str, ...]
+    threshold: int
+
+
+class SiteRole(_Role, frozen=True):
+    """Which key signs the lists of a site. Lists of before may name several, or leave the version before out (previous: 0)."""
+
+    name: str
+    previous: int = 1
+
+
+class _Key(msgspec.Struct, frozen=True):
+    keytype: str
+
+
 class _Signed(msgspec.Struct, frozen=True):
     version: int
     expires: datetime
     meta: dict[str, dict[str, Any]] = {}
     delegations: dict[str, Any] | None = None
+    roles: dict[str, _Role] = {}
+    keys: dict[str, _Key] = {}
 
 
 class _Signature(msgspec.Struct, frozen=True):
@@ -40,15 +57,6 @@ class _Signature(msgspec.Struct, frozen=True):
 class _File(msgspec.Struct, frozen=True):
     signed: _Signed
     signatures: tuple[_Signature, ...] = ()
-
-
-class SiteRole(msgspec.Struct, frozen=True):
-    """Who signs the lists of a site. previous: 1 where the version before stays admitted, else 0."""
-
-    name: str
-    keyids: tuple[str, ...]
-    threshold: int
-    previous: int = 1
 
 
 def is_fresh(role: str, expires: datetime, now: datetime) -> bool:
@@ -104,29 +112,43 @@ class SignedLists:
         roles = (self.read("targets").delegations or {}).get("roles", [])
         return {role.name: role for role in msgspec.convert(roles, list[SiteRole])}
 
-    def is_signed(self, role: SiteRole, path: Path | None = None) -> bool:
-        """Whether a list (the newest, if not named) bears the names of enough keys that may sign it now; no signature is verified."""
-        path = self.path(role.name, self.newest(role.name)) if path is None else path
+    def is_signed(self, role: SiteRole) -> bool:
+        """Whether a site's newest list bears the name of its present key; the signature is not verified."""
         try:
-            file = msgspec.json.decode(path.read_bytes(), type=_File)
+            data = self.path(role.name, self.newest(role.name)).read_bytes()
+            signatures = msgspec.json.decode(data, type=_File).signatures
         except (OSError, msgspec.MsgspecError):
             return False
-        return len({signature.keyid for signature in file.signatures} & set(role.keyids)) >= role.threshold
+        return any(signature.keyid in role.keyids for signature in signatures)
+
+    def check_root(self) -> None:
+        """Raises UsageError for lists of before whose root several people, or a token, sign: nothing here can go on with them."""
+        root = self.read("root")
+        for name in ("root", "targets"):
+            role = root.roles[name]
+            kinds = {root.keys[keyid].keytype for keyid in role.keyids if keyid in root.keys} - {"ed25519"}
+            fault = f"{role.threshold} keys must sign {name}" if role.threshold > 1 else ""
+            fault = fault or (f"a key of {name} is of the kind {min(kinds)}, as PKCS#11 tokens have" if kinds else "")
+            if fault:
+                raise UsageError(
+                    f"{self.folder}: {fault}; fleetmap signs with one root key in a file now. Go on with the fleetmap that made it, "
+                    "or begin anew: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
+                )
+
+    def check_site(self, role: SiteRole) -> None:
+        """Raises UsageError for a site of before whose lists several keys sign, or whose predecessors are not admitted."""
+        fault = f"{role.threshold} keys must sign its lists" if role.threshold > 1 else ""
+        fault = fault or ("" if role.previous else "its lists admit no version but the current one")
+        if fault:
+            site = role.name.removeprefix("site-")
+            raise UsageError(
+                f"site {site}: {fault}, which is no longer supported; `mapserver trust admit {site} --key ROOT` lets one key of "
+                "this server sign lists that admit the version before, too"
+            )
 
     def path(self, role: str, number: int) -> Path:
         """The file of a role's number."""
         return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
-
-    def staged_path(self, site: str) -> Path:
-        """The file of a site's list that waits for more signatures."""
-        return self.folder / "staged" / f"{site_role(site)}.json"
-
-    def staged_list(self, site: str) -> SiteList | None:
-        """What waits for more signatures of a site; None where nothing does, or it is damaged."""
-        try:
-            return read_site_list(self.staged_path(site).read_bytes(), site)
-        except (OSError, UntrustedError):
-            return None
 
     def site_list(self, site: str, number: int) -> SiteList:
         """The list of this number; errors as of `read`."""

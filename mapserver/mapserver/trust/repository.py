@@ -1,10 +1,11 @@
 """Writing of signed lists with tuf. Every function takes the keys that it needs: who lacks them cannot call it with success."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
+import msgspec
 from securesystemslib.signer import Key, Signer
 from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
 from tuf.api.metadata import (
@@ -55,154 +56,74 @@ class ListRepository:
         """What the newest targets say; errors as of `newest`."""
         return _as(Targets, self.newest("targets").signed)
 
-    # --- by the people who hold root keys -----------------------------------------------------------------------------
+    # --- with the root key --------------------------------------------------------------------------------------------
 
-    def init(self, people: Sequence[Signer], threshold: int, online: Key) -> None:
+    def init(self, root_key: Signer, online: Key) -> None:
         """The first root and targets; StateError where the store has some."""
         if self.lists.are_there:
             raise StateError(f"{self.lists.folder} has signed lists already; `mapserver trust status` shows them")
         root = Root(consistent_snapshot=True)
         for role in ("root", "targets"):
-            for signer in people:
-                root.add_key(signer.public_key, role)
-            root.roles[role].threshold = threshold
+            root.add_key(root_key.public_key, role)
         for role in _ONLINE:
             root.add_key(online, role)
         # The root last: with it the store counts as signed.
-        targets = Targets(delegations=Delegations(keys={}, roles={}))
-        self._sign("targets", targets, people)
-        self._sign("root", root, people)
+        self._sign("targets", Targets(delegations=Delegations(keys={}, roles={})), root_key)
+        self._sign("root", root, root_key)
 
-    def check_people(self, people: Sequence[Signer]) -> None:
-        """Raises StateError where these are not enough for a root and targets, before half of a ceremony is done."""
-        root = self.root()
-        for name in ("root", "targets"):
-            role = root.roles[name]
-            known = {signer.public_key.keyid for signer in people} & set(role.keyids)
-            if len(known) < role.threshold:
-                raise StateError(
-                    f"{len(known)} of the {role.threshold} keys that {name} needs are here; bring the others too"
-                )
+    def check_root_key(self, root_key: Signer) -> None:
+        """Raises StateError for a key that is not the root key, before anything is changed."""
+        roles, keyid = self.root().roles, root_key.public_key.keyid
+        if not all(keyid in roles[name].keyids for name in ("root", "targets")):
+            raise StateError(f"key {keyid[:8]} is not the root key of {self.lists.folder}; name its file by --key")
 
-    def change_root(self, change: Callable[[Root], None], people: Sequence[Signer]) -> None:
-        """The next root, with what `change` makes of the last one; StateError unless both roots' people signed it."""
-        before, root = self.root(), self.root()
-        change(root)
-        root.version += 1
-        self._sign("root", root, people, (before, root))
-
-    def replace_online(self, online: Key, people: Sequence[Signer]) -> None:
+    def replace_online(self, online: Key, root_key: Signer) -> None:
         """Another key for snapshot and timestamp; robots then forget the numbers of the old one."""
+        self._change_root(_ONLINE, online, [root_key])
 
-        def change(root: Root) -> None:
-            for role in _ONLINE:
-                for keyid in list(root.roles[role].keyids):
-                    root.revoke_key(keyid, role)
-                root.add_key(online, role)
-
-        self.change_root(change, people)
-
-    def delegate(self, site: str, keys: Sequence[Key], people: Sequence[Signer], **rules: int) -> None:
-        """These keys, and no others, sign the list of a site. rules: threshold, and `previous`, how many predecessors stay admitted.
-
-        StateError unless enough people signed.
-        """
-        targets, name = self.targets(), site_role(site)
-        held = targets.delegations or Delegations(keys={}, roles={})
-        roles = dict(held.roles or {})
-        threshold, previous = rules.get("threshold", 1), {"previous": rules.get("previous", 1)}
-        paths = [manifest_target(site, "*")]
-        role = DelegatedRole(name, [], threshold, terminating=True, paths=paths, unrecognized_fields=previous)
-        targets.delegations = Delegations(keys=held.keys, roles={**roles, name: role})
-        for key in keys:
-            targets.add_key(key, name)
-        used = {keyid for known in targets.delegations.roles.values() for keyid in known.keyids}  # type: ignore[union-attr]
-        targets.delegations.keys = {keyid: key for keyid, key in targets.delegations.keys.items() if keyid in used}
-        targets.version += 1
-        self._sign("targets", targets, people, (self.root(),))
-
-    def renew_targets(self, people: Sequence[Signer]) -> None:
-        """The same targets for another year; StateError unless enough people signed."""
+    def replace_root(self, root_key: Signer, new: Signer) -> None:
+        """The next root and targets, signed by `new` in the place of `root_key`, or by the same key for longer."""
+        self._change_root(("root", "targets"), new.public_key, [root_key, new])
         targets = self.targets()
         targets.version += 1
-        self._sign("targets", targets, people, (self.root(),))
+        self._sign("targets", targets, new, judges=(self.root(),))
 
-    # --- by who builds a site's maps ----------------------------------------------------------------------------------
+    def _change_root(self, roles: Sequence[str], key: Key, signers: Sequence[Signer]) -> None:
+        """The next root, in which `key` alone signs these roles; StateError unless the last root's key and its own signed it."""
+        before, root = self.root(), self.root()
+        for role in roles:
+            for keyid in list(root.roles[role].keyids):
+                root.revoke_key(keyid, role)
+            root.add_key(key, role)
+        root.version += 1
+        self._sign("root", root, *signers, judges=(before, root))
 
-    def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], signers: Sequence[Signer]) -> Metadata[Any]:
-        """The next list of a site, not yet among those that robots get."""
-        name = site_role(site)
-        signed = Targets(version=self.lists.newest(name) + 1, expires=self._expiry("site"))
-        for entry in admitted:
-            about = {key: value for key, value in _fields(entry).items() if value not in (None, {})}
-            target = TargetFile(entry.length, {"sha256": entry.sha256}, manifest_target(site, entry.about.version))
-            target.unrecognized_fields["custom"] = about
-            signed.targets[target.path] = target
-        metadata = Metadata[Any](signed)
-        for signer in signers:
-            metadata.sign(signer, append=True)
-        return metadata
-
-    def staged(self, site: str) -> Metadata[Any] | None:
-        """The list of a site that waits for more signatures; None where none does. Raises StoreError for a damaged one."""
-        path = self.lists.staged_path(site)
-        try:
-            return Metadata.from_file(str(path)) if path.is_file() else None
-        except (RepositoryError, OSError) as error:
-            raise StoreError(f"{path} cannot be read ({error}); remove it, and sign anew") from error
-
-    def stage_site(self, site: str, metadata: Metadata[Any]) -> int:
-        """Puts a list among the others if enough keys of the site signed it, else aside; how many signatures it still needs."""
-        path = self.lists.staged_path(site)
-        result = self.targets().get_verification_result(site_role(site), metadata.signed_bytes, metadata.signatures)
-        missing = self._delegated(site).threshold - len(result.signed)
-        if missing <= 0:
-            self.accept_site(site, metadata)
-            path.unlink(missing_ok=True)
-            return 0
-        self.lay_down(site, metadata)
-        return missing
-
-    def lay_down(self, site: str, metadata: Metadata[Any]) -> None:
-        """Puts a list aside, where the server and further people find it."""
-        path = self.lists.staged_path(site)
-        with disk_errors(f"{path} cannot be written", "make space, and run the command again"):
-            make_folder(path.parent)
-            write_atomically(path, [metadata.to_bytes(_COMPACT)])
-
-    def check_signer(self, site: str, signer: Signer) -> None:
-        """Raises StateError where a key may not sign the lists of a site."""
-        if signer.public_key.keyid not in self._delegated(site).keyids:
-            raise StateError(
-                f"this key may not sign maps of site {site}; `mapserver trust admit {site}` names those that may"
-            )
-
-    def _delegated(self, site: str) -> DelegatedRole:
-        delegations = self.targets().delegations
-        role = None if delegations is None else (delegations.roles or {}).get(site_role(site))
-        if role is None:
-            raise StateError(f"no key may sign maps of site {site}; `mapserver trust admit {site}` names one")
-        return role
-
-    def accept_site(self, site: str, metadata: Metadata[Any]) -> None:
-        """Puts a site's list among the others; StateError unless its keys signed it, its number is the next one and it lasts."""
-        name = site_role(site)
-        expected = self.lists.newest(name) + 1
-        if metadata.signed.version != expected:
-            raise StateError(
-                f"list {metadata.signed.version} of site {site} comes where {expected} is the next; sign anew"
-            )
-        if metadata.signed.is_expired(self.now):
-            raise StateError(f"list {expected} of site {site} expired at {metadata.signed.expires}; sign anew")
-        _check(self.targets(), name, metadata)
-        self._write(name, metadata)
+    def delegate(self, site: str, key: Key, root_key: Signer) -> None:
+        """This key, and no other, signs the list of a site. StateError unless the root key signed."""
+        targets, name = self.targets(), site_role(site)
+        held = targets.delegations or Delegations(keys={}, roles={})
+        role = DelegatedRole(name, [], 1, terminating=True, paths=[manifest_target(site, "*")])
+        roles = {**(held.roles or {}), name: role}
+        targets.delegations = Delegations(keys=held.keys, roles=roles)
+        targets.add_key(key, name)
+        used = {keyid for known in roles.values() for keyid in known.keyids}
+        targets.delegations.keys = {keyid: key for keyid, key in targets.delegations.keys.items() if keyid in used}
+        targets.version += 1
+        self._sign("targets", targets, root_key, judges=(self.root(),))
 
     def forget_site(self, site: str) -> None:
         """Removes all lists of a site, so that its numbers begin anew; robots follow only after another online key."""
-        for path in [*self.lists.folder.glob(f"*.{site_role(site)}.json"), self.lists.staged_path(site)]:
+        for path in self.lists.folder.glob(f"*.{site_role(site)}.json"):
             path.unlink(missing_ok=True)
 
-    # --- by the server ------------------------------------------------------------------------------------------------
+    # --- with the keys of the server ----------------------------------------------------------------------------------
+
+    def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], key: Signer) -> int:
+        """The next list of a site, and its number; StateError unless the site's key signed."""
+        name = site_role(site)
+        signed = site_targets(site, admitted, self.lists.newest(name) + 1)
+        self._sign(name, signed, key, judges=(self.targets(),))
+        return signed.version
 
     def sign_online(self, online: Signer) -> None:
         """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
@@ -222,8 +143,8 @@ class ListRepository:
             stamped = self.newest(TIMESTAMP).signed.version
         if before is None or before.meta != meta or not is_fresh("snapshot", before.expires, self.now):
             number += 1
-            self._sign("snapshot", Snapshot(version=number, meta=meta), [online])
-        self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), [online], (root,))
+            self._sign("snapshot", Snapshot(version=number, meta=meta), online)
+        self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), online, judges=(root,))
 
     def _last_snapshot(self, root: Root) -> Snapshot | None:
         """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""
@@ -237,7 +158,7 @@ class ListRepository:
         return _as(Snapshot, last.signed)
 
     def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
-        """What a snapshot says of a site: its newest list, or what it said before where other keys must sign first.
+        """What a snapshot says of a site: its newest list, or what it said before where another key must sign first.
 
         Robots refuse a snapshot that has lost a role, those of other sites too.
         """
@@ -250,11 +171,8 @@ class ListRepository:
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _expiry(self, role: str) -> datetime:
-        return self.now + timedelta(days=DAYS[role])
-
-    def _sign(self, role: str, signed: Signed, signers: Sequence[Signer], judges: Sequence[Root] = ()) -> None:
-        signed.expires = self._expiry(role)
+    def _sign(self, role: str, signed: Signed, *signers: Signer, judges: Sequence[Root | Targets] = ()) -> None:
+        signed.expires = self.now + timedelta(days=DAYS.get(role, DAYS["site"]))
         metadata = Metadata[Any](signed)
         for signer in signers:
             metadata.sign(signer, append=True)
@@ -276,9 +194,15 @@ class ListRepository:
             self.lists.path(role, number).unlink(missing_ok=True)
 
 
-def _fields(entry: AdmittedVersion) -> dict[str, object]:
-    about = entry.about
-    return {name: getattr(about, name) for name in about.__struct_fields__}
+def site_targets(site: str, admitted: Sequence[AdmittedVersion], number: int) -> Targets:
+    """The list of a site with this number, unsigned."""
+    targets = Targets(version=number)
+    for entry in admitted:
+        about = {name: value for name, value in msgspec.structs.asdict(entry.about).items() if value not in (None, {})}
+        target = TargetFile(entry.length, {"sha256": entry.sha256}, manifest_target(site, entry.about.version))
+        target.unrecognized_fields["custom"] = about
+        targets.targets[target.path] = target
+    return targets
 
 
 def _check(judge: Root | Targets, role: str, metadata: Metadata[Any]) -> None:

@@ -1,32 +1,37 @@
-"""When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go."""
+"""When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go.
+
+And what takes the root key: the first lists, other keys.
+"""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from fleetmap.errors import FleetmapError, StateError, UsageError
+from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
-from mapserver.store.files import locked
+from mapserver.store.files import locked, make_folder
 from mapserver.store.rows import SiteReleases
-from mapserver.trust.builder_folder import BuilderFolder
-from mapserver.trust.keys import KeyFolder
+from mapserver.trust.keys import KeyFolder, make_passphrase, new_key, save_key
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 
 if TYPE_CHECKING:
+    from securesystemslib.signer import Key, Signer
+
     from mapserver.trust.repository import ListRepository
 
 _log = logging.getLogger(__name__)
 
 
-def admitted_versions(rows: SiteReleases, previous: int) -> tuple[AdmittedVersion, ...]:
-    """What robots of a site may run. previous: 1 where the version before stays admitted, so that a rollback needs no key; else 0."""
+def admitted_versions(rows: SiteReleases) -> tuple[AdmittedVersion, ...]:
+    """What robots of a site may run: also the version before, so that a rollback needs no key."""
     states: dict[int, str] = {}
-    if previous and rows.rollback_target is not None:
+    if rows.rollback_target is not None:
         states[rows.rollback_target] = "previous"
     if rows.canary is not None:
         states[rows.canary.version] = "trial"
@@ -45,23 +50,15 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
     lists = SignedLists(store.folder)
     if not lists.are_there:
         return
-    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-    keys = KeyFolder(store.folder / "keys")
+    now, keys = _now(store), KeyFolder(store.folder / "keys")
     if not all_anew and not _due(store, lists, keys, now):
         return
-    from mapserver.trust.repository import ListRepository
-
     with locked(lists.folder / "lock", shared=False):
-        repository = ListRepository(lists, now)
-        faults = []
+        repository, faults = _repository(store), []
         for info in store.sites():
-            role = site_role(info.site)
-            before = lists.newest(role)
             try:
-                _take_staged(store, repository, info.site)
-                _update_site(repository, keys, store.releases(info.site), now)
-                if lists.newest(role) != before:
-                    store.audit("list signed", f"site {info.site}, list {lists.newest(role)}")
+                if number := _update_site(repository, keys, store.releases(info.site), now):
+                    store.audit("list signed", f"site {info.site}, list {number}")
             except FleetmapError as error:  # of one site: the others' robots, and the timestamp, must not wait for it
                 faults.append(error)
         online = keys.signer("online")
@@ -82,17 +79,29 @@ def try_update_lists(store: MapStore) -> None:
 def prepare_lists(store: MapStore, endpoint: str) -> None:
     """Before a server listens at `endpoint`: makes the lists where only this machine can ask for them, and signs what is due.
 
-    Raises UsageError where a store without lists would be served to other machines.
+    Raises UsageError where a store without lists would be served to other machines, and for lists that nothing here can go on with:
+    several keys, a token, or another account sign them.
     """
     from fleetmap.bus import is_loopback  # late: zenoh comes with it, and builds need none
 
-    if not SignedLists(store.folder).are_there:
+    lists, keys = SignedLists(store.folder), KeyFolder(store.folder / "keys")
+    if not lists.are_there:
         if not is_loopback(endpoint):
             raise UsageError(
                 f"the maps of {store.folder} are not signed, and robots on other machines can ask at {endpoint}; sign them "
                 f"first: `mapserver trust init --here --store {store.folder}`"
             )
         init_here(store)
+    lists.check_root()
+    for name, role in lists.site_roles().items():
+        lists.check_site(role)
+        signer = keys.signer(name)
+        if signer is None or signer.public_key.keyid not in role.keyids:
+            site = name.removeprefix("site-")
+            raise UsageError(
+                f"the key that signs the lists of site {site} is not {keys.path(name)} (another account, a person or a token "
+                f"cannot sign any more); restore it, or let this server sign: `mapserver trust admit {site} --key ROOT`"
+            )
     try_update_lists(store)
 
 
@@ -101,54 +110,115 @@ def init_here(store: MapStore) -> None:
 
     Errors as of `update_lists`; StateError where there are lists already.
     """
-    from mapserver.trust.repository import ListRepository
+    keys = KeyFolder(store.folder / "keys")
+    _init(store, keys.signer("root") or keys.make("root"))
 
-    keys, lists = KeyFolder(store.folder / "keys"), SignedLists(store.folder)
-    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-    root, online = (keys.signer(name) or keys.make(name) for name in ("root", "online"))
-    ListRepository(lists, now).init([root], 1, online.public_key)
+
+def init_offline(store: MapStore, folder: Path) -> tuple[Path, str]:
+    """Signed lists whose root key lies in `folder`, encrypted; its file and passphrase. Errors as of `init_here`."""
+    lists = SignedLists(store.folder)
+    if lists.are_there:
+        raise StateError(f"{lists.folder} has signed lists already; `mapserver trust status` shows them")
+    key, made = _offline_key(folder, 1)
+    _init(store, key)
+    return made
+
+
+def admit_site(store: MapStore, site: str, root_key: "Signer") -> None:
+    """Another key in the store's folder of keys signs the lists of a site from now on; StateError unless `root_key` is the root key."""
+    with _changing(store, root_key, f"site {site}: another key signs its lists") as repository:
+        repository.delegate(site, _new_site_key(store, site), root_key)
+
+
+def rotate_online(store: MapStore, root_key: "Signer") -> None:
+    """Another online key, after a theft of the server or of the key; robots forget what the old one signed. Errors as of `admit_site`."""
+    with _changing(store, root_key, "another online key") as repository:
+        _replace_online(repository, store, root_key)
+
+
+def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
+    """Another key for a site and for the server in one step, after a theft of the site's key.
+
+    The site's key alone would not do: robots refuse numbers below those that the thief signed until the online key is another one.
+    Errors as of `admit_site`, UsageError for a site that nothing was signed for.
+    """
+    with _changing(store, root_key, f"site {site}: another key for it and for the server") as repository:
+        if site_role(site) not in repository.lists.site_roles():
+            raise UsageError(f"no key may sign maps of site {site}; `mapserver trust status` shows the sites")
+        repository.delegate(site, _new_site_key(store, site), root_key)
+        repository.forget_site(site)
+        _replace_online(repository, store, root_key)
+
+
+def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None) -> tuple[Path, str] | None:
+    """Root and targets for two and one more years; with a folder, signed by a new root key in it, whose file and passphrase are returned.
+
+    Errors as of `admit_site`.
+    """
+    new, made = root_key, None
+    words = "root and targets signed anew" + ("" if folder is None else " by another root key")
+    with _changing(store, root_key, words) as repository:
+        if folder is not None:
+            new, made = _offline_key(folder, repository.lists.newest("root") + 1)
+        repository.replace_root(root_key, new)
+    if made is not None:
+        KeyFolder(store.folder / "keys").set_aside("root")
+    return made
+
+
+@contextmanager
+def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["ListRepository"]:
+    """The lists for one change, checked before it; afterwards `words` stand in the log, and the server signs what follows from it."""
+    repository = _repository(store)
+    if not repository.lists.are_there:
+        raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
+    repository.lists.check_root()
+    with disk_errors(f"{repository.lists.folder} cannot be changed", "check its rights"):
+        make_folder(repository.lists.folder)
+        with locked(repository.lists.folder / "lock", shared=False):
+            repository.check_root_key(root_key)
+            yield repository
+    store.audit("trust changed", words)
+    update_lists(store, all_anew=True)
+
+
+def _init(store: MapStore, root_key: "Signer") -> None:
+    keys = KeyFolder(store.folder / "keys")
+    online = keys.signer("online") or keys.make("online")
+    _repository(store).init(root_key, online.public_key)
     update_lists(store)
 
 
-def sign_as_builder(store: MapStore, builder: BuilderFolder, site: str) -> bool:
-    """Signs what the site's releases admit, with the builder's key, and lays it down for the server; False where nothing is due.
+def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":
+    """A root key with its file and passphrase. number: of the root in which it begins to count."""
+    key, path, passphrase = new_key(), folder / f"root-{number}.pem", make_passphrase()
+    save_key(path, key, passphrase)
+    return key, (path, passphrase)
 
-    Of the database only the numbers of versions are believed. Raises StateError for a version that was not built here or did not
-    pass, or where this account's key may not sign.
+
+def _new_site_key(store: MapStore, site: str) -> "Key":
+    return KeyFolder(store.folder / "keys").replace(site_role(site)).public_key
+
+
+def _replace_online(repository: "ListRepository", store: MapStore, root_key: "Signer") -> None:
+    repository.replace_online(KeyFolder(store.folder / "keys").replace("online").public_key, root_key)
+
+
+def _repository(store: MapStore) -> "ListRepository":
+    from mapserver.trust.repository import ListRepository  # late: tuf comes with it
+
+    return ListRepository(SignedLists(store.folder), _now(store))
+
+
+def _now(store: MapStore) -> datetime:
+    return datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+
+
+def check_base(store: MapStore, info: VersionInfo) -> None:
+    """Raises StateError where the database names other bytes for a version, its archive too, than what was signed last.
+
+    The next map is built on it: otherwise whoever writes into the database decides what is built.
     """
-    lists, rows = SignedLists(store.folder), store.releases(site)
-    now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-    role = site_role(site)
-    if not builder.keys.has(role) or role not in lists.site_roles() or not _site_is_due(lists, rows, now):
-        return False
-    from mapserver.trust.repository import ListRepository
-
-    with locked(lists.folder / "lock", shared=False):
-        repository, signer = ListRepository(lists, now), builder.keys.signer(role)
-        assert signer is not None
-        repository.check_signer(site, signer)
-        admitted = admitted_versions(rows, lists.site_roles()[role].previous)
-        builder.check_entries(site, admitted)
-        repository.lay_down(site, repository.sign_site(site, admitted, [signer]))
-    return True
-
-
-def record_built(built: VersionInfo, keys: Path | None) -> int:
-    """Keeps what was built in the builder's folder, if that is not the server's; returns its number. StoreError where the disk refuses."""
-    if keys is not None:
-        BuilderFolder(keys).record(built)
-    return built.version
-
-
-def check_base(store: MapStore, info: VersionInfo, keys: Path | None = None) -> None:
-    """Raises StateError where the database names other bytes for a version, its archive too, than the builder knows.
-
-    The next map is built on it: otherwise whoever writes into the database decides what is built. keys: the builder's folder;
-    without one what was signed last is compared.
-    """
-    if keys is not None:
-        BuilderFolder(keys).check(info)
-        return
     lists = SignedLists(store.folder)
     number = lists.newest(site_role(info.site)) if lists.are_there else 0
     if number:
@@ -184,37 +254,12 @@ def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) ->
     """Whether anything is to be signed that can be signed here; asked every second, so without tuf."""
     if keys.has("online") and _online_is_due(lists, now):
         return True
+    known = lists.site_roles()
     return any(
-        (_site_is_due(lists, store.releases(info.site), now) and (keys.has(site_role(info.site)) or keys.has("root")))
-        or _is_laid_down(lists, info.site)
+        keys.has(role if role in known else "root") and _site_is_due(lists, store.releases(info.site), now)
         for info in store.sites()
+        for role in [site_role(info.site)]
     )
-
-
-def _is_laid_down(lists: SignedLists, site: str) -> bool:
-    """Whether a list waits that bears the names of enough keys."""
-    role = lists.site_roles().get(site_role(site))
-    return role is not None and lists.is_signed(role, lists.staged_path(site))
-
-
-def _take_staged(store: MapStore, repository: "ListRepository", site: str) -> None:
-    """Gives robots a list that the builder, or the last of several people, laid down, after the same judgement that robots make.
-
-    Raises StateError where the store does not have what it names.
-    """
-    if not _is_laid_down(repository.lists, site):
-        return
-    metadata, found = repository.staged(site), repository.lists.staged_list(site)
-    assert metadata is not None
-    assert found is not None
-    for entry in found.admitted:
-        info = store.version(site, entry.about.version)
-        if info.manifest_sha256 != entry.sha256:
-            raise StateError(
-                f"a list names version {info.version} of site {site} with bytes that the store does not have"
-            )
-        store.check_bytes(info)
-    repository.stage_site(site, metadata)
 
 
 def _online_is_due(lists: SignedLists, now: datetime) -> bool:
@@ -226,7 +271,7 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
     present = {"targets.json": lists.newest("targets")}
     for name, role in lists.site_roles().items():
         if newest := lists.newest(name):
-            # One that waits for other keys is named as before, or not at all.
+            # One that waits for another key is named as before, or not at all.
             number_now = newest if lists.is_signed(role) else named.get(f"{name}.json", 0)
             present |= {f"{name}.json": number_now} if number_now else {}
     return (
@@ -242,37 +287,28 @@ def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
     number, signed_by = lists.newest(role), lists.site_roles().get(role)
     if rows.current is None:
         return False
-    if signed_by is None:
+    if signed_by is None or not number or not lists.is_signed(signed_by):
         return True
-    wanted = admitted_versions(rows, signed_by.previous)
-    last = lists.site_list(rows.site, number) if number else None
-    if (
-        last is not None
-        and last.admitted == wanted
-        and is_fresh("site", last.expires, now)
-        and lists.is_signed(signed_by)
-    ):
-        return False
-    staged = lists.staged_list(rows.site)
-    return staged is None or staged.admitted != wanted or not is_fresh("site", staged.expires, now)
+    last = lists.site_list(rows.site, number)
+    return last.admitted != admitted_versions(rows) or not is_fresh("site", last.expires, now)
 
 
-def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> None:
+def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> int | None:
+    """The number of the list that was signed, None where none was due or the key is elsewhere."""
     lists, role = repository.lists, site_role(rows.site)
     if not _site_is_due(lists, rows, now):
-        return
+        return None
     if role not in lists.site_roles():
-        root = keys.signer("root")
-        if root is None:
-            return
+        root_key = keys.signer("root")
+        if root_key is None:
+            return None
         signer = keys.signer(role) or keys.make(role)
-        repository.delegate(rows.site, [signer.public_key], [root])
+        repository.delegate(rows.site, signer.public_key, root_key)
+    lists.check_site(lists.site_roles()[role])
     site_key = keys.signer(role)
     if site_key is None:
-        return
-    admitted = admitted_versions(rows, lists.site_roles()[role].previous)
+        return None
+    admitted = admitted_versions(rows)
     if number := lists.newest(role):
         _check_unchanged(rows.site, lists.site_list(rows.site, number), admitted)
-    signed = repository.sign_site(rows.site, admitted, [site_key])
-    if repository.stage_site(rows.site, signed):
-        _log.warning("the list of site %s waits for another signature: `mapserver trust sign %s`", rows.site, rows.site)
+    return repository.sign_site(rows.site, admitted, site_key)

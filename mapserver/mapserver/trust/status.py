@@ -2,11 +2,8 @@
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
 
-import msgspec
-
-from fleetmap.errors import StateError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.trust import site_role
 from mapserver.store import MapStore
 from mapserver.trust.authorities import Authorities
@@ -14,7 +11,7 @@ from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 
-# Days before its end at which a role is to be signed again: by people, who must meet; by the builder, every night; by the server.
+# Days before its end at which a role is to be signed again: by a person with the root key; by the server.
 _ENDS_SOON = {"root": 60, "targets": 30, "snapshot": 1, TIMESTAMP: 0.25}
 _SITE_ENDS_SOON = 7
 _CERTIFICATE_ENDS_SOON = 30
@@ -22,12 +19,10 @@ _CERTIFICATE_ENDS_SOON = 30
 
 @dataclass(frozen=True)
 class RoleStatus:
-    """One role. number: of its newest file, 0 where there is none; keys: how many may sign, of which `threshold` are needed."""
+    """One role. number: of its newest file, 0 where there is none."""
 
     role: str
     number: int
-    keys: int
-    threshold: int
     expires: str | None
     days_left: float | None
     fault: str = ""
@@ -50,28 +45,32 @@ def trust_status(store: MapStore) -> TrustStatus:
             f"{store.folder} has no signed lists; `mapserver trust init --store {store.folder}` makes them"
         )
     now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-    holders = _holders(lists)
-    for role, (keys, threshold) in holders.items():
-        found.roles.append(_role(lists, role, keys, threshold, now))
+    known = lists.site_roles()
+    for name in ("root", "targets", "snapshot", TIMESTAMP, *known):
+        found.roles.append(_role(lists, name, now))
     found.faults = [f"{status.role}: {status.fault}" for status in found.roles if status.fault]
+    try:
+        lists.check_root()
+        for signed_by in known.values():
+            lists.check_site(signed_by)
+    except UsageError as error:
+        found.faults.append(str(error))
     own = KeyFolder(store.folder / "keys")
     for info in store.sites():
         role = site_role(info.site)
-        signer = lists.site_roles().get(role)
-        if signer is not None and lists.newest(role) and not lists.is_signed(signer):
+        if role not in known:
+            if info.current_version is not None:
+                found.faults.append(f"site {info.site}: no key may sign its maps; `mapserver trust admit {info.site}`")
+            continue
+        if lists.newest(role) and not lists.is_signed(known[role]):
             found.faults.append(
-                f"{role}: a signature of its present keys is missing; `mapserver trust sign {info.site}`"
+                f"{role}: its list is not signed by its present key; look for {own.path(role)}, or name another: "
+                f"`mapserver trust admit {info.site}`"
             )
-        if lists.staged_path(info.site).is_file():
-            found.faults.append(f"{role}: a list waits for another signature; `mapserver trust sign {info.site}`")
-        if role not in holders and info.current_version is not None:
-            found.faults.append(f"site {info.site}: no key may sign its maps; `mapserver trust admit {info.site}`")
-        elif own.has(role) and holders.get(role, (1, 1))[1] == 1:
-            found.risks.append(f"{own.folder}/{role}.pem: who takes this machine can publish maps of {info.site}")
+        if own.has(role):
+            found.risks.append(f"{own.path(role)}: who takes this machine can publish maps of {info.site}")
     if own.has("root"):
-        found.risks.append(
-            f"{own.folder}/root.pem: who takes this machine can do everything, and nobody can take it back"
-        )
+        found.risks.append(f"{own.path('root')}: who takes this machine can do everything, and nobody can take it back")
     _look_at_certificates(RobotRegister(store).authorities, found)
     return found
 
@@ -87,24 +86,15 @@ def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
         found.risks.append(f"{authorities.folder}/servers-ca.pem: who takes this machine can play the server")
 
 
-def _holders(lists: SignedLists) -> dict[str, tuple[int, int]]:
-    """Number of keys and threshold by role, the top ones first."""
-    path = lists.path("root", lists.newest("root"))
-    signed: dict[str, Any] = msgspec.json.decode(path.read_bytes())["signed"]
-    held = {role: (len(entry["keyids"]), int(entry["threshold"])) for role, entry in signed["roles"].items()}
-    top = {role: held[role] for role in ("root", "targets", "snapshot", TIMESTAMP)}
-    return top | {name: (len(role.keyids), role.threshold) for name, role in lists.site_roles().items()}
-
-
-def _role(lists: SignedLists, role: str, keys: int, threshold: int, now: datetime) -> RoleStatus:
+def _role(lists: SignedLists, role: str, now: datetime) -> RoleStatus:
     number = lists.newest(role)
     if role == TIMESTAMP and lists.path(role, 0).is_file():
         number = lists.read(role).version
     if not number:
-        return RoleStatus(role, 0, keys, threshold, None, None, "nothing was signed yet")
+        return RoleStatus(role, 0, None, None, "nothing was signed yet")
     expires = lists.read(role).expires
     days_left = (expires - now).total_seconds() / 86_400
     fault = ""
     if days_left < _ENDS_SOON.get(role, _SITE_ENDS_SOON):
         fault = "expired: robots take no new map" if days_left <= 0 else f"ends in {days_left:.1f} days: sign it again"
-    return RoleStatus(role, number, keys, threshold, expires.isoformat(), round(days_left, 2), fault)
+    return RoleStatus(role, number, expires.isoformat(), round(days_left, 2), fault)

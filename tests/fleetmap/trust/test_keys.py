@@ -1,4 +1,4 @@
-"""Signatures: thresholds, duplicates, rotation, and delegation to the sites. Named after tuf-conformance."""
+"""Signatures: duplicates, rotation, delegation to the sites; thresholds, which servers of before may have. After tuf-conformance."""
 
 import json
 
@@ -14,12 +14,6 @@ def test_snapshot_does_not_meet_threshold(publisher: ListPublisher, robot: ListR
     publisher.publish("root", "snapshot", "timestamp")
     assert robot.refused(1).startswith("signature: ")
     assert robot.number("snapshot") is None
-
-
-def test_snapshot_has_too_few_keys(publisher: ListPublisher, robot: ListReader) -> None:
-    publisher.root.roles["snapshot"].threshold = 6
-    publisher.publish("root", "snapshot", "timestamp")
-    assert robot.refused(1).startswith("signature: ")
 
 
 @pytest.mark.parametrize("role", ["snapshot", ROLE])
@@ -49,18 +43,6 @@ def test_duplicate_keys_do_not_count_twice(publisher: ListPublisher, robot: List
     assert robot.refused(1).startswith("signature: ")
 
 
-def test_ecdsa_beside_ed25519(publisher: ListPublisher, robot: ListReader) -> None:
-    """A hardware token's key and a file's, both needed."""
-    token = CryptoSigner.generate_ecdsa()
-    publisher.targets.add_key(token.public_key, ROLE)
-    publisher.targets.delegations.roles[ROLE].threshold = 2
-    publisher.publish("targets", "snapshot", "timestamp")
-    assert robot.refused(1).startswith("signature: ")
-    publisher.keys[ROLE].append(token)
-    publisher.publish(ROLE, "snapshot", "timestamp")
-    assert robot.refused(1) == ""
-
-
 @pytest.mark.parametrize(
     ("old", "new", "signers", "is_good"),
     [
@@ -68,18 +50,14 @@ def test_ecdsa_beside_ed25519(publisher: ListPublisher, robot: ListReader) -> No
         ([1], [2], [1, 2], True),
         ([1], [2], [2], False),
         ([1], [2], [1], False),
-        ([1, 2, 3], [1, 2, 4], [1, 2], True),
-        ([1, 2, 3], [1, 2, 4], [2, 4], False),
         ([1, 2, 3], [1, 2, 4], [1, 3, 4], True),
-        ([1, 2, 3], [4, 5, 6], [1, 2, 4, 5], True),
-        ([1, 2, 3], [4, 5, 6], [4, 5, 6], False),
-        ([1, 2, 3], [1, 2, 3], [3], False),
+        ([1, 2, 3], [1, 2, 4], [2, 4], False),
     ],
 )
 def test_root_rotation(
     publisher: ListPublisher, robot: ListReader, old: list[int], new: list[int], signers: list[int], is_good: bool
 ) -> None:
-    """Two of three (or one of one) of the old root's people and of the new root's."""
+    """The key of the old root and of the new one; or two of three each, as servers of before may have."""
     people = {number: CryptoSigner.generate_ed25519() for number in range(1, 7)}
     begun, own = publisher.keys["root"], publisher.root.roles["root"]
     own.keyids.clear()

@@ -11,8 +11,9 @@ from cryptography.hazmat.primitives import serialization as s
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from fleetmap.errors import UsageError
-from mapserver.trust.authorities import Authorities, Authority, _pem
+from mapserver.trust.authorities import Authorities, Authority
 from mapserver.trust.http_certificate import HttpCertificate
+from mapserver.trust.keys import key_pem
 
 NOW = datetime.now(UTC)
 
@@ -28,7 +29,7 @@ def authority(tmp_path: Path) -> Authority:
 def write(folder: Path, certificate: bytes, key: ec.EllipticCurvePrivateKey) -> tuple[Path, Path]:
     paths = folder / "http.crt", folder / "http.pem"
     paths[0].write_bytes(certificate)
-    paths[1].write_bytes(_pem(key, None))
+    paths[1].write_bytes(key_pem(key, None))
     paths[1].chmod(0o600)
     return paths
 

@@ -1,13 +1,15 @@
 """What a store signs: after each release, before something expires, never what robots would refuse; and what the server tells robots."""
 
+import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from securesystemslib.signer import CryptoSigner
+from tuf.api.metadata import Metadata
 
 from fleetmap.errors import StateError, StoreError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
@@ -15,10 +17,10 @@ from mapserver import releases
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
-from mapserver.trust import KeyFolder, SignedLists, ceremonies, init_here, prepare_lists, update_lists
+from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, signing, update_lists
 from mapserver.trust.keys import load_key, make_passphrase, new_key, save_key
 from mapserver.trust.repository import ListRepository
-from mapserver.trust.signing import admitted_versions
+from mapserver.trust.signing import check_base
 from mapserver.trust.status import trust_status
 from support.storage.map_samples import save_sample_draft
 
@@ -83,36 +85,26 @@ def test_every_release_is_signed_at_once(store: MapStore) -> None:
     assert found.state("current").about.vocabulary == info.vocabulary_sha256
 
 
-def test_without_predecessors_a_rollback_needs_the_signer(store: MapStore) -> None:
-    publish(store, seed=2)
-    rows = store.releases("lab")
-    assert [entry.about.version for entry in admitted_versions(rows, 1)] == [1, 2]
-    assert [entry.about.version for entry in admitted_versions(rows, 0)] == [2]
-
-
 def test_robots_are_told_of_what_is_signed_alone(store: MapStore) -> None:
-    """The builder's key is elsewhere: what was published waits for it, and robots stay where they are."""
-    (store.folder / "keys" / "site-lab.pem").rename(store.folder / "elsewhere.pem")
-    (store.folder / "keys" / "root.pem").unlink()
+    """A process that cannot read the site's key: what was published waits for the server, and robots stay where they are."""
+    own = store.folder / "keys" / "site-lab.pem"
+    own.rename(store.folder / "elsewhere.pem")
     assert publish(store, seed=2) == 2
-    assert states(store) == {1: "current"}
-    assert told(store, 2) == 1
-    (store.folder / "elsewhere.pem").rename(store.folder / "keys" / "site-lab.pem")
+    assert (states(store), told(store, 2)) == ({1: "current"}, 1)
+    (store.folder / "elsewhere.pem").rename(own)
     update_lists(store)
     assert told(store, 2) == 2
 
 
 def test_nothing_is_told_before_the_first_list(tmp_path: Path, clock: Clock) -> None:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        save_sample_draft(store, seed=1)
-        releases.publish(store, "lab")
+        publish(store, seed=1)
         assert told(store, 1) == 1  # a store that is not signed serves as before
-        people = [CryptoSigner.generate_ed25519() for _ in range(3)]
-        online = KeyFolder(store.folder / "keys").make("online")
-        ListRepository(SignedLists(store.folder), datetime.now(UTC)).init(people, 2, online.public_key)
-        update_lists(store)
+        path, words = signing.init_offline(store, tmp_path / "stick")
         assert told(store, 1) is None
         assert trust_status(store).faults == ["site lab: no key may sign its maps; `mapserver trust admit lab`"]
+        signing.admit_site(store, "lab", load_key(path, words))
+        assert (told(store, 1), trust_status(store).faults) == (1, [])
 
 
 def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock) -> None:
@@ -151,25 +143,114 @@ def test_old_lists_are_removed_and_roots_are_not(store: MapStore) -> None:
     assert "1.root.json" in names
 
 
-def test_the_server_takes_no_list_that_robots_would_refuse(store: MapStore, clock: Clock) -> None:
-    """Of a thief with another key, with a number that was there, or under a root that one of two people signed."""
-    lists, thief = SignedLists(store.folder), CryptoSigner.generate_ed25519()
-    repository = ListRepository(lists, datetime.fromtimestamp(clock() / 1e9, UTC))
-    admitted = admitted_versions(store.releases("lab"), 1)
-    with pytest.raises(StateError, match="not signed as robots demand"):
-        repository.accept_site("lab", repository.sign_site("lab", admitted, [thief]))
-    own = KeyFolder(store.folder / "keys").signer("site-lab")
-    signed = repository.sign_site("lab", admitted, [own])
-    repository.accept_site("lab", signed)  # the control
-    with pytest.raises(StateError, match="3 is the next"):
-        repository.accept_site("lab", signed)
-    with pytest.raises(StateError, match="not signed"):
-        repository.delegate("lab", [thief.public_key], [thief])
-    with pytest.raises(StateError, match="not signed"):
-        repository.replace_online(thief.public_key, [thief])
-    with pytest.raises(StateError, match="not signed"):
-        repository.sign_online(thief)
-    assert lists.newest("root") == 1
+def test_another_key_than_the_root_key_changes_nothing(store: MapStore) -> None:
+    lists, thief = SignedLists(store.folder), new_key()
+    before = {path: path.read_bytes() for path in store.folder.glob("[kt]*/*.*")}
+    for act in (signing.rotate_online, signing.rotate_root):
+        with pytest.raises(StateError, match="is not the root key of"):
+            act(store, thief)
+    for act in (signing.admit_site, signing.revoke_site):
+        with pytest.raises(StateError, match="is not the root key of"):
+            act(store, "lab", thief)
+    repository = ListRepository(lists, datetime.fromtimestamp(store.now_ns() / 1e9, UTC))
+    for sign in (
+        lambda: repository.sign_site("lab", signing.admitted_versions(store.releases("lab")), thief),
+        lambda: repository.delegate("lab", thief.public_key, thief),
+        lambda: repository.replace_online(thief.public_key, thief),
+        lambda: repository.sign_online(thief),
+    ):
+        with pytest.raises(StateError, match="not signed as robots demand"):
+            sign()
+    assert {path: path.read_bytes() for path in store.folder.glob("[kt]*/*.*")} == before
+
+
+def test_the_root_key_goes_from_this_machine_to_a_stick(store: MapStore, tmp_path: Path) -> None:
+    keys, lists = KeyFolder(store.folder / "keys"), SignedLists(store.folder)
+    first = keys.signer("root")
+    path, words = signing.rotate_root(store, first, tmp_path / "stick")
+    assert (path.name, lists.newest("root"), keys.has("root")) == ("root-2.pem", 2, False)
+    with pytest.raises(StateError, match="is not the root key"):
+        signing.rotate_online(store, first)
+    own = load_key(path, words)
+    assert signing.rotate_root(store, own) is None  # the same key, for two more years
+    signing.rotate_online(store, own)
+    publish(store, seed=2)
+    assert (states(store), lists.newest("root")) == ({1: "previous", 2: "current"}, 4)
+    with pytest.raises(UsageError, match="no key may sign maps of site yard"):
+        signing.revoke_site(store, "yard", own)
+
+
+RETIRED = {
+    "threshold of the root": ("root", {"threshold": 2}, "2 keys must sign root; .* begin anew: .*trust init"),
+    "threshold of the targets": ("targets", {"threshold": 2}, "2 keys must sign targets; .* begin anew: .*trust init"),
+    "a token's root key": ("root", {"scheme": 1}, "a key of root is of the kind ecdsa, as PKCS#11 tokens have"),
+    "threshold of a site": (
+        "site",
+        {"threshold": 2},
+        "site lab: 2 keys must sign its lists, .*trust admit lab --key ROOT",
+    ),
+    "no predecessors": (
+        "site",
+        {"previous": 0},
+        "site lab: its lists admit no version but .*trust admit lab --key ROOT",
+    ),
+    "the site's key elsewhere": ("key", {}, r"site lab is not .*/site-lab.pem .*trust admit lab --key ROOT"),
+}
+
+
+@pytest.mark.parametrize(("what", "change", "words"), RETIRED.values(), ids=RETIRED)
+def test_what_earlier_fleetmaps_made_is_refused_by_name(
+    store: MapStore, caplog: pytest.LogCaptureFixture, what: str, change: dict[str, int], words: str
+) -> None:
+    """Several keys, tokens, a signing account: a server would be weaker than its owner set up, or could never sign again."""
+    lists, root_key = SignedLists(store.folder), KeyFolder(store.folder / "keys").signer("root")
+    prepare_lists(store, "tcp/127.0.0.1:0")  # the control
+    if what == "key":
+        (store.folder / "keys" / "site-lab.pem").unlink()
+    else:
+        path = lists.path("root", 1) if what != "site" else lists.path("targets", lists.newest("targets"))
+        document = json.loads(path.read_bytes())
+        signed = document["signed"]
+        role = signed["delegations"]["roles"][0] if what == "site" else signed["roles"][what]
+        if "scheme" in change:
+            signed["keys"][role["keyids"][0]] |= {"keytype": "ecdsa", "scheme": "ecdsa-sha2-nistp256"}
+        else:
+            role |= change
+        metadata = Metadata.from_dict(document)
+        metadata.sign(root_key)
+        path.write_bytes(metadata.to_bytes())
+    with pytest.raises(UsageError, match=words):
+        prepare_lists(store, "tcp/127.0.0.1:0")
+    if what != "key":
+        assert any(re.search(words, fault) for fault in trust_status(store).faults)
+    if what in ("root", "targets"):
+        with pytest.raises(UsageError, match=words):
+            signing.rotate_online(store, root_key)
+    publish(store, seed=2)
+    assert what == "root" or states(store) == {1: "current"}, "nothing weaker is signed"
+    if what == "key":
+        signing.admit_site(store, "lab", root_key)
+        prepare_lists(store, "tcp/127.0.0.1:0")
+        assert states(store) == {1: "previous", 2: "current"}
+
+
+def test_row_33_an_archive_swapped_in_the_database(store: MapStore) -> None:
+    """The next map would be built on it. A list named the right one, and none is signed that names the other."""
+    check_base(store, store.current("lab"))
+    other = store._blobs.put(b"another survey")
+    set_archive(store, other)
+    assert store.archive("lab", 1) == b"another survey"  # the control: the store believes its table
+    for act in (lambda: check_base(store, store.current("lab")), lambda: update_lists(store)):
+        with pytest.raises(StateError, match="names other bytes for version 1"):
+            act()
+    set_archive(store, None)  # as `gc` removes it
+    check_base(store, store.current("lab"))
+    update_lists(store)
+
+
+def set_archive(store: MapStore, sha256: str | None) -> None:
+    with store._transactions.write() as connection:
+        connection.execute("UPDATE versions SET archive_sha256 = ? WHERE version = 1", (sha256,))
 
 
 @pytest.mark.parametrize(
@@ -258,65 +339,6 @@ def test_one_sites_fault_does_not_stop_the_others(store: MapStore, clock: Clock)
     assert after == (before[0], before[1] + 1, before[2] + 1)
 
 
-def test_a_ceremony_that_cannot_be_finished_changes_no_key(store: MapStore) -> None:
-    people = [KeyFolder(store.folder / "keys").signer("root")]
-    before = (store.folder / "keys" / "site-lab.pem").read_bytes()
-    with pytest.raises(UsageError, match="--threshold 2"):
-        ceremonies.admit(store, "lab", [], people, threshold=2, previous=1)
-    assert (store.folder / "keys" / "site-lab.pem").read_bytes() == before
-    with pytest.raises(UsageError, match="holds no root key"):
-        ceremonies.rotate_root(store, people, removed=[new_key().public_key])
-    publish(store, seed=2)
-    assert states(store) == {1: "previous", 2: "current"}
-
-
-def test_a_list_that_waited_too_long_is_signed_anew(store: MapStore, clock: Clock) -> None:
-    """The first person's signature is of a list that is over when the second comes: robots would refuse it."""
-    people, (ada, bob) = [KeyFolder(store.folder / "keys").signer("root")], [new_key(), new_key()]
-    ceremonies.admit(store, "lab", [ada.public_key, bob.public_key], people, threshold=2, previous=1)
-    (store.folder / "keys" / "site-lab.pem").unlink()
-    publish(store, seed=2)
-    assert ceremonies.sign_site(store, "lab", ada) == 1
-    clock.now_ns += 15 * 24 * HOUR_NS
-    assert ceremonies.sign_site(store, "lab", bob) == 1, "it begins anew"
-    assert ceremonies.sign_site(store, "lab", ada) == 0
-    now = datetime.fromtimestamp(clock() / 1e9, UTC)
-    assert SignedLists(store.folder).served("lab").expires > now
-    # A list that was put back from a copy: its number was used meanwhile.
-    repository = ListRepository(SignedLists(store.folder), now)
-    publish(store, seed=3)
-    stale = repository.sign_site("lab", admitted_versions(store.releases("lab"), 1), [ada])
-    stale.signed.version -= 1
-    repository.lists.staged_path("lab").write_bytes(stale.to_bytes())
-    assert [ceremonies.sign_site(store, "lab", key) for key in (ada, bob)] == [1, 0]
-    assert states(store) == {2: "previous", 3: "current"}
-
-
-def test_an_expired_list_is_not_accepted(store: MapStore, clock: Clock) -> None:
-    repository = ListRepository(SignedLists(store.folder), datetime.fromtimestamp(clock() / 1e9, UTC))
-    key = KeyFolder(store.folder / "keys").signer("site-lab")
-    old = repository.sign_site("lab", admitted_versions(store.releases("lab"), 1), [])
-    old.signed.expires -= timedelta(days=15)
-    old.sign(key)
-    with pytest.raises(StateError, match="expired"):
-        repository.accept_site("lab", old)
-
-
-def test_a_site_that_waits_for_other_keys_is_no_reason_to_sign_every_second(store: MapStore, clock: Clock) -> None:
-    people, other = [KeyFolder(store.folder / "keys").signer("root")], new_key()
-    ceremonies.admit(store, "lab", [other.public_key], people, threshold=1, previous=1)
-    ceremonies.rotate_online(store, people)
-    (store.folder / "keys" / "site-lab.pem").unlink()
-    before = SignedLists(store.folder).read("timestamp").version
-    for _ in range(3):
-        clock.now_ns += 10**9
-        update_lists(store)
-    assert SignedLists(store.folder).read("timestamp").version == before
-    assert any("lab" in words and "signature" in words for words in trust_status(store).faults)
-    assert ceremonies.sign_site(store, "lab", other) == 0
-    assert states(store) == {1: "current"}
-
-
 def test_lists_of_a_clock_that_was_ahead_are_signed_anew(store: MapStore, clock: Clock) -> None:
     """Else a timestamp of that day would be believed for years, whoever shows it."""
     clock.now_ns += 3650 * 24 * HOUR_NS
@@ -349,14 +371,6 @@ def verify_with_link(store: MapStore, tmp_path: Path) -> list[str]:
     return store.verify().faults
 
 
-def test_a_key_does_not_close_a_folder_that_was_there(tmp_path: Path) -> None:
-    tmp_path.chmod(0o755)
-    save_key(tmp_path / "ada.pem", new_key(), None)
-    assert stat.S_IMODE(tmp_path.stat().st_mode) == 0o755
-    save_key(tmp_path / "made" / "ada.pem", new_key(), None)
-    assert stat.S_IMODE((tmp_path / "made").stat().st_mode) == 0o700
-
-
 def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> None:
     fleet = Fleet(store, clock_ns=clock)
     for robot, hours in (("r1", 0.5), ("r2", 31.0), ("r3", None)):
@@ -383,11 +397,3 @@ def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> N
     assert found["fleetmap_trust_faults"] == 3  # timestamp, snapshot, and the site's list
     (store.folder / "trust" / "timestamp.json").write_text("{")
     assert figures()["fleetmap_trust_faults"] == 1
-
-
-def test_a_stolen_server_can_publish_only_where_its_key_is_enough(store: MapStore) -> None:
-    assert "who takes this machine can publish maps of lab" in " ".join(trust_status(store).risks)
-    people, own = [KeyFolder(store.folder / "keys").signer("root")], KeyFolder(store.folder / "keys").signer("site-lab")
-    both = [own.public_key, new_key().public_key]
-    ceremonies.admit(store, "lab", both, people, threshold=2, previous=1)
-    assert "can publish maps" not in " ".join(trust_status(store).risks)

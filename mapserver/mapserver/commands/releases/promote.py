@@ -1,27 +1,19 @@
 """`mapserver publish`, `promote` and `rollback`: which version of a site is current."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.options import ActorOptions, BuilderKeys, SiteName, SiteOptions, StoreFolder
-
-
-@dataclass(frozen=True, kw_only=True)
-class DraftOptions(SiteOptions):
-    """A draft, and who built it."""
-
-    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None
-    keys: BuilderKeys = None
+from mapserver.commands.options import ActorOptions, SiteName, SiteOptions, StoreFolder
 
 
 @expand_options
 def publish(
     context: typer.Context,
-    where: DraftOptions,
+    where: SiteOptions,
     by: ActorOptions,
+    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None,
     trust: Annotated[
         bool,
         typer.Option(
@@ -41,23 +33,13 @@ def publish(
     from mapserver.quality.probes import lookalike_words
     from mapserver.releases import rules
     from mapserver.store import MapStore
-    from mapserver.trust.builder_folder import BuilderFolder
-    from mapserver.trust.signing import sign_as_builder
 
     gate = settings_of(context).gate
     with MapStore.open(where.store) as maps:
-        builder = None if where.keys is None else BuilderFolder(where.keys)
-        draft = rules.chosen_draft(maps.releases(where.site), where.version)
-        if builder is not None:
-            builder.check(draft)
-        if trust and (new := releases.trust_calibration(maps, draft, by.named())) != draft:
-            draft = new
-            if builder is not None:
-                builder.record(draft)
+        draft = rules.chosen_draft(maps.releases(where.site), version)
+        if trust:
+            draft = releases.trust_calibration(maps, draft, by.named())
         published = releases.publish(maps, where.site, draft.version, actor=by.named(), force=force, gate=gate)
-        if builder is not None:
-            builder.note_passed(where.site, published)
-            sign_as_builder(maps, builder, where.site)
         info = maps.version(where.site, published)
         verdict = maps.verdicts(where.site, published)[-1]
         evidence = maps.evidence(where.site, published)

@@ -18,20 +18,14 @@ def export(
     without_archive: Annotated[
         bool, typer.Option("--without-archive", help="Leave out the data that only later surveys need.")
     ] = False,
-    with_trust: Annotated[
-        bool, typer.Option("--with-trust", help="Write FILE.trust beside it: the signed lists, for `import --root`.")
-    ] = False,
 ) -> None:
     """Write a version into FILE, which `mapserver import` takes into another store."""
     if file.is_dir() or not file.parent.is_dir():
         raise UsageError(f"{file}: name a file in a folder that exists")
     from mapserver.store import MapStore
-    from mapserver.trust.carried_lists import carry_lists
 
     with MapStore.open(store, read_only=True) as maps:
         version = version_named(maps, site, version)
-        if with_trust:
-            carry_lists(maps.folder, site, file)
         size = maps.export_version(site, version, file, archive=not without_archive)
     typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
 
@@ -41,19 +35,10 @@ def import_(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File that `mapserver export` wrote.")],
     store: NewStoreFolder,
     by: ActorOptions,
-    root: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="1.root.json", help="The sender's root: refuse what the lists in FILE.trust do not admit."
-        ),
-    ] = None,
 ) -> None:
     """Take the version in FILE into a store, as a draft of its site under its own number."""
     from mapserver.store import MapStore
-    from mapserver.trust.carried_lists import check_carried
 
-    if root is not None:
-        check_carried(file, root)
     with MapStore.open(store, create=True) as maps:
         info = maps.import_version(file, actor=by.named())
     typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")

@@ -1,28 +1,25 @@
-"""`mapserver trust`: who may sign maps, and what is signed."""
+"""`mapserver trust`: which keys sign maps, and what is signed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import Group, expand_options
+from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError
 from mapserver.commands.options import Json, StoreFolder, print_json
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
-    from mapserver.trust.keys import PublicKey, Signer
+    from mapserver.trust.keys import Signer
 
-KeyFiles = Annotated[
-    list[str] | None,
-    typer.Option(metavar="FILE|URI", help="Key of a person, asked for its passphrase or PIN; repeat it."),
-]
-PublicKeys = Annotated[
-    list[str] | None,
-    typer.Option(metavar="FILE.pub|URI", help="Public key that signs the site's lists; default: a new one in keys/."),
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="The root key, asked for its passphrase; default: root.pem in keys/ of the store."
+    ),
 ]
 Hosts = Annotated[
     list[str] | None,
@@ -40,29 +37,13 @@ class Rotated(StrEnum):
     ROBOTS_CA = "robots-ca"
 
 
-@dataclass(frozen=True, kw_only=True)
-class PeopleOptions:
-    """Whose keys are here."""
-
-    store: StoreFolder
-    key: KeyFiles = None
-
-    def load(self, maps: "MapStore") -> "list[Signer]":
-        """The keys: the files named, each asked for its passphrase, else the one that `init --here` left in the store."""
-        from mapserver.trust import KeyFolder
-
-        root = None if self.key else KeyFolder(maps.folder / "keys").signer("root")
-        return [root] if root is not None else [_asked(path) for path in self.key or ()]
-
-
 def init(
     store: StoreFolder,
     here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
     stick: Annotated[
-        list[str] | None,
-        typer.Option(metavar="DIR|URI", help="Folder for one root key, or a key on a token; repeat it."),
+        list[Path] | None,
+        typer.Option(metavar="DIR", help="Folder for the root key, such as a stick, which this machine then lacks."),
     ] = None,
-    threshold: Annotated[int, typer.Option(min=1, help="How many root keys are needed for a change.")] = 2,
     host: Hosts = None,
 ) -> None:
     """Make the keys of a store: its maps are signed from now on, and its server can tell robots apart by certificates."""
@@ -70,96 +51,44 @@ def init(
 
     from mapserver.store import MapStore
     from mapserver.trust import SignedLists, init_here
-    from mapserver.trust.ceremonies import init_with_people
     from mapserver.trust.enrolment import RobotRegister
-    from mapserver.trust.keys import TOKEN_SCHEME, make_passphrase
+    from mapserver.trust.keys import make_passphrase
+    from mapserver.trust.signing import init_offline
 
     if here == bool(stick):
+        raise UsageError("say where the root key is: --here for this machine, or --stick DIR for a folder of its own")
+    if stick and len(stick) > 1:
         raise UsageError(
-            "say where the keys are: --here for this machine, or --stick DIR for every person who holds a root key"
+            f"--stick names {len(stick)} folders, and there is one root key; name one, and copy the key yourself"
         )
-    sticks, hosts = (
-        [Path(name) for name in stick or () if not name.startswith(TOKEN_SCHEME)],
-        host or [socket.gethostname()],
-    )
-    if not here and not sticks:
-        raise UsageError("name a folder too: the servers' authority, servers-ca.pem, is no key for a token")
-    tokens = [_asked(name) for name in stick or () if name.startswith(TOKEN_SCHEME)]
+    folder, hosts, made = _not_a_token(stick[0]) if stick else None, host or [socket.gethostname()], []
     with MapStore.open(store) as maps:
-        authorities, passphrases = RobotRegister(maps).authorities, {}
+        authorities = RobotRegister(maps).authorities
         # A store that was served on loopback has lists already, and no certificates.
         if authorities.are_there or not SignedLists(maps.folder).are_there:
-            passphrases = {} if here else init_with_people(maps, sticks, threshold, tokens)
-            if here:
+            if folder is None:
                 init_here(maps)
-        path, words = (None, None) if here else (sticks[0] / "servers-ca.pem", make_passphrase())
+            else:
+                made.append(init_offline(maps, folder))
+        path, words = (None, None) if folder is None else (folder / "servers-ca.pem", make_passphrase())
         authorities.init(hosts, path, words)
-        passphrases |= {path: words} if path is not None and words is not None else {}
-    for file, passphrase in passphrases.items():
-        typer.echo(f"{file}: {passphrase}   (shown once: write it down, apart from the stick)")
+        made += [(path, words)] if path is not None and words is not None else []
+    for file, passphrase in made:
+        _show(file, passphrase)
     typer.echo(f"robots reach the server by the name {', '.join(hosts)}; --host names others")
     typer.echo(f"serve with --zenoh tls/0.0.0.0:7447; `mapserver robots enrol ROBOT --site SITE --store {store}`")
 
 
-def key(
-    file: Annotated[Path, typer.Argument(metavar="FILE.pem", help="File to write; FILE.pub is written beside it.")],
-) -> None:
-    """Make a key for a person who signs maps of a site; prints its passphrase once."""
-    from mapserver.trust.ceremonies import make_key_file
-    from mapserver.trust.keys import make_passphrase
-
-    passphrase = make_passphrase()
-    make_key_file(file, passphrase)
-    typer.echo(f"{file}: {passphrase}   (shown once: write it down)")
-
-
-@expand_options
-def admit(
-    site: SiteArgument,
-    people: PeopleOptions,
-    public: PublicKeys = None,
-    threshold: Annotated[int, typer.Option(min=1, help="How many of the site's keys must sign.")] = 1,
-    previous: Annotated[
-        int, typer.Option(min=0, max=1, help="Predecessors that stay admitted; with 0 a rollback needs a signature.")
-    ] = 1,
-) -> None:
-    """Name the keys that sign the lists of SITE, in the place of those that did."""
+def admit(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
+    """Make a key of this server that signs the lists of SITE, in the place of the one that did."""
     from mapserver.store import MapStore
-    from mapserver.trust import ceremonies
+    from mapserver.trust.signing import admit_site
 
-    with MapStore.open(people.store) as maps:
-        keys = [_public(path) for path in public or ()]
-        ceremonies.admit(maps, site, keys, people.load(maps), threshold=threshold, previous=previous)
-    typer.echo(f"site {site}: {max(1, len(keys))} keys may sign, {threshold} must")
-
-
-@expand_options
-def sign(site: SiteArgument, people: PeopleOptions) -> None:
-    """Show what the list of SITE would admit, and add a signature to it."""
-    from mapserver import releases
-    from mapserver.store import MapStore
-    from mapserver.trust import SignedLists
-    from mapserver.trust.ceremonies import sign_site
-
-    if not people.key:
-        raise UsageError("name the key that signs: --key FILE")
-    with MapStore.open(people.store) as maps:
-        rows, before = maps.releases(site), SignedLists(maps.folder).served(site)
-        served = None if before is None else before.state("current")
-        if rows.current is not None and served is not None and served.about.version != rows.current.version:
-            changed = releases.difference(maps, site, served.about.version, rows.current.version)
-            tiles = (
-                f"{changed.tiles_added} tiles added, {changed.tiles_removed} removed, {changed.tiles_changed} changed"
-            )
-            typer.echo(f"site {site}: version {served.about.version} becomes {rows.current.version}, {tiles}")
-            for verdict in maps.verdicts(site, rows.current.version)[-1:]:
-                typer.echo(f"the gate: {'; '.join(verdict.reasons) or 'accepted'}")
-        for path in people.key:
-            missing = sign_site(maps, site, _asked(path))
-    typer.echo(f"site {site}: {f'{missing} more signatures are needed' if missing else 'robots get it now'}")
+    with MapStore.open(store) as maps:
+        admit_site(maps, site, _root_key(maps, key))
+    typer.echo(f"site {site}: its lists are signed by this server's new key")
 
 
-@expand_options
 def rotate(
     what: Annotated[
         Rotated,
@@ -168,13 +97,10 @@ def rotate(
             "robots-ca: who signs robots."
         ),
     ],
-    people: PeopleOptions,
-    add: Annotated[
-        str | None,
-        typer.Option(metavar="DIR|URI", help="Folder for the root key of a person who comes, or a key on a token."),
-    ] = None,
-    remove: Annotated[
-        str | None, typer.Option(metavar="FILE.pub|URI", help="Public key of a person who leaves.")
+    store: StoreFolder,
+    key: KeyFile = None,
+    stick: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Of root: folder for another root key, in the place of this one.")
     ] = None,
     host: Hosts = None,
     stolen: Annotated[
@@ -182,64 +108,50 @@ def rotate(
     ] = False,
 ) -> None:
     """Replace keys, or sign root and targets anew before they expire."""
-    if what in {Rotated.SERVER, Rotated.ROBOTS_CA}:
-        if add or remove or (host and what is Rotated.ROBOTS_CA) or (stolen and what is Rotated.SERVER):
-            raise UsageError(
-                "--host is for `trust rotate server`, --stolen for `trust rotate robots-ca`, --add for root"
-            )
-        _rotate_certificates(what, people, host or (), is_stolen=stolen)
-        return
-    if host or stolen:
-        raise UsageError("--host is for `trust rotate server`, --stolen for `trust rotate robots-ca`")
+    if (stick and what is not Rotated.ROOT) or (host and what is not Rotated.SERVER):
+        raise UsageError("--stick is for `trust rotate root`, --host for `trust rotate server`")
+    if stolen and what is not Rotated.ROBOTS_CA:
+        raise UsageError("--stolen is for `trust rotate robots-ca`")
     from mapserver.store import MapStore
-    from mapserver.trust import ceremonies
-    from mapserver.trust.keys import TOKEN_SCHEME
+    from mapserver.trust import signing
 
-    if what is Rotated.ONLINE and (add or remove):
-        raise UsageError("--add and --remove are for `trust rotate root`")
-    with MapStore.open(people.store) as maps:
-        signers = people.load(maps)
+    with MapStore.open(store) as maps:
+        if what in {Rotated.SERVER, Rotated.ROBOTS_CA}:
+            _rotate_certificates(maps, what, key, host or (), is_stolen=stolen)
+            return
+        root_key = _root_key(maps, key)
         if what is Rotated.ONLINE:
-            ceremonies.rotate_online(maps, signers)
-        else:
-            removed = [] if remove is None else [_public(remove)]
-            comes = None if add is None else _asked(add) if add.startswith(TOKEN_SCHEME) else Path(add)
-            for path, passphrase in ceremonies.rotate_root(maps, signers, removed=removed, add=comes).items():
-                typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
+            signing.rotate_online(maps, root_key)
+        elif made := signing.rotate_root(maps, root_key, None if stick is None else _not_a_token(stick)):
+            _show(*made)
     typer.echo("done; robots follow with their next question")
 
 
-def _rotate_certificates(what: Rotated, people: PeopleOptions, hosts: Sequence[str], *, is_stolen: bool) -> None:
-    import getpass
-
-    from mapserver.store import MapStore
+def _rotate_certificates(
+    maps: "MapStore", what: Rotated, key: Path | None, hosts: Sequence[str], *, is_stolen: bool
+) -> None:
     from mapserver.trust.enrolment import RobotRegister
 
-    with MapStore.open(people.store) as maps:
-        register = RobotRegister(maps)
-        _ = register.tls  # raises where there is nothing to rotate
-        if what is Rotated.SERVER:
-            path = Path(people.key[0]) if people.key else None
-            words = None if path is None else getpass.getpass(f"passphrase of {path}: ").strip()
-            register.authorities.rotate_server(path, words, hosts)
-            typer.echo("done; a server that runs takes it within two seconds")
-            return
-        register.authorities.rotate_robots_ca(is_stolen=is_stolen)
-        if is_stolen:
-            typer.echo(f"done; {register.revoke_all()} robots must be enrolled again")
-        else:
-            typer.echo("done; robots follow when they renew their certificates, within a month")
+    register = RobotRegister(maps)
+    _ = register.tls  # raises where there is nothing to rotate
+    if what is Rotated.SERVER:
+        register.authorities.rotate_server(key, None if key is None else _passphrase(key), hosts)
+        typer.echo("done; a server that runs takes it within two seconds")
+        return
+    register.authorities.rotate_robots_ca(is_stolen=is_stolen)
+    if is_stolen:
+        typer.echo(f"done; {register.revoke_all()} robots must be enrolled again")
+    else:
+        typer.echo("done; robots follow when they renew their certificates, within a month")
 
 
-@expand_options
-def revoke(site: SiteArgument, people: PeopleOptions, public: PublicKeys = None) -> None:
+def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
     """Replace the keys of SITE and the server's together, after a theft of the key that signs its maps."""
     from mapserver.store import MapStore
-    from mapserver.trust import ceremonies
+    from mapserver.trust.signing import revoke_site
 
-    with MapStore.open(people.store) as maps:
-        keys = [_public(path) for path in public or ()]
-        ceremonies.revoke_site(maps, site, keys, people.load(maps))
+    with MapStore.open(store) as maps:
+        revoke_site(maps, site, _root_key(maps, key))
     typer.echo(f"site {site}: the old keys sign nothing any more; robots follow with their next question")
 
 
@@ -256,10 +168,10 @@ def status(store: StoreFolder, json: Json = False) -> None:
     if json:
         print_json(found)
     else:
-        table = Table("role", "number", "keys", "needed", "days left", "")
+        table = Table("role", "number", "days left", "")
         for role in found.roles:
             left = "" if role.days_left is None else f"{role.days_left:.1f}"
-            table.add_row(role.role, str(role.number), str(role.keys), str(role.threshold), left, role.fault)
+            table.add_row(role.role, str(role.number), left, role.fault)
         console = plain_console()
         console.print(table)
         for words in found.risks:
@@ -270,34 +182,35 @@ def status(store: StoreFolder, json: Json = False) -> None:
         raise typer.Exit(1)
 
 
-def _asked(path: str) -> "Signer":
-    """A key by its file or on a token."""
+def _root_key(maps: "MapStore", path: Path | None) -> "Signer":
+    from mapserver.trust.keys import KeyFolder, load_key
+
+    if path is not None:
+        return load_key(_not_a_token(path), _passphrase(path))
+    keys = KeyFolder(maps.folder / "keys")
+    root = keys.signer("root")
+    if root is None:
+        raise UsageError(f"{keys.path('root')} is not there; name the file of the root key by --key")
+    return root
+
+
+def _not_a_token(path: Path) -> Path:
+    if str(path).startswith("pkcs11:"):
+        raise UsageError(f"{path}: keys on PKCS#11 tokens are no longer supported; the root key is a file on a stick")
+    return path
+
+
+def _passphrase(path: Path) -> str:
     import getpass
 
-    from mapserver.trust.keys import TOKEN_SCHEME, load_key
-
-    if path.startswith(TOKEN_SCHEME):
-        from mapserver.trust.tokens import token_signer
-
-        return token_signer(path, getpass.getpass)
-    return load_key(Path(path), getpass.getpass(f"passphrase of {path}: ").strip())
+    return getpass.getpass(f"passphrase of {path}: ").strip()
 
 
-def _public(path: str) -> "PublicKey":
-    """A public key by its file or on a token."""
-    import getpass
-
-    from mapserver.trust.ceremonies import public_key
-    from mapserver.trust.keys import TOKEN_SCHEME
-
-    if path.startswith(TOKEN_SCHEME):
-        from mapserver.trust.tokens import token_public_key
-
-        return token_public_key(path, getpass.getpass)
-    return public_key(Path(path))
+def _show(path: Path, passphrase: str) -> None:
+    typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
 
 
 TRUST = Group(
-    "Who may sign maps, and what is signed.",
-    {"init": init, "key": key, "admit": admit, "sign": sign, "rotate": rotate, "revoke": revoke, "status": status},
+    "Which keys sign maps, and what is signed.",
+    {"init": init, "admit": admit, "rotate": rotate, "revoke": revoke, "status": status},
 )
