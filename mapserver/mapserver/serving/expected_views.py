@@ -70,7 +70,7 @@ class SurfelChanges:
         if self._most is not None and len(surfels.exposures) > self._most:
             raise StateError(
                 f"version {version} of site {site} was seen from {len(surfels.exposures)} places, more than are compared here: "
-                "use `mapserver map changes BEFORE AFTER FILE --site {site}` on the server"
+                f"use `mapserver map changes BEFORE AFTER FILE --site {site}` on the server"
             )
         return SeenSite(surfels, 0.5 * min(camera.width_px, camera.height_px) / camera.focal_px)
 
