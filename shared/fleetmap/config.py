@@ -21,6 +21,10 @@ _OF_POSES = (
     "`--trajectory-frame camera|body` says whose poses they are"
 )
 _ONE_KEY = "one root key and one key a site sign now, each of them a file (docs/security.md); delete the key"
+_OF_PEOPLE = (
+    "a proxy that signs people in, such as oauth2-proxy, stands in front: `--sign-in-proxy ADDRESS --sign-in-group GROUP=ROLE`; "
+    "docs/security.md shows it"
+)
 RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "walls": "`mapserver align --pin ...` replaces it; delete the key",
@@ -40,6 +44,10 @@ RETIRED = {  # keys of files, and options of commands with _ for -; what replace
         "no lists go with an export: an imported version is a draft that you judge; delete the key",
     ),
     "witness": "`mapserver audit --verify` checks the log by itself; delete the key",
+    **{
+        f"oidc_{item}": _OF_PEOPLE
+        for item in ["issuer", "client", "secret", "group", "groups_claim", "name_claim", "scope"]
+    },
     **dict.fromkeys(("vocabulary", "train_vocabulary"), "maps use the vocabulary that ships with fleetmap; delete it"),
 }
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.

@@ -22,17 +22,16 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapserver.api.problems import problem
-from mapserver.operators.openid import WAIT_S, Provider
 from mapserver.operators.operators import LIFE_S, Operators
-from mapserver.operators.roles import PROVIDER_PREFIX, Identity
+from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
+from mapserver.operators.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.store import Actor
 
 _log = logging.getLogger(__name__)
 
 SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
-PROVIDER, PROVIDER_BACK = "/sign-in/provider", "/sign-in/provider/back"
-_OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, PROVIDER, PROVIDER_BACK}
+_OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT}
 _SOCKET = "/_nicegui_ws/"
 _LEVEL = 5
 _SCRIPT = re.compile(rb"<script\b(?![^>]*\bnonce=)")
@@ -52,7 +51,7 @@ class GuardSettings:
 
     names: host names that it goes by, beside localhost and addresses. operators: who may sign in; None: those of the application's store.
     must_sign_in: also before anybody is named. handlers: code of the event handlers in its pages. warning: a sentence for every page.
-    provider: where people may sign in, too; None: by passwords alone.
+    proxy: who signs people in in front of the server, too; None: passwords alone.
     """
 
     names: frozenset[str] = frozenset()
@@ -60,7 +59,7 @@ class GuardSettings:
     must_sign_in: bool = False
     handlers: tuple[str, ...] = ()
     warning: str = ""
-    provider: Provider | None = None
+    proxy: SignInProxy | None = None
 
     @property
     def is_sign_in_on(self) -> bool:
@@ -74,8 +73,7 @@ class GuardSettings:
         headers = _headers(scope)
         session = cookie_parser(headers.get("cookie", "")).get(cookie_name(scope), "")
         who = self.operators.identify(session, headers.get("authorization", ""), address_of(scope), uses=uses)
-        # Without the provider nobody vouches for its people any more.
-        return None if who and self.provider is None and who.name.startswith(PROVIDER_PREFIX) else who
+        return who or (None if self.proxy is None else self.proxy.identify(scope, address_of(scope)))
 
     def acting(self, request: Request, typed: str, reason: str) -> Actor:
         """Who acts by a page that was opened with `request`, asked anew; typed: the name where nobody signs in.
@@ -119,17 +117,6 @@ def set_session(response: Response, scope: Scope, session: str) -> None:
     """Gives a browser its session; an empty one takes it away."""
     secure, age_s = _is_secure(scope), LIFE_S if session else 0
     response.set_cookie(cookie_name(scope), session, age_s, secure=secure, httponly=True, samesite="strict", path="/")
-
-
-def set_waiting(response: Response, scope: Scope, secret: str) -> None:
-    """Marks the browser that goes to the provider; an empty secret takes the mark away. Lax: it comes back from elsewhere."""
-    secure, age_s = _is_secure(scope), WAIT_S if secret else 0
-    response.set_cookie(waiting_name(scope), secret, age_s, secure=secure, httponly=True, samesite="lax", path="/")
-
-
-def waiting_name(scope: Scope) -> str:
-    """The name of that mark's cookie."""
-    return f"{cookie_name(scope)}-waiting"
 
 
 def address_of(scope: Scope) -> str:
@@ -208,6 +195,10 @@ class Guard:
         if right is None or not self._settings.is_sign_in_on:
             return None
         who = self._settings.identify(scope)
+        if who is None and (name := proxied_name(scope)):
+            return _refuse(
+                scope, 403, f"none of the groups of {name} has a role here; --sign-in-group gives one a role"
+            )
         if who is None:
             if scope["type"] == "http" and scope["method"] == "GET" and _wants_page(scope):
                 asked = scope["path"] + (f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else "")

@@ -75,7 +75,7 @@ def time_range(since: str | None, until: str | None) -> tuple[int | None, int | 
 async def known_parameters(request: HTTPConnection) -> None:
     """Refuses query parameters that an address of the API does not know, for a filter that is not applied gives a wrong answer.
 
-    Pages answer for theirs themselves: what a sign-in provider sends back with a browser is its own affair.
+    Pages answer for theirs themselves.
     """
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute) or not route.include_in_schema:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.oidc_options import OidcOptions
 from mapserver.commands.options import StoreFolder
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from mapserver.api.guard import GuardSettings
     from mapserver.config import MapserverConfig
     from mapserver.fleet.fleet import Fleet
-    from mapserver.operators.openid import Provider
+    from mapserver.operators.sign_in_proxy import SignInProxy
     from mapserver.serving.bus_access import BusGuard
     from mapserver.serving.http_connections import BoundedListener
     from mapserver.store import MapStore
@@ -33,6 +32,7 @@ _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
 _WARN_EVERY_S = 86_400.0
 _VIEW_EVERY_S = 0.5
+_LOOPBACK = frozenset({"127.0.0.1", "::1"})
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
 )
@@ -41,7 +41,7 @@ _NO_TLS = "This server was started with --insecure. Passwords and sessions can b
 
 
 @dataclass(frozen=True, kw_only=True)
-class HttpOptions(OidcOptions):
+class HttpOptions:
     """Where HTTP is served, and by which names; and where viewers look at a site."""
 
     http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
@@ -51,6 +51,12 @@ class HttpOptions(OidcOptions):
     http_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM key of --http-cert.")] = None
     http_name: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Host name that a proxy passes on; repeat it.")
+    ] = None
+    sign_in_proxy: Annotated[
+        list[str] | None, typer.Option(metavar="ADDRESS", help="Proxy that signs people in, by address; repeat it.")
+    ] = None
+    sign_in_group: Annotated[
+        list[str] | None, typer.Option(metavar="GROUP=ROLE", help="Role of a group that the proxy names; repeat it.")
     ] = None
     insecure: Annotated[
         bool,
@@ -111,8 +117,19 @@ class HttpOptions(OidcOptions):
             return None
         return HttpCertificate(self.http_cert, self.http_key)
 
+    def load_proxy(self) -> "SignInProxy | None":
+        """The proxy that signs people in, None without one; UsageError as `SignInProxy.of`, and for half of the two options."""
+        from fleetmap.errors import UsageError
+        from mapserver.operators.sign_in_proxy import SignInProxy
+
+        if self.sign_in_proxy:
+            return SignInProxy.of(self.sign_in_proxy, self.sign_in_group or ())
+        if self.sign_in_group:
+            raise UsageError("--sign-in-group belongs to --sign-in-proxy ADDRESS; name the proxy by it")
+        return None
+
     def guard(
-        self, store: "MapStore", certificate: "HttpCertificate | None", provider: "Provider | None", warning: str
+        self, store: "MapStore", certificate: "HttpCertificate | None", proxy: "SignInProxy | None", warning: str
     ) -> "GuardSettings":
         """Who is let in. warning: about something else, for every page.
 
@@ -124,7 +141,7 @@ class HttpOptions(OidcOptions):
         from mapserver.operators.operators import Operators
 
         given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
-        has_operators = provider is not None or store.operators.may_sign_in()
+        has_operators = proxy is not None or store.operators.may_sign_in()
         fault = binding_fault(
             HttpBinding(
                 address=self.http,
@@ -142,10 +159,10 @@ class HttpOptions(OidcOptions):
         return GuardSettings(
             names=frozenset(names),
             operators=Operators(store),
-            must_sign_in=provider is not None or (not fault and not is_loopback_name(host)),
+            must_sign_in=proxy is not None or (not fault and not is_loopback_name(host)),
             handlers=HANDLERS,
             warning=(_NO_TLS if has_operators else _INSECURE) if fault else warning,
-            provider=provider,
+            proxy=proxy,
         )
 
 
@@ -173,19 +190,20 @@ def serve(
     from mapserver.store import MapStore
     from mapserver.trust import prepare_lists
 
-    certificate, provider, settings = at.load_certificate(), at.load_provider(), settings_of(context)
+    certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
+    proxies = (_LOOPBACK if at.http_name else frozenset()) | (proxy.addresses if proxy else frozenset())
     with (
-        _listening(host, port, is_behind_proxy=bool(at.http_name)) as listener,
+        _listening(host, port, proxies) as listener,
         at.viewers() as viewers,
         MapStore.open(store) as maps,
     ):
         shown = None if viewers is None else _Shown(viewers, at.viewed_site(maps))
-        guard = at.guard(maps, certificate, provider, _OPEN_BUS if is_open else "")
+        guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:
-            http = _Http(listener, guard, certificate, bool(at.http_name), shown)
+            http = _Http(listener, guard, certificate, proxies, shown)
             _run(maps, (bus, robots), http, settings)
     _end_process()
 
@@ -212,7 +230,7 @@ class _Http(NamedTuple):
     listener: "BoundedListener"
     guard: "GuardSettings"
     certificate: "HttpCertificate | None"
-    is_behind_proxy: bool
+    proxies: frozenset[str]
     shown: _Shown | None
 
 
@@ -225,6 +243,7 @@ def _run(
     from contextlib import asynccontextmanager
 
     import uvicorn
+    from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
     from fleetmap.log_lines import log_to_stderr
     from fleetmap.threads import ended_by_threads
@@ -234,6 +253,7 @@ def _run(
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
+    from mapserver.operators.sign_in_proxy import ProxiedPeople
     from mapserver.serving.background_tasks import (
         BackgroundTask,
         admission_tasks,
@@ -284,8 +304,10 @@ def _run(
     api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
+    # Around the middleware that puts the client's address in the place of the proxy's.
+    served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(http.proxies)), http.guard.proxy)  # type: ignore[arg-type]
     config = uvicorn.Config(
-        app,
+        served,
         loop="asyncio",  # uvloop would not ask the listener
         http="h11",  # httptools takes heads of any size
         h11_max_incomplete_event_size=MAX_HEAD_BYTES,
@@ -295,8 +317,7 @@ def _run(
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
         ws_max_size=MAX_BODY_BYTES,
-        # Where no proxy is named, anybody on this machine could write another address into the log.
-        proxy_headers=http.is_behind_proxy,
+        proxy_headers=False,
         ssl_certfile=None if http.certificate is None else http.certificate.certificate,
         ssl_keyfile=None if http.certificate is None else http.certificate.key,
     )
@@ -346,13 +367,13 @@ def _bound_the_end(fleet: "Fleet") -> None:
     bound.start()
 
 
-def _listening(host: str, port: int, *, is_behind_proxy: bool) -> "BoundedListener":
+def _listening(host: str, port: int, proxies: frozenset[str]) -> "BoundedListener":
     import socket
 
     from fleetmap.errors import UsageError
     from mapserver.serving.http_connections import BACKLOG, BoundedListener
 
-    listener = BoundedListener(socket.AF_INET6 if ":" in host else socket.AF_INET, is_behind_proxy=is_behind_proxy)
+    listener = BoundedListener(socket.AF_INET6 if ":" in host else socket.AF_INET, proxies)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))

@@ -249,6 +249,8 @@ def _person(request: Request) -> Markup:
     who = getattr(request.state, "operator", None)
     if who is None:
         return Markup("")
+    if not who.proof:  # signed in by a proxy, which has its own way out
+        return Markup('<span class="quiet">{} ({})</span>').format(who.name, who.role)
     return Markup(
         '<form method="post" action="{}"><span class="quiet">{} ({})</span> <button class="plain" type="submit">Sign out</button></form>'
     ).format(SIGN_OUT, who.name, who.role)

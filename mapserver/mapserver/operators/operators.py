@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from argon2 import PasswordHasher
 
-    from mapserver.operators.openid import Person
-
 IDLE_S, LIFE_S = 3600, 12 * 3600
 TRIES, TRY_EVERY_S = 5, 12
 ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = (
@@ -113,13 +111,6 @@ class Operators:
         )
         return SignIn(session)
 
-    def sign_in_by_provider(self, person: "Person", address: str) -> SignIn:
-        """A session for whom the provider has just vouched, with the role of there; a refusal for who is disabled here."""
-        who = Actor(person.name, f"subject {person.subject}", person.name, address)
-        if not self._store.operators.admit(person.name, person.role, who):
-            return SignIn(refusal=f"{person.name} is disabled here; an administrator can change that.")
-        return self._begin(who)
-
     def sign_out(self, who: Identity) -> None:
         """Ends the session that a request came with."""
         if who.proof:
@@ -152,7 +143,7 @@ class Operators:
         row = self._store.operators.token(_digest(token))
         if row is None or row.ends_ns <= self._now_ns():
             return None
-        return Identity(row.name, row.role, SCOPES[row.role] & set(row.scopes.split()), address)
+        return Identity(row.name, row.role, SCOPES[row.role] & set(row.scopes.split()), address, is_token=True)
 
 
 def _is_within(age_ns: int, most_s: float) -> bool:

@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from mapserver.store import Actor
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
-# In front of the names of people who sign in at a provider: no name of ours has a colon.
-PROVIDER_PREFIX = "oidc:"
 
 
 class Scope(StrEnum):
@@ -44,19 +42,20 @@ SCOPES: dict[str, frozenset[Scope]] = {
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who sends a request, as a session or a token has proved it. proof: the hash of a session, empty for a token."""
+    """Who sends a request, as a session, a token or a proxy has proved it. proof: the hash of a session, empty without one."""
 
     name: str
     role: str
     scopes: frozenset[str]
     address: str
     proof: str = ""
+    is_token: bool = False
 
     def actor(self, reason: str = "") -> "Actor":
         """As the store keeps who acts."""
         from mapserver.store import Actor
 
-        return Actor(self.name, reason, self.name if self.proof else f"token of {self.name}", self.address)
+        return Actor(self.name, reason, f"token of {self.name}" if self.is_token else self.name, self.address)
 
 
 def check_operator_name(name: str) -> str:

@@ -13,6 +13,7 @@ from operator import itemgetter
 from typing import Any, NoReturn
 
 from fleetmap.log_lines import LogLimit
+from mapserver.operators.sign_in_proxy import plain_address
 
 MAX_CONNECTIONS, MAX_OF_ADDRESS = 512, 64
 MAX_HEAD_BYTES = 16 << 10
@@ -21,7 +22,7 @@ BACKLOG = 256
 _LOOK_EVERY_S = 1.0
 _TAKEN_S, _TAKEN_BYTES = 30.0, 150_000  # a client that takes less of what waits for it holds the server's memory
 _BYTES_ACKED = 120  # place of tcpi_bytes_acked in Linux's struct tcp_info
-_PROXY = "the proxy on this machine"
+_PROXY = "a proxy"
 _log = logging.getLogger(__name__)
 
 
@@ -37,10 +38,10 @@ class BoundedListener(socket.socket):
     asyncio's own loop calls `accept` of this object; uvloop does not. Connections count from here on, before any handshake of TLS.
     """
 
-    def __init__(self, family: int, *, is_behind_proxy: bool) -> None:
-        """is_behind_proxy: a proxy on this machine brings everybody's requests, so that this machine has no limit of its own."""
+    def __init__(self, family: int, proxies: frozenset[str] = frozenset()) -> None:
+        """proxies: addresses of proxies, which bring everybody's requests and have no limit of their own."""
         super().__init__(family, socket.SOCK_STREAM)
-        self._is_behind_proxy = is_behind_proxy
+        self._proxies = proxies
         self._open: list[tuple[socket.socket, str, float]] = []  # with the address and when it was accepted
         self._refusals = LogLimit(_log)
 
@@ -51,7 +52,7 @@ class BoundedListener(socket.socket):
         """
         connection, address = super().accept()
         host = _network(address[0])
-        if self._is_behind_proxy and ip_address(address[0]).is_loopback:
+        if plain_address(address[0]) in self._proxies:
             host = _PROXY
         self._open = [entry for entry in self._open if entry[0].fileno() >= 0]
         counts = Counter(other for _, other, _ in self._open if other != _PROXY)

@@ -24,8 +24,7 @@ from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli, releases
-from mapserver.commands.oidc_options import OidcOptions
-from mapserver.commands.serve import serve
+from mapserver.commands.serve import HttpOptions, serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
 from support.fleet.dashboard_scene import serving as scene_serving
@@ -154,9 +153,8 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
     context = typer.Context(typer.main.get_command(cli.app), obj=Program({}, lambda _: (MapserverConfig(), {})))
 
     def serve_at(http: str, zenoh: str, **more: object) -> None:
-        options = {"http_cert": None, "http_key": None, "http_name": None, "insecure": False} | asdict(OidcOptions())
-        options |= {"foxglove": None, "foxglove_site": None}
-        serve(context=context, store=tmp_path, http=http, zenoh=zenoh, config=None, **options | more)
+        options = asdict(HttpOptions(http=http)) | more
+        serve(context=context, store=tmp_path, zenoh=zenoh, config=None, **options)
 
     with pytest.raises(UsageError, match="--http 'nonsense'"):
         serve_at("nonsense", "tcp/127.0.0.1:0")

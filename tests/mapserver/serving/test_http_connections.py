@@ -96,7 +96,7 @@ def is_answered(door: Door, source: str) -> bool:
 
 @contextmanager
 def a_door(*, is_behind_proxy: bool = False, **tls: Any) -> Iterator[Door]:
-    listener = BoundedListener(socket.AF_INET, is_behind_proxy=is_behind_proxy)
+    listener = BoundedListener(socket.AF_INET, frozenset({"127.0.0.1"}) if is_behind_proxy else frozenset())
     listener.bind(("127.0.0.1", 0))
     listener.listen(module.BACKLOG)
     door = Door(listener, **tls)

@@ -7,7 +7,7 @@ import typer
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
 from mapserver.commands.options import ActorOptions, Json, StoreFolder, print_json
-from mapserver.operators.roles import PROVIDER_PREFIX, Role, Scope
+from mapserver.operators.roles import Role, Scope
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
@@ -69,18 +69,6 @@ def disable(name: Name, store: StoreFolder, by: ActorOptions) -> None:
 
 
 @expand_options
-def enable(name: Name, store: StoreFolder, by: ActorOptions) -> None:
-    """Let a disabled person sign in at the provider again; who has a password here gets another one instead."""
-    from mapserver.store import MapStore
-
-    if not name.startswith(PROVIDER_PREFIX):
-        raise UsageError(f"{name} is nobody of a provider; `mapserver operators password {name}` lets them in again")
-    with MapStore.open(store) as maps:
-        maps.operators.enable(name, by.named())
-    typer.echo(f"{name} may sign in at the provider")
-
-
-@expand_options
 def token(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of an operator, or of a program.")],
     store: StoreFolder,
@@ -120,10 +108,6 @@ def list_(store: StoreFolder, json: Json = False) -> None:
 
 
 def _check_person(maps: "MapStore", name: str) -> None:
-    if name.startswith(PROVIDER_PREFIX):
-        raise UsageError(
-            f"{name} signs in at the provider, whose groups decide; `mapserver operators disable {name}` keeps them out"
-        )
     row = maps.operators.find(name)
     if row is not None and row.role == "program":
         raise UsageError(f"{name} is a program, which has tokens alone; choose another name for a person")
@@ -150,7 +134,6 @@ OPERATORS = Group(
         "password": password,
         "role": role,
         "disable": disable,
-        "enable": enable,
         "token": token,
         "list": list_,
     },

@@ -1,7 +1,7 @@
 """Sign-in and sign-out: a page without scripts, outside of the page library, so that nobody needs to be known for it."""
 
 from pathlib import Path
-from urllib.parse import parse_qs, quote
+from urllib.parse import parse_qs
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
@@ -10,20 +10,12 @@ from markupsafe import Markup
 from starlette.responses import Response
 
 from mapserver.api.guard import (
-    PROVIDER,
-    PROVIDER_BACK,
     SIGN_IN,
     SIGN_OUT,
     GuardSettings,
     address_of,
     set_session,
-    set_waiting,
-    waiting_name,
 )
-from mapserver.operators.openid import Provider, ProviderError
-from mapserver.operators.operators import Operators
-from mapserver.operators.roles import PROVIDER_PREFIX
-from mapserver.store import Actor
 
 _MAX_ADDRESS = 300  # percent-encoded it must fit into the sign-in's body, beside name and password
 _STYLE = Path(__file__).parents[1] / "style.css"
@@ -34,15 +26,9 @@ _PAGE = Markup(
     '<form method="post" action="{action}"><input type="hidden" name="next" value="{then}">'
     '<label>Name<input name="name" value="{name}" required maxlength="64" autocapitalize="none" autocomplete="username" {focus}></label>'
     '<label>Password<input name="password" type="password" required maxlength="1000" autocomplete="current-password"></label>'
-    '<button type="submit">Sign in</button></form>{provider}'
+    '<button type="submit">Sign in</button></form>'
     '<p class="quiet">No account yet? An administrator makes one on the server with <code>mapserver operators add</code>.</p>'
     "</main></body></html>\n"
-)
-_PROVIDER = Markup('<p><a class="plain" href="{address}">Sign in at {host}</a></p>')
-# Not a redirect: browsers take the way from the provider to here for one page's, and would keep the strict cookie back.
-_GO_ON = Markup(
-    '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Signed in – fleetmap</title>'
-    '<meta http-equiv="refresh" content="0;url={then}"></head><body><p><a href="{then}">Go on</a></p></body></html>\n'
 )
 
 
@@ -85,59 +71,11 @@ def install(app: FastAPI, settings: GuardSettings) -> None:
         set_session(response, request.scope, "")
         return response
 
-    if settings.provider is not None and settings.operators is not None:
-        _install_provider(app, settings, settings.provider, settings.operators)
-
-
-def _install_provider(app: FastAPI, settings: GuardSettings, provider: Provider, operators: Operators) -> None:
-    async def refused(request: Request, fault: ProviderError, then: str = "/") -> Response:
-        who = Actor(fault.name or PROVIDER_PREFIX, "", fault.name, address_of(request.scope))
-        await to_thread.run_sync(operators.note, "sign-in refused", str(fault), who)
-        # The mark stays: a link from elsewhere to the way back must not end what this browser has begun.
-        return _page(settings, then, "", str(fault), fault.status)
-
-    @app.get(PROVIDER, include_in_schema=False)
-    async def to_provider(request: Request, next: str = "/") -> Response:
-        """Sends the browser to the provider; whoever is signed in goes on."""
-        if await to_thread.run_sync(settings.identify, request.scope) is not None:
-            return RedirectResponse(_local(next), 303)
-        back = str(request.url.replace(path=PROVIDER_BACK, query="", fragment=""))
-        try:
-            address, secret = await provider.begin(back, _local(next), address_of(request.scope))
-        except ProviderError as fault:
-            return await refused(request, fault, next)
-        response = RedirectResponse(address, 303, {"Cache-Control": "no-store"})
-        set_waiting(response, request.scope, secret)
-        return response
-
-    @app.get(PROVIDER_BACK, include_in_schema=False)
-    async def from_provider(request: Request) -> Response:
-        """Begins a session for whom the provider vouches."""
-        address = address_of(request.scope)
-        try:
-            secret = request.cookies.get(waiting_name(request.scope), "")
-            person, then = await provider.finish(secret, request.query_params)
-            found = await to_thread.run_sync(operators.sign_in_by_provider, person, address)
-            if not found.session:
-                raise ProviderError(403, found.refusal, person.name)
-        except ProviderError as fault:
-            return await refused(request, fault)
-        response = HTMLResponse(_GO_ON.format(then=then), headers={"Cache-Control": "no-store"})
-        set_waiting(response, request.scope, "")
-        set_session(response, request.scope, found.session)
-        return response
-
 
 def _page(settings: GuardSettings, then: str, name: str = "", refusal: str = "", status: int = 200) -> HTMLResponse:
     notice = Markup('<p class="notice bad" role="alert">{}</p>').format(refusal) if refusal else ""
     style, focus = Markup(_STYLE.read_text("utf-8")), "" if name else "autofocus"
-    shown = Markup("")
-    if settings.provider is not None:
-        address = f"{PROVIDER}?next={quote(_local(then), safe='')}"
-        shown = _PROVIDER.format(address=address, host=settings.provider.host)
-    page = _PAGE.format(
-        style=style, notice=notice, action=SIGN_IN, then=_local(then), name=name, focus=focus, provider=shown
-    )
+    page = _PAGE.format(style=style, notice=notice, action=SIGN_IN, then=_local(then), name=name, focus=focus)
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
 
 

@@ -110,26 +110,6 @@ class OperatorQueries:
                 connection.execute(f"DELETE FROM {table} WHERE name = ?", (name,))
             self._transactions.log(connection, "", LogEntry("operator disabled", name, None, actor))
 
-    def admit(self, name: str, role: str, actor: Actor) -> bool:
-        """Takes in a person whom a provider vouches for, with the role of there; False for one who is disabled here."""
-        with self._transactions.write() as connection:
-            sql = "INSERT OR IGNORE INTO operators (name, role, is_disabled) VALUES (?, ?, 0)"
-            is_new = bool(connection.execute(sql, (name, role)).rowcount)
-            (found,) = connection.execute("SELECT role, is_disabled FROM operators WHERE name = ?", (name,)).fetchall()
-            if found[1]:
-                return False
-            if is_new or found[0] != role:
-                _change(connection, "UPDATE operators SET role = ? WHERE name = ?", role, name)
-                kind = "operator added" if is_new else "operator's role"
-                self._transactions.log(connection, "", LogEntry(kind, f"{name}, {role}", None, actor))
-        return True
-
-    def enable(self, name: str, actor: Actor) -> None:
-        """Lets a disabled person of a provider sign in again. UsageError for an unknown name."""
-        with self._transactions.write() as connection:
-            _change(connection, "UPDATE operators SET is_disabled = 0 WHERE name = ?", name)
-            self._transactions.log(connection, "", LogEntry("operator enabled", name, None, actor))
-
     def begin_session(self, sha256: str, name: str, actor: Actor) -> None:
         """A new session of an operator who has just signed in."""
         now_ns = self._transactions.now_ns()

@@ -1,0 +1,114 @@
+"""People whom a proxy in front of the server has signed in. docs/security.md explains it.
+
+The proxy names them and their groups in headers. These count from its addresses alone; of every other request they are removed.
+"""
+
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from typing import NamedTuple
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from fleetmap.errors import UsageError
+from mapserver.operators.roles import SCOPES, Identity, Role
+
+USER, GROUPS = b"x-forwarded-user", b"x-forwarded-groups"
+PREFIX = "proxy:"  # in front of their names in the log: no name of ours has a colon
+PAGE_S = 3600  # how long an open page counts as its person's before it is loaded, and the proxy asked, again
+_KEY = "fleetmap.proxied"
+_NAME = re.compile(r"[A-Za-z0-9._@+|:/=~-]{1,128}")
+
+
+class _Person(NamedTuple):
+    name: str
+    groups: tuple[str, ...]
+    seen_s: float
+
+
+@dataclass(frozen=True)
+class SignInProxy:
+    """Addresses of proxies, and the roles of the groups that they name. UsageError for an address that is none."""
+
+    addresses: frozenset[str]
+    roles: Mapping[str, Role]
+    clock_s: Callable[[], float] = field(default=time.monotonic)
+
+    @classmethod
+    def of(cls, addresses: Iterable[str], groups: Iterable[str]) -> "SignInProxy":
+        """By words such as `127.0.0.1` and `map-people=operator`; UsageError for others."""
+        roles: dict[str, Role] = {}
+        for given in groups:
+            group, _, role = given.rpartition("=")
+            if not group or role not in set(Role):
+                raise UsageError(
+                    f"--sign-in-group {given!r}: write it like map-people=operator, with one of {', '.join(Role)}"
+                )
+            if group in roles:
+                raise UsageError(f"--sign-in-group names {group!r} twice; give it one role")
+            roles[group] = Role(role)
+        if not roles:
+            raise UsageError(
+                "--sign-in-proxy needs --sign-in-group GROUP=ROLE: without a role nobody whom it signs in may enter"
+            )
+        return cls(frozenset(_address(given) for given in addresses), roles)
+
+    def identify(self, scope: Scope, address: str) -> Identity | None:
+        """Whom a proxy names in a request, with the highest role of their groups; None for nobody, or for groups without a role."""
+        person: _Person | None = scope.get(_KEY)
+        if person is None or self.clock_s() - person.seen_s > PAGE_S:
+            return None
+        roles = {self.roles[group] for group in person.groups if group in self.roles}
+        if not roles:
+            return None
+        role = max(roles, key=list(Role).index)
+        return Identity(PREFIX + person.name, role, SCOPES[role], address)
+
+
+class ProxiedPeople:
+    """ASGI, around everything else: takes the headers out of requests, and remembers what the proxies' ones say."""
+
+    def __init__(self, app: ASGIApp, proxy: SignInProxy | None) -> None:
+        self._app, self._proxy = app, proxy
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request, one socket, or the lifespan."""
+        if scope["type"] in {"http", "websocket"}:
+            named = [
+                (name, value.decode("latin-1").strip()) for name, value in scope["headers"] if name in (USER, GROUPS)
+            ]
+            scope = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] not in (USER, GROUPS)]}
+            users = [value for name, value in named if name == USER]
+            # A second name would be one that somebody else has written, and the proxy has passed on.
+            if self._proxy is not None and len(users) == 1 and _NAME.fullmatch(users[0]) and _is_of(scope, self._proxy):
+                groups = (group.strip() for name, value in named if name == GROUPS for group in value.split(","))
+                scope[_KEY] = _Person(users[0], tuple(groups), self._proxy.clock_s())
+        await self._app(scope, receive, send)
+
+
+def proxied_name(scope: Scope) -> str:
+    """Whom a proxy names in a request, whatever their groups are; empty for nobody."""
+    person: _Person | None = scope.get(_KEY)
+    return "" if person is None else PREFIX + person.name
+
+
+def _is_of(scope: Scope, proxy: SignInProxy) -> bool:
+    try:
+        return plain_address(scope["client"][0]) in proxy.addresses
+    except (ValueError, TypeError):  # a client without an address
+        return False
+
+
+def _address(given: str) -> str:
+    try:
+        return plain_address(given)
+    except ValueError as error:
+        raise UsageError(f"--sign-in-proxy {given!r}: write the proxy's address like 127.0.0.1") from error
+
+
+def plain_address(address: str) -> str:
+    """Of IPv4 addresses in IPv6 the former, as sockets of both kinds write them."""
+    found = ip_address(address.partition("%")[0])
+    return str(getattr(found, "ipv4_mapped", None) or found)

@@ -1,0 +1,174 @@
+"""People whom a proxy has signed in: its headers count from its address alone, for requests and sockets."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi.testclient import TestClient
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
+
+from fleetmap.errors import UsageError
+from mapserver.api.app import create_app
+from mapserver.api.guard import GuardSettings
+from mapserver.api.metrics import Metrics
+from mapserver.api.version_routes import ApiSettings
+from mapserver.commands.serve import HttpOptions
+from mapserver.operators.operators import Operators
+from mapserver.operators.sign_in_proxy import PAGE_S, ProxiedPeople, SignInProxy
+from mapserver.store import Actor, MapStore
+from support.fleet.dashboard_scene import fill_store, serving
+from support.fleet.served_api import Server, check_problem, served_api
+
+PROXY, GROUPS = "10.0.0.5", ("map-people=operator", "map-admins=admin", "everybody=viewer")
+ADA = {"X-Forwarded-User": "ada@example.com", "X-Forwarded-Groups": "everybody,map-people"}
+PUBLISH = "/v1/sites/lab/versions/2/publish"
+ACT = {"reason": "monday"}
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with served_api(tmp_path) as made:
+        yield made
+
+
+class Clock:
+    s = 1000.0
+
+    def __call__(self) -> float:
+        return self.s
+
+
+@contextmanager
+def asking(server: Server, address: str, clock: Clock | None = None, later_s: float = 0.0) -> Iterator[TestClient]:
+    """A client at an address, of a server as `serve` makes it. later_s: passes between the proxy's word and the question."""
+    clock = clock or Clock()
+    proxy = SignInProxy(SignInProxy.of([PROXY], GROUPS).addresses, SignInProxy.of([PROXY], GROUPS).roles, clock)
+    guard = GuardSettings(operators=Operators(server.store), must_sign_in=True, proxy=proxy)
+    app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, None, ApiSettings(guard))
+
+    @app.websocket("/dashboard/_nicegui_ws/socket.io/")
+    async def socket(websocket: WebSocket) -> None:
+        await websocket.accept()
+        await websocket.send_text(str(dict(websocket.headers)))
+
+    inner: ASGIApp = ProxyHeadersMiddleware(app, [PROXY])  # type: ignore[arg-type,assignment]
+
+    async def late(scope: Scope, receive: Receive, send: Send) -> None:
+        clock.s += later_s
+        await inner(scope, receive, send)
+
+    with TestClient(
+        ProxiedPeople(late, proxy), "http://127.0.0.1", client=(address, 50000), follow_redirects=False
+    ) as client:
+        yield client
+
+
+def opens_socket(client: TestClient, headers: dict[str, str]) -> bool:
+    try:
+        with client.websocket_connect("ws://127.0.0.1/dashboard/_nicegui_ws/socket.io/", headers=headers) as socket:
+            assert "x-forwarded-user" not in socket.receive_text()
+    except WebSocketDisconnect:
+        return False
+    return True
+
+
+def test_the_proxy_says_who_asks_and_the_log_has_it(server: Server) -> None:
+    with asking(server, PROXY) as client:
+        headers = ADA | {"X-Forwarded-For": "192.0.2.7"}
+        assert client.get("/v1/sites", headers=headers).status_code == 200
+        assert opens_socket(client, headers)
+        assert client.post(PUBLISH, json=ACT, headers=headers).status_code == 200
+        check_problem(client.get("/v1/sites"), 401, "sign in")
+    last = next(line for line in reversed(server.store.audit_lines()) if line.kind == "published")
+    assert (last.operator, last.actor, last.address) == ("proxy:ada@example.com", "proxy:ada@example.com", "192.0.2.7")
+
+
+@pytest.mark.parametrize(
+    ("address", "headers"),
+    [
+        ("10.0.0.6", ADA),
+        ("127.0.0.1", ADA),
+        ("10.0.0.6", ADA | {"X-Forwarded-For": PROXY}),
+        ("testclient", ADA),
+        (PROXY, ADA | {"X-Forwarded-User": "ada\tadmin"}),
+        (PROXY, ADA | {"X-Forwarded-User": "<img src=x>"}),
+        (PROXY, ADA | {"X-Forwarded-User": "x" * 129}),
+        (PROXY, ADA | {"X-Forwarded-User": ""}),
+        (PROXY, {"X-Forwarded-Groups": "map-admins"}),
+        (PROXY, [*ADA.items(), ("X-Forwarded-User", "root")]),
+    ],
+)
+def test_nobody_else_does(server: Server, address: str, headers: dict[str, str]) -> None:
+    with asking(server, address) as client:
+        check_problem(client.get("/v1/sites", headers=headers), 401, "sign in")
+        check_problem(client.post(PUBLISH, json=ACT, headers=headers), 401, "sign in")
+        assert not opens_socket(client, httpx.Headers(headers))
+
+
+@pytest.mark.parametrize(
+    ("groups", "reads", "changes"),
+    [
+        ("everybody", 200, 403),
+        ("map-admins, everybody", 200, 200),
+        ("others", 403, 403),
+        ("", 403, 403),
+        (None, 403, 403),
+    ],
+)
+def test_groups_give_the_role(server: Server, groups: str | None, reads: int, changes: int) -> None:
+    headers = {"X-Forwarded-User": "bea"} | ({} if groups is None else {"X-Forwarded-Groups": groups})
+    with asking(server, PROXY) as client:
+        answer = client.get("/v1/sites", headers=headers)
+        assert (answer.status_code, client.post(PUBLISH, json=ACT, headers=headers).status_code) == (reads, changes)
+        assert reads == 200 or "none of the groups of proxy:bea has a role" in answer.json()["detail"]
+
+
+def test_tokens_pass_and_no_local_operator_is_meant(server: Server) -> None:
+    Operators(server.store).add("ada", "admin", "a password of the test", Actor("root"))
+    token = Operators(server.store).make_token("prometheus", ["read"], 1, Actor("root"))
+    with asking(server, PROXY) as client:
+        assert client.get("/v1/sites", headers={"Authorization": f"Bearer {token}"}).status_code == 200
+        headers = {"X-Forwarded-User": "ada", "X-Forwarded-Groups": "everybody"}
+        check_problem(client.post(PUBLISH, json=ACT, headers=headers), 403, "proxy:ada (viewer)")
+
+
+def test_an_open_page_is_asked_again_after_an_hour(server: Server) -> None:
+    with asking(server, PROXY, later_s=PAGE_S + 1) as client:
+        assert client.get("/v1/sites", headers=ADA).status_code == 403
+        assert not opens_socket(client, ADA)
+
+
+@pytest.mark.parametrize(
+    ("addresses", "groups", "words"),
+    [
+        (["proxy.example"], GROUPS, "write the proxy's address like 127.0.0.1"),
+        (["10.0.0.0/8"], GROUPS, "10.0.0.0/8"),
+        ([PROXY], ["map-people=boss"], "one of viewer, operator, admin"),
+        ([PROXY], ["a=viewer", "a=admin"], "'a' twice"),
+        ([PROXY], [], "needs --sign-in-group"),
+        ([], GROUPS, "belongs to --sign-in-proxy"),
+    ],
+)
+def test_options_that_cannot_be_right(addresses: list[str], groups: list[str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        HttpOptions(sign_in_proxy=addresses, sign_in_group=list(groups)).load_proxy()
+
+
+def test_serve_believes_the_named_address_alone(tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    options = ("--sign-in-proxy", "127.0.0.2", "--sign-in-group", "map-people=operator", "--http-name", "maps.example")
+    with serving(tmp_path, *options) as served:
+        found = {}
+        for address in ("127.0.0.1", "127.0.0.2"):
+            with httpx.Client(transport=httpx.HTTPTransport(local_address=address), headers=ADA, timeout=60) as client:
+                headers = {"Host": "maps.example", "X-Forwarded-For": "127.0.0.2", "X-Forwarded-Proto": "https"}
+                found[address] = client.get(f"{served.http}/v1/sites", headers=headers).status_code
+                page = client.get(f"{served.http}/dashboard/", headers=headers | {"Accept": "text/html"})
+                assert ("proxy:ada@example.com (operator)" in page.text) == (address == "127.0.0.2")
+        assert found == {"127.0.0.1": 401, "127.0.0.2": 200}
+    with MapStore.open(tmp_path) as store:
+        assert store.operators.all(0) == [], "the proxy's people are nobody of the store"
