@@ -23,7 +23,6 @@ from mapserver.commands.serve import serve
 from mapserver.commands.site.align import align
 from mapserver.commands.site.areas import AREAS_GROUP
 from mapserver.commands.site.grid import GRID
-from mapserver.commands.site.masks import MASKS_GROUP
 from mapserver.commands.site.surfels import MAP
 from mapserver.commands.store.audit import audit
 from mapserver.commands.store.export import export, import_
@@ -60,7 +59,6 @@ COMMANDS: Commands = {
     "fleet": FLEET,
     "robots": ROBOTS,
     "grid": GRID,
-    "masks": MASKS_GROUP,
     "map": MAP,
     "operators": OPERATORS,
     "audit": audit,

@@ -13,7 +13,7 @@ PRINTED = re.compile(r"`(mapserver [a-z][^`]*)`")
 # Commands that need each option, by their first words
 _NEEDS = {
     "--site": re.compile(
-        r"mapserver (build|live|nightly|publish|promote|rollback|versions|inspect|diff|export|align|areas|grid|masks|map"
+        r"mapserver (build|live|nightly|publish|promote|rollback|versions|inspect|diff|export|align|areas|grid|map"
         r"|fleet (report|resurvey)|robots (enrol|revoke|remove))\b"
     ),
     "--store": re.compile(r"mapserver (?!(doctor|calibrate|convert|evaluate|prepare|config|trust key)\b)"),

@@ -6,7 +6,8 @@ GeoJSON (RFC 7946) means degrees of WGS 84. Here coordinates are metres, and a m
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from enum import StrEnum
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -26,6 +27,7 @@ _MAX_M = 1e6
 _SAMPLES = 16  # a tile's area is known by as many points each way
 _LEAST_SHARE = 0.1  # of a tile, for an area to give it its name
 _NAMED = 3
+_MASK_WORDS = 'where it is a mask "mask": "keep-out", or "mask": "speed" and "percent": 1 to 99'
 _TILE = re.compile(r"\btile (-?\d{1,10}),(-?\d{1,10})\b", re.ASCII)
 
 
@@ -37,8 +39,17 @@ class _MultiPolygon(msgspec.Struct, tag_field="type", tag="MultiPolygon"):
     coordinates: list[list[list[list[float]]]]
 
 
+class MaskKind(StrEnum):
+    """What an area does to a planner: no robot may be in it, or it drives there at a share of its speed."""
+
+    KEEP_OUT = "keep-out"
+    SPEED = "speed"
+
+
 class _Properties(msgspec.Struct):
     name: str
+    mask: MaskKind | None = None
+    percent: Annotated[int, msgspec.Meta(ge=1, le=99)] | None = None
 
 
 class _Feature(msgspec.Struct):
@@ -55,10 +66,15 @@ class _Collection(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """rings: (V, 2) corners in `map`, metres, not repeated at the end; a place is inside by the even-odd rule over all rings."""
+    """rings: (V, 2) corners in `map`, metres, not repeated at the end; a place is inside by the even-odd rule over all rings.
+
+    mask: what it is to planners, None for nothing. percent: of the robot's largest speed, in an area of the kind SPEED.
+    """
 
     name: str
     rings: tuple[Array, ...]
+    mask: MaskKind | None = None
+    percent: int | None = None
 
     @property
     def size_m2(self) -> float:
@@ -131,7 +147,8 @@ class Areas:
             {
                 "type": "Feature",
                 "geometry": {"type": "Polygon", "coordinates": [_closed(ring) for ring in area.rings]},
-                "properties": {"name": area.name},
+                "properties": {"name": area.name}
+                | ({} if area.mask is None else {"mask": area.mask, "percent": area.percent}),
             }
             for area in self.areas
         ]
@@ -155,7 +172,7 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
         collection = msgspec.json.decode(data, type=_Collection)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(
-            f"areas: {error}; give a GeoJSON FeatureCollection of polygons with properties.name"
+            f"areas: {error}; give a GeoJSON FeatureCollection of polygons with properties.name, and {_MASK_WORDS}"
         ) from error
     if collection.frame is None:
         words = 'add "frame": "map" or "frame": "building" beside "features", and write metres'
@@ -192,6 +209,9 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(
             f"area {name[:80]!r}: a name has 1 to {_MAX_NAME} printable characters, and is not {OUTSIDE!r}"
         )
+    mask, percent = feature.properties.mask, feature.properties.percent
+    if (percent is None) == (mask is MaskKind.SPEED):
+        raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
     geometry = feature.geometry
     polygons = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
     rings = [_ring(ring, f"area {name!r}") for polygon in polygons for ring in polygon]
@@ -199,7 +219,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     if map_from_building is not None:
         rings = [transform_points(map_from_building, np.c_[ring, np.zeros(len(ring))])[:, :2] for ring in rings]
-    return Area(name, tuple(rings))
+    return Area(name, tuple(rings), mask, percent)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:

@@ -12,7 +12,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 BUILDING_KEY = "building"
 """In `configuration` of a manifest, where readers of before look over it: format 1 refuses keys that it does not know elsewhere."""
 
-ALIGNMENT, AREAS, MASKS = FOR_ROBOTS = ("alignment", "areas", "masks")
+ALIGNMENT, AREAS = FOR_ROBOTS = ("alignment", "areas")
 """Kinds of what a site keeps beside its versions and robots may have, by the address that the site's signed list names."""
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e7, le=1e7)]

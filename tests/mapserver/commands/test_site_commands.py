@@ -139,7 +139,7 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
     run("areas", "import", drawn, *site)
     with MapStore.open(tmp_path / "store") as store:
         assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, "hall"]
-    assert "run `mapserver align --store" in run("align", *site, "--forget", status=2)
+    assert "run `mapserver align --plan FILE --pin ... --site lab --store" in run("align", *site, "--forget", status=2)
     run("align", *site, *pins("a=200,400:50,0", "b=200,0:70,0", "c=0,400:50,10"))  # 50 m along x of the map
     with MapStore.open(tmp_path / "store") as store:
         assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, None]

@@ -7,7 +7,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, check_output, print_json
 
 
 @expand_options
@@ -18,7 +18,8 @@ def import_(
 ) -> None:
     """Take the areas of FILE in the place of those that the site has; reports, pages and metrics then speak of them."""
     from fleetmap.mapformat.building import AREAS
-    from mapserver.floor_plan.areas import MAX_AREAS_BYTES
+    from mapserver.floor_plan.areas import MAX_AREAS_BYTES, read_areas
+    from mapserver.grid.masks import check_masks_on_map
     from mapserver.store import MapStore
 
     with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
@@ -26,6 +27,10 @@ def import_(
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
     with MapStore.open(where.store) as maps:
+        alignment, current = maps.alignment(where.site), maps.current(where.site)
+        if current is not None:
+            areas = read_areas(data, None if alignment is None else alignment.frame)
+            check_masks_on_map(areas, maps.manifest(where.site, current.version))
         maps.keep_site_files(where.site, {AREAS: data}, f"areas of {file.name}", actor=by.named())
         names = maps.areas(where.site).names
     typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
@@ -54,10 +59,44 @@ def list_(where: SiteOptions, json: Json = False) -> None:
         print_json(areas.geojson(where.site))
         return
     for area in sorted(areas.areas, key=lambda area: area.name):
-        typer.echo(f"{area.name}: {area.size_m2:.1f} m2")
+        speed = "" if area.percent is None else f" {area.percent} %"
+        typer.echo(f"{area.name}: {area.size_m2:.1f} m2{'' if area.mask is None else f', {area.mask}{speed}'}")
     typer.echo(f"{len(areas.areas)} areas")
 
 
+@expand_options
+def export(
+    where: SiteOptions,
+    keep_out: Annotated[
+        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's KeepoutFilter, and its image.")
+    ] = None,
+    speed: Annotated[
+        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's SpeedFilter, and its image.")
+    ] = None,
+) -> None:
+    """Write the areas with a mask as nav2's costmap filters read them, in the frame of the map."""
+    from fleetmap.occupancy_grid import write_grid
+    from mapserver.floor_plan.areas import MaskKind
+    from mapserver.grid.masks import mask_grid
+    from mapserver.store import MapStore
+
+    asked = {MaskKind.KEEP_OUT: keep_out, MaskKind.SPEED: speed}
+    if not any(asked.values()):
+        raise UsageError("name a file by --keep-out or --speed")
+    for kind, file in asked.items():
+        check_output(f"--{kind.value}", file)
+        if file is not None and file.suffix != ".yaml":
+            raise UsageError(f"--{kind.value} {file} must end in .yaml")
+    with MapStore.open(where.store, read_only=True) as maps:
+        maps.current(where.site)
+        areas = maps.areas(where.site)
+    grids = {file: mask_grid(areas, kind) for kind, file in asked.items() if file is not None}
+    for file, grid in grids.items():
+        write_grid(file, grid)
+        typer.echo(str(file))
+
+
 AREAS_GROUP = Group(
-    "The areas of a site that people have names for.", {"import": import_, "list": list_, "remove": remove}
+    "The areas of a site that people have names for.",
+    {"import": import_, "list": list_, "remove": remove, "export": export},
 )
