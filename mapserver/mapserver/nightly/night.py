@@ -33,7 +33,7 @@ _ENDED = (
     "{nights} nights ended while this was read or built: killed, out of memory or out of time, or by a fault of the program; "
     "try `mapserver doctor` on it, and move it back, alone, to try again"
 )
-_SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config", "keys")
+_SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config")
 
 
 @dataclass(frozen=True, slots=True)
