@@ -84,7 +84,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
         if path.name.startswith(".") or path.name in (DONE, HELD, BAD):
             continue
         try:
-            if stat.S_ISREG(path.lstat().st_mode) and path.suffix not in (*_UNFINISHED, *FILE_SUFFIXES):
+            if stat.S_ISREG(path.lstat().st_mode) and path.suffix not in (*_UNFINISHED, *FILE_SUFFIXES, ".zip"):
                 others.append(path.name)
             elif reason := _unfinished(path, settle_s, now_ns):
                 waiting.append((path, reason))

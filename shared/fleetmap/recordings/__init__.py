@@ -1,4 +1,4 @@
-"""Recordings of camera robots: folders of data sets, MCAP, rosbag2 in SQLite, ROS 1 bags, videos; zipped or not.
+"""Recordings of camera robots: folders of data sets, MCAP, rosbag2 in SQLite, ROS 1 bags, videos.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
 and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -6,11 +6,10 @@ and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import archive, video
+from fleetmap.recordings import video
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
@@ -72,7 +71,7 @@ _ADVICE = {
     ),
     (".bag.active",): "`rosbag reindex {path}` finishes it",
 }
-FILE_SUFFIXES = (".mcap", ".db3", ".bag", ".zip", *video.SUFFIXES)  # of recordings that are one file
+FILE_SUFFIXES = (".mcap", ".db3", ".bag", *video.SUFFIXES)  # of recordings that are one file
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:
@@ -91,17 +90,7 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
         )
     if path.is_file() and (fault := what_file_instead(path)):
         raise RecordingError(f"{path} is {fault}")
-    if archive.recognises(path):
-        return archive.open_zip(path, _format_of, partial(_open, options=options))
-    return _open(path, options)
-
-
-def _format_of(path: Path) -> RecordingFormat | None:
-    return next((each for each in RECORDING_FORMATS.values() if each.recognises(path)), None)
-
-
-def _open(path: Path, options: OpenOptions) -> Recording:
-    found = _format_of(path)
+    found = next((each for each in RECORDING_FORMATS.values() if each.recognises(path)), None)
     if found is not None:
         return found.open(path, options)
     if path.is_dir() and not any(path.iterdir()):
@@ -111,4 +100,4 @@ def _open(path: Path, options: OpenOptions) -> Recording:
             words = advice.format(path=path, stem=path.stem)
             raise RecordingError(f"{path} is in no format that is known; {words}")
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in RECORDING_FORMATS.items())
-    raise RecordingError(f"{path} is in no format that is known. Known are {known}; each also in a .zip file")
+    raise RecordingError(f"{path} is in no format that is known. Known are {known}")

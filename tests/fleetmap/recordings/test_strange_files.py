@@ -2,6 +2,7 @@
 
 import re
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,6 +81,14 @@ def test_damaged_files_of_every_format(
             if damage in ("page", "pointer") and file.name not in ("metadata.yaml", "frame-000000.pose.txt"):
                 assert "git lfs pull" in told, (file.name, damage, told)
         file.write_bytes(sound)
+
+
+@pytest.mark.parametrize("name", ["drive.zip", "drive.mcap"])
+def test_zip_files_are_to_be_unpacked(tmp_path: Path, name: str) -> None:
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.writestr("mav0/cam0/data.csv", "")
+    with pytest.raises(RecordingError, match=f"{name} is a zip file; `unzip` it"):
+        open_recording(tmp_path / name)
 
 
 LINES = ["1.0 0 0 0 0 0 0 1", "1.1 1 0 0 0 0 0 1"]

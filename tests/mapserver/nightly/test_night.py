@@ -285,6 +285,7 @@ BAD_ENTRIES = {
     "a table of terabytes": (_in_recording(_sparse(1 << 41), "mav0/imu0/data.csv"), "1024 MiB"),
     "a table of one line": (_in_recording(_long_line, "mav0/imu0/data.csv"), "no row"),
     "a calibration of terabytes": (_in_recording(_sparse(1 << 41), "mav0/cam0/sensor.yaml"), "1048576 bytes"),
+    "a zip file": (lambda path: path.write_bytes(b"PK\3\4" + bytes(30)), "`unzip` it"),
     "an MCAP file of holes": (_sparse(1 << 41, b"\x89MCAP0\r\n"), "MCAP"),
 }
 
