@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,22 +18,6 @@ _BEYOND_M = 12.0  # margin around the robots' path; landmarks of far walls would
 _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 
 
-class PlanTile(Protocol):
-    """A square of a plan and how many landmarks it holds; a TileEntry is one."""
-
-    @property
-    def x(self) -> int:
-        """Number along x."""
-
-    @property
-    def y(self) -> int:
-        """Number along y."""
-
-    @property
-    def landmarks(self) -> int:
-        """How many."""
-
-
 @dataclass(frozen=True, slots=True)
 class Plan:
     """low, high: corners in `map`, metres. png: transparent where nothing is. places: number of places.
@@ -45,7 +28,7 @@ class Plan:
     low_m: tuple[float, float]
     high_m: tuple[float, float]
     tile_size_m: float
-    tiles: tuple[PlanTile, ...]
+    tiles: tuple[TileEntry, ...]
     places: int
     png: bytes
     directions: tuple[TileDirections, ...]
