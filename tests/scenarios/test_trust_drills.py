@@ -68,7 +68,7 @@ class Drill:
         return Robot(self, bus, name)
 
     def repository(self) -> ListRepository:
-        return ListRepository(self.lists, datetime.now(UTC))
+        return ListRepository(self.store, datetime.now(UTC))
 
     def publish(self, seed: int) -> None:
         with MapStore.open(self.store) as store:

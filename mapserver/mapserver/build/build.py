@@ -89,7 +89,7 @@ class BuildOptions:
     with. trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
     looked for in the draft.
     threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
-    section of the file `config` over it. job: its number, for the draft. keys: the builder's folder, if not the server's.
+    section of the file `config` over it. job: its number, for the draft.
     look_at: told which recordings are worked on.
     """
 

@@ -307,12 +307,12 @@ class StoreQueries:
         with self._transactions.write(durable=False) as connection:
             keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
 
-    def begin_job(self, site: str, kind: str, message: str = "", report: dict[str, Any] | None = None) -> int:
+    def begin_job(self, site: str, kind: str) -> int:
         """The number of a new running job."""
         with self._transactions.write() as connection:
             done = connection.execute(
-                "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, ?, ?)",
-                (check_name(site, "site"), kind, self._now(), message, to_json(report or {}).decode()),
+                "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",
+                (check_name(site, "site"), kind, self._now()),
             )
             return int(done.lastrowid or 0)
 

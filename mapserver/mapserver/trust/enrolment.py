@@ -7,7 +7,6 @@ import hashlib
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -81,27 +80,16 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         """Name in the certificate of its bundle."""
         return f"{self.certificate}.enrol"
 
-    def row(self, now_ns: int) -> "EnrolledRow":
-        """What people want to know of it."""
+    def row(self, now_ns: int) -> dict[str, str | int | float]:
+        """What `robots list` shows. certificate: the name in it; days_left: of it, or of the bundle that waits."""
         since_ns = self.enrolled_ns if self.renewed_ns is None else self.renewed_ns
         left = DAYS["enrol" if self.renewed_ns is None else "robot"] - (now_ns - since_ns) / _DAY_NS
         if self.renewed_ns is None:
             state = f"bundle waits, {24 * left:.0f} h left" if left > 0 else "bundle expired: enrol again"
         else:
             state = f"certificate for {left:.0f} days" if left > 0 else "certificate expired: revoke and enrol again"
-        return EnrolledRow(self.site, self.robot, self.certificate, self.enrolled_ns, round(left, 2), state)
-
-
-@dataclass(frozen=True)
-class EnrolledRow:
-    """One enrolled robot. certificate: the name in it; days_left: of it, or of the bundle that waits."""
-
-    site: str
-    robot: str
-    certificate: str
-    enrolled_ns: int
-    days_left: float
-    state: str
+        named = {"site": self.site, "robot": self.robot, "certificate": self.certificate}
+        return {**named, "enrolled_ns": self.enrolled_ns, "days_left": round(left, 2), "state": state}
 
 
 class RobotRegister:
@@ -300,8 +288,3 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
     except FileNotFoundError:
         return None
     return stat.st_mtime_ns, stat.st_ino, stat.st_size
-
-
-def bundle_path(folder: Path, robot: str) -> Path:
-    """The file that a robot's bundle is written to."""
-    return folder / f"{robot}.fleetmap"

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from fleetmap.errors import StoreError, UntrustedError, UsageError
+from fleetmap.errors import StoreError, UntrustedError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
 from mapserver.store.files import is_plain_file
@@ -121,30 +121,30 @@ class SignedLists:
             return False
         return any(signature.keyid in role.keyids for signature in signatures)
 
-    def check_root(self) -> None:
-        """Raises UsageError for lists of before whose root several people, or a token, sign: nothing here can go on with them."""
-        root = self.read("root")
+    def retired(self) -> dict[str, str]:
+        """By role, what an earlier fleetmap set up and this one cannot go on with: several keys, a token's, no predecessors."""
+        root, found = self.read("root"), {}
         for name in ("root", "targets"):
             role = root.roles[name]
             kinds = {root.keys[keyid].keytype for keyid in role.keyids if keyid in root.keys} - {"ed25519"}
-            fault = f"{role.threshold} keys must sign {name}" if role.threshold > 1 else ""
-            fault = fault or (f"a key of {name} is of the kind {min(kinds)}, as PKCS#11 tokens have" if kinds else "")
-            if fault:
-                raise UsageError(
+            if role.threshold > 1 or kinds:
+                fault = f"{role.threshold} keys must sign {name}"
+                if role.threshold == 1:
+                    fault = f"a key of {name} is of the kind {min(kinds)}, as PKCS#11 tokens have"
+                found[name] = (
                     f"{self.folder}: {fault}; fleetmap signs with one root key in a file now. Go on with the fleetmap that made it, "
                     "or begin anew: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
                 )
-
-    def check_site(self, role: SiteRole) -> None:
-        """Raises UsageError for a site of before whose lists several keys sign, or whose predecessors are not admitted."""
-        fault = f"{role.threshold} keys must sign its lists" if role.threshold > 1 else ""
-        fault = fault or ("" if role.previous else "its lists admit no version but the current one")
-        if fault:
-            site = role.name.removeprefix("site-")
-            raise UsageError(
-                f"site {site}: {fault}, which is no longer supported; `mapserver trust admit {site} --key ROOT` lets one key of "
-                "this server sign lists that admit the version before, too"
-            )
+        for name, signed_by in self.site_roles().items():
+            if signed_by.threshold > 1 or not signed_by.previous:
+                site, fault = name.removeprefix("site-"), f"{signed_by.threshold} keys must sign its lists"
+                if signed_by.threshold == 1:
+                    fault = "its lists admit no version but the current one"
+                found[name] = (
+                    f"site {site}: {fault}, which is no longer supported; `mapserver trust admit {site} --key ROOT` lets one key of "
+                    "this server sign lists that admit the version before, too"
+                )
+        return found
 
     def path(self, role: str, number: int) -> Path:
         """The file of a role's number."""

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -25,6 +26,7 @@ from tuf.api.serialization.json import JSONSerializer
 from fleetmap.errors import StateError, StoreError, disk_errors
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
 from mapserver.store.files import make_folder, write_atomically
+from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh
 
 _MOST_FILES = 5  # of a role that robots ask for by number: one may have read the timestamp before the last change
@@ -35,10 +37,11 @@ T = TypeVar("T", bound=Signed)
 
 
 class ListRepository:
-    """The signed lists of one store, for writing. now: the moment that times of expiry are counted from."""
+    """The signed lists of one store, for writing, and its keys. now: the moment that times of expiry are counted from."""
 
-    def __init__(self, lists: SignedLists, now: datetime) -> None:
-        self.lists, self.now = lists, now.astimezone(UTC).replace(microsecond=0)
+    def __init__(self, store: Path, now: datetime) -> None:
+        self.lists, self.keys = SignedLists(store), KeyFolder(store / "keys")
+        self.now = now.astimezone(UTC).replace(microsecond=0)
 
     def newest(self, role: str) -> Metadata[Any]:
         """The newest file of a role; StoreError where there is none or it cannot be read."""
@@ -58,15 +61,19 @@ class ListRepository:
 
     # --- with the root key --------------------------------------------------------------------------------------------
 
-    def init(self, root_key: Signer, online: Key) -> None:
-        """The first root and targets; StateError where the store has some."""
+    def check_empty(self) -> None:
+        """Raises StateError where the store has lists."""
         if self.lists.are_there:
             raise StateError(f"{self.lists.folder} has signed lists already; `mapserver trust status` shows them")
-        root = Root(consistent_snapshot=True)
+
+    def init(self, root_key: Signer) -> None:
+        """The first root and targets; StateError where the store has some."""
+        self.check_empty()
+        online, root = self.keys.signer("online") or self.keys.make("online"), Root(consistent_snapshot=True)
         for role in ("root", "targets"):
             root.add_key(root_key.public_key, role)
         for role in _ONLINE:
-            root.add_key(online, role)
+            root.add_key(online.public_key, role)
         # The root last: with it the store counts as signed.
         self._sign("targets", Targets(delegations=Delegations(keys={}, roles={})), root_key)
         self._sign("root", root, root_key)
@@ -77,9 +84,9 @@ class ListRepository:
         if not all(keyid in roles[name].keyids for name in ("root", "targets")):
             raise StateError(f"key {keyid[:8]} is not the root key of {self.lists.folder}; name its file by --key")
 
-    def replace_online(self, online: Key, root_key: Signer) -> None:
+    def replace_online(self, root_key: Signer) -> None:
         """Another key for snapshot and timestamp; robots then forget the numbers of the old one."""
-        self._change_root(_ONLINE, online, [root_key])
+        self._change_root(_ONLINE, self.keys.replace("online").public_key, [root_key])
 
     def replace_root(self, root_key: Signer, new: Signer) -> None:
         """The next root and targets, signed by `new` in the place of `root_key`, or by the same key for longer."""

@@ -21,8 +21,7 @@ from mapserver.trust.keys import KeyFolder, make_passphrase, new_key, save_key
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 
 if TYPE_CHECKING:
-    from securesystemslib.signer import Key, Signer
-
+    from mapserver.trust.keys import Signer
     from mapserver.trust.repository import ListRepository
 
 _log = logging.getLogger(__name__)
@@ -57,7 +56,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
         repository, faults = _repository(store), []
         for info in store.sites():
             try:
-                if number := _update_site(repository, keys, store.releases(info.site), now):
+                if number := _update_site(repository, store.releases(info.site)):
                     store.audit("list signed", f"site {info.site}, list {number}")
             except FleetmapError as error:  # of one site: the others' robots, and the timestamp, must not wait for it
                 faults.append(error)
@@ -92,9 +91,9 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
                 f"first: `mapserver trust init --here --store {store.folder}`"
             )
         init_here(store)
-    lists.check_root()
+    if retired := lists.retired():
+        raise UsageError("; ".join(retired.values()))
     for name, role in lists.site_roles().items():
-        lists.check_site(role)
         signer = keys.signer(name)
         if signer is None or signer.public_key.keyid not in role.keyids:
             site = name.removeprefix("site-")
@@ -110,30 +109,31 @@ def init_here(store: MapStore) -> None:
 
     Errors as of `update_lists`; StateError where there are lists already.
     """
-    keys = KeyFolder(store.folder / "keys")
-    _init(store, keys.signer("root") or keys.make("root"))
+    repository = _repository(store)
+    repository.init(repository.keys.signer("root") or repository.keys.make("root"))
+    update_lists(store)
 
 
 def init_offline(store: MapStore, folder: Path) -> tuple[Path, str]:
     """Signed lists whose root key lies in `folder`, encrypted; its file and passphrase. Errors as of `init_here`."""
-    lists = SignedLists(store.folder)
-    if lists.are_there:
-        raise StateError(f"{lists.folder} has signed lists already; `mapserver trust status` shows them")
+    repository = _repository(store)
+    repository.check_empty()
     key, made = _offline_key(folder, 1)
-    _init(store, key)
+    repository.init(key)
+    update_lists(store)
     return made
 
 
 def admit_site(store: MapStore, site: str, root_key: "Signer") -> None:
     """Another key in the store's folder of keys signs the lists of a site from now on; StateError unless `root_key` is the root key."""
     with _changing(store, root_key, f"site {site}: another key signs its lists") as repository:
-        repository.delegate(site, _new_site_key(store, site), root_key)
+        repository.delegate(site, repository.keys.replace(site_role(site)).public_key, root_key)
 
 
 def rotate_online(store: MapStore, root_key: "Signer") -> None:
     """Another online key, after a theft of the server or of the key; robots forget what the old one signed. Errors as of `admit_site`."""
     with _changing(store, root_key, "another online key") as repository:
-        _replace_online(repository, store, root_key)
+        repository.replace_online(root_key)
 
 
 def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
@@ -145,9 +145,9 @@ def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
     with _changing(store, root_key, f"site {site}: another key for it and for the server") as repository:
         if site_role(site) not in repository.lists.site_roles():
             raise UsageError(f"no key may sign maps of site {site}; `mapserver trust status` shows the sites")
-        repository.delegate(site, _new_site_key(store, site), root_key)
+        repository.delegate(site, repository.keys.replace(site_role(site)).public_key, root_key)
         repository.forget_site(site)
-        _replace_online(repository, store, root_key)
+        repository.replace_online(root_key)
 
 
 def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None) -> tuple[Path, str] | None:
@@ -161,8 +161,8 @@ def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None)
         if folder is not None:
             new, made = _offline_key(folder, repository.lists.newest("root") + 1)
         repository.replace_root(root_key, new)
-    if made is not None:
-        KeyFolder(store.folder / "keys").set_aside("root")
+        if made is not None:
+            repository.keys.set_aside("root")
     return made
 
 
@@ -172,7 +172,8 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
     repository = _repository(store)
     if not repository.lists.are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
-    repository.lists.check_root()
+    if retired := [words for role, words in repository.lists.retired().items() if role in ("root", "targets")]:
+        raise UsageError(retired[0])
     with disk_errors(f"{repository.lists.folder} cannot be changed", "check its rights"):
         make_folder(repository.lists.folder)
         with locked(repository.lists.folder / "lock", shared=False):
@@ -182,13 +183,6 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
     update_lists(store, all_anew=True)
 
 
-def _init(store: MapStore, root_key: "Signer") -> None:
-    keys = KeyFolder(store.folder / "keys")
-    online = keys.signer("online") or keys.make("online")
-    _repository(store).init(root_key, online.public_key)
-    update_lists(store)
-
-
 def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":
     """A root key with its file and passphrase. number: of the root in which it begins to count."""
     key, path, passphrase = new_key(), folder / f"root-{number}.pem", make_passphrase()
@@ -196,18 +190,10 @@ def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]"
     return key, (path, passphrase)
 
 
-def _new_site_key(store: MapStore, site: str) -> "Key":
-    return KeyFolder(store.folder / "keys").replace(site_role(site)).public_key
-
-
-def _replace_online(repository: "ListRepository", store: MapStore, root_key: "Signer") -> None:
-    repository.replace_online(KeyFolder(store.folder / "keys").replace("online").public_key, root_key)
-
-
 def _repository(store: MapStore) -> "ListRepository":
     from mapserver.trust.repository import ListRepository  # late: tuf comes with it
 
-    return ListRepository(SignedLists(store.folder), _now(store))
+    return ListRepository(store.folder, _now(store))
 
 
 def _now(store: MapStore) -> datetime:
@@ -293,10 +279,10 @@ def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
     return last.admitted != admitted_versions(rows) or not is_fresh("site", last.expires, now)
 
 
-def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleases, now: datetime) -> int | None:
+def _update_site(repository: "ListRepository", rows: SiteReleases) -> int | None:
     """The number of the list that was signed, None where none was due or the key is elsewhere."""
-    lists, role = repository.lists, site_role(rows.site)
-    if not _site_is_due(lists, rows, now):
+    lists, keys, role = repository.lists, repository.keys, site_role(rows.site)
+    if not _site_is_due(lists, rows, repository.now):
         return None
     if role not in lists.site_roles():
         root_key = keys.signer("root")
@@ -304,7 +290,8 @@ def _update_site(repository: "ListRepository", keys: KeyFolder, rows: SiteReleas
             return None
         signer = keys.signer(role) or keys.make(role)
         repository.delegate(rows.site, signer.public_key, root_key)
-    lists.check_site(lists.site_roles()[role])
+    if words := lists.retired().get(role):
+        raise UsageError(words)
     site_key = keys.signer(role)
     if site_key is None:
         return None

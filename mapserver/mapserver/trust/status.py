@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from fleetmap.errors import StateError, UsageError
+from fleetmap.errors import StateError
 from fleetmap.trust import site_role
 from mapserver.store import MapStore
 from mapserver.trust.authorities import Authorities
@@ -49,12 +49,7 @@ def trust_status(store: MapStore) -> TrustStatus:
     for name in ("root", "targets", "snapshot", TIMESTAMP, *known):
         found.roles.append(_role(lists, name, now))
     found.faults = [f"{status.role}: {status.fault}" for status in found.roles if status.fault]
-    try:
-        lists.check_root()
-        for signed_by in known.values():
-            lists.check_site(signed_by)
-    except UsageError as error:
-        found.faults.append(str(error))
+    found.faults += lists.retired().values()
     own = KeyFolder(store.folder / "keys")
     for info in store.sites():
         role = site_role(info.site)

@@ -83,7 +83,7 @@ class World:
         return releases.publish(self.store, SITE)
 
     def repository(self) -> ListRepository:
-        return ListRepository(SignedLists(self.store.folder), datetime.now(UTC))
+        return ListRepository(self.store.folder, datetime.now(UTC))
 
     def attacker(self, versions: int = 3) -> BusService:
         """Answers first, with maps and lists of its own; its version 3 is not the honest one."""

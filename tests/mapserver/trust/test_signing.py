@@ -144,7 +144,7 @@ def test_old_lists_are_removed_and_roots_are_not(store: MapStore) -> None:
 
 
 def test_another_key_than_the_root_key_changes_nothing(store: MapStore) -> None:
-    lists, thief = SignedLists(store.folder), new_key()
+    thief = new_key()
     before = {path: path.read_bytes() for path in store.folder.glob("[kt]*/*.*")}
     for act in (signing.rotate_online, signing.rotate_root):
         with pytest.raises(StateError, match="is not the root key of"):
@@ -152,11 +152,11 @@ def test_another_key_than_the_root_key_changes_nothing(store: MapStore) -> None:
     for act in (signing.admit_site, signing.revoke_site):
         with pytest.raises(StateError, match="is not the root key of"):
             act(store, "lab", thief)
-    repository = ListRepository(lists, datetime.fromtimestamp(store.now_ns() / 1e9, UTC))
+    repository = ListRepository(store.folder, datetime.fromtimestamp(store.now_ns() / 1e9, UTC))
     for sign in (
         lambda: repository.sign_site("lab", signing.admitted_versions(store.releases("lab")), thief),
         lambda: repository.delegate("lab", thief.public_key, thief),
-        lambda: repository.replace_online(thief.public_key, thief),
+        lambda: repository.replace_root(thief, thief),
         lambda: repository.sign_online(thief),
     ):
         with pytest.raises(StateError, match="not signed as robots demand"):

@@ -52,7 +52,7 @@ def enrol(
     from fleetmap.bus import check_endpoint
     from mapserver.store import MapStore
     from mapserver.store.files import write_atomically
-    from mapserver.trust.enrolment import LISTENING, RobotRegister, bundle_path
+    from mapserver.trust.enrolment import LISTENING, RobotRegister
 
     with MapStore.open(where.store) as maps:
         register = RobotRegister(maps)
@@ -60,10 +60,9 @@ def enrol(
         with disk_errors(f"{out} cannot be written", "name another folder by --out", UsageError):
             out.mkdir(parents=True, exist_ok=True)
             for robot, bundle in register.enrol(where.site, robots, reached, actor=by.named()).items():
-                write_atomically(bundle_path(out, robot), [bundle])
-                typer.echo(
-                    f"{bundle_path(out, robot)}: for robot {robot} of site {where.site} at {reached}, within 24 h"
-                )
+                path = out / f"{robot}.fleetmap"
+                write_atomically(path, [bundle])
+                typer.echo(f"{path}: for robot {robot} of site {where.site} at {reached}, within 24 h")
         if where.site not in {info.site for info in maps.sites()}:
             typer.echo(f"note: the store has no map of site {where.site} yet", err=True)
 
@@ -102,8 +101,8 @@ def list_(
         return
     table = Table("site", "robot", "certificate", "enrolled", "state")
     for row in rows:
-        enrolled = datetime.fromtimestamp(row.enrolled_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
-        table.add_row(row.site, row.robot, row.certificate, enrolled, row.state)
+        enrolled = datetime.fromtimestamp(int(row["enrolled_ns"]) / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
+        table.add_row(*(str(row[name]) for name in ("site", "robot", "certificate")), enrolled, str(row["state"]))
     plain_console().print(table)
 
 
