@@ -247,6 +247,9 @@ class MapData:
         """The last that happened to a site in a time, newest first."""
         return self._store.events(site, span_ns)[::-1][:_EVENTS_SHOWN]
 
+    def job(self, number: int) -> JobInfo:
+        return self._store.job(number)
+
     def publish(self, site: str, version: int, actor: Actor) -> str:
         """Takes a draft through the gate and makes it current."""
         releases.publish(self._store, site, version, actor=actor, gate=self._gate)
