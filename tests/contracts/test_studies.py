@@ -64,9 +64,11 @@ def test_what_was_stopped_goes_on(tmp_path: study.Path, monkeypatch: pytest.Monk
     assert [row["value"] for row in rows] == [1, 2, 4]
 
 
-def test_the_readme_shows_the_table_of_public_sequences() -> None:
-    page, readme = ((study.PAGES / "public_sequences.md"), study.PAGES.parents[1] / "README.md")
-    table = readme.read_text().partition("<!-- begin of results -->")[2].partition("<!-- end of results -->")[0].strip()
+def test_the_comparison_shows_the_table_of_public_sequences() -> None:
+    page, comparison = ((study.PAGES / "public_sequences.md"), study.PAGES.parent / "comparison.md")
+    table = (
+        comparison.read_text().partition("<!-- begin of results -->")[2].partition("<!-- end of results -->")[0].strip()
+    )
     assert table.startswith("| recording |")
     assert table in page.read_text()
 

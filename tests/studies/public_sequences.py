@@ -26,7 +26,7 @@ from studies.study import PAGES, Column, Row, between_marks, publish, results, r
 from support.recordings.realdata import DATA
 
 _SHORT_M = 1.0  # of less no share is said
-README = PAGES.parents[1] / "README.md"
+COMPARISON = PAGES.parent / "comparison.md"
 # What others reach on the same frames, measured by us once, and what their authors print of the whole sequence (docs/studies).
 PEERS = {
     "euroc_mh01_start": ("EuRoC MH_01, first 15 s", "ORB-SLAM3 4.2, stella_vslam 4.6", "ORB-SLAM3 36, OKVIS2-X 28 (mean of 11)"),
@@ -144,7 +144,7 @@ def draw(rows: list[Row]) -> Figure:
 
 
 def main() -> None:
-    """Rows and picture of docs/studies/public_sequences.md; the table stands in the README, too. `--out FILE`: rows as JSON, no page."""
+    """Rows and picture of docs/studies/public_sequences.md and the table of docs/comparison.md. `--out FILE`: rows as JSON, no page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path)
     if (out := parser.parse_args().out) is not None:
@@ -153,7 +153,7 @@ def main() -> None:
     rows = results("public_sequences", CASES)
     shown = table(rows, COLUMNS)
     publish("public_sequences", [shown], draw(rows))
-    README.write_text(between_marks(README.read_text(), shown, README))
+    COMPARISON.write_text(between_marks(COMPARISON.read_text(), shown, COMPARISON))
 
 
 if __name__ == "__main__":
