@@ -11,7 +11,6 @@ from locclient.commands.config import CONFIG
 from locclient.commands.enrol import enrol
 from locclient.commands.prepare import prepare
 from locclient.commands.replay import replay
-from locclient.commands.replay_failure import replay_failure
 from locclient.commands.run import run
 from locclient.commands.status import status
 
@@ -22,7 +21,6 @@ COMMANDS: Commands = {
     "enrol": enrol,
     "check": check,
     "replay": replay,
-    "replay-failure": replay_failure,
     "run": run,
     "status": status,
     "prepare": prepare,

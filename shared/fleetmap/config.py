@@ -27,6 +27,7 @@ _OF_PEOPLE = (
 )
 RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
+    "manifest": "`--version N` names another version of `--store DIR`",
     "walls": "`mapserver align --pin ...` replaces it; delete the key",
     "frozen": _IN_A_VERSION,
     "map": _IN_A_VERSION,

@@ -108,15 +108,61 @@ def replay(
     ] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: it did not find itself."""
+    """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: it did not find itself.
+
+    A failure's recording begins with the robot's pose, in the robot's version unless --version names another, and is compared with what
+    the robot said.
+    """
+    from fleetmap.recordings.failure_recording import is_failure_recording
+
     settings = settings_of(context)
-    address = replace(map_options.address(), version=version)
+    if is_failure_recording(recording):
+        _replay_failure(recording, map_options, playback, files, version)
+        return
+    address = _in_version(map_options.address(), version)
+    files.check()
+    _run(recording, (address, map_options), playback, files, settings)
+
+
+def _replay_failure(
+    path: Path, map_options: MapOptions, playback: PlaybackOptions, files: ResultFiles, version: int | None
+) -> None:
+    """Asks whether the present localizer would have failed too; the site is the failure's unless another is named."""
+    from fleetmap.encoding import to_json
+    from locclient.delivery.failure_file import read_failure_file
+    from locclient.maps.connection import connected
+    from locclient.replay.failure_replay import compare_failure, phases
+
+    for given in (playback, replace(files, report=None)):
+        for name, value in vars(given).items():
+            if value != getattr(type(given)(), name):
+                raise UsageError(
+                    f"--{name} is not for a failure's recording ({path}), which is played as a whole; leave it out"
+                )
+    files.check()
+    summary, record = read_failure_file(path)
+    address = _in_version(replace(map_options, site=map_options.site or summary.site).address(), version)
+    with connected(address, map_options.cache, map_options.cache_bytes) as connection:
+        sha256 = None if version is None else connection.source.ready().wanted.manifest_sha256
+        found = compare_failure((summary, record), connection.source, sha256)
+    if files.report is not None:
+        answer = {"answer": found.answer, "version": found.version, "is_same": found.first_difference_ns is None}
+        told = {"apart_m": found.apart_m, "then": summary.moments, "now": found.now}
+        files.report.write_bytes(to_json(answer | told, indent=2) + b"\n")
+    typer.echo(
+        f"{summary.robot}, version {summary.version}, fleetmap {summary.client}; seconds since the failure began"
+    )
+    typer.echo(f"then: {', '.join(phases(summary.moments, summary.began_ns))}")
+    typer.echo(f"now:  {', '.join(phases(found.now, summary.began_ns))}")
+    typer.echo(found.answer)
+
+
+def _in_version(address: "MapAddress", version: int | None) -> "MapAddress":
     if version is not None and address.store is None:
         raise UsageError(
             f"--version {version} needs --store DIR: a server gives the version that its robots should run"
         )
-    files.check()
-    _run(recording, (address, map_options), playback, files, settings)
+    return replace(address, version=version)
 
 
 def _run(

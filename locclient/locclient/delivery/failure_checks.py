@@ -21,7 +21,6 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 
 MAX_ROWS = 10_000  # of an array, and members of a list
-_MAX_DEPTH = 16
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
 _ANGLE_TOLERANCE, _COVARIANCE_TOLERANCE = 1e-3, 1e-6
 _MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m")
@@ -76,22 +75,17 @@ def _octaves(octaves: AnyArray, _: StereoCamera) -> bool:
     return bool(np.all((octaves >= 0) & (octaves < 32)))
 
 
-def _rising(ids: AnyArray, _: StereoCamera) -> bool:
-    return bool(np.all(ids[1:] > ids[:-1]))
-
-
 _TRANSFORM, _COVARIANCE, _VECTOR = (
     Kind("<f8", (4, 4), _rigid),
     Kind("<f8", (6, 6), _covariance),
     Kind("<f8", (3,), _finite),
 )
 _TRANSFORMS = (
-    "body_from_cam base_from_body odom_from_body previous_from_body new_odom_from_old_odom search_odom_from_body "
-    "view_odom_from_body map_from_body now_map_from_body query_map_from_body map_from_base failed_places"
+    "body_from_cam base_from_body odom_from_body previous_from_body new_odom_from_old_odom map_from_body map_from_base"
 )
 ARRAYS: Mapping[str, Kind] = {
     **dict.fromkeys(_TRANSFORMS.split(), _TRANSFORM),
-    **dict.fromkeys(("cov_rot_trans", "now_cov", "query_cov", "cov_bias_cam"), _COVARIANCE),
+    **dict.fromkeys(("cov_rot_trans", "cov_bias_cam"), _COVARIANCE),
     **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), _VECTOR),
     # a map query: features
     "pixels": Kind("<f8", ("n", 2), _within),
@@ -99,12 +93,6 @@ ARRAYS: Mapping[str, Kind] = {
     "angles_deg": Kind("<f4", ("n",), _finite),
     "descriptors": Kind("|u1", ("n", 32), _any),
     "right_px": Kind("<f8", ("n",), _columns),
-    "is_tried": Kind("|b1", ("n",), _any),
-    # landmarks that a hypothesis has observed
-    "ids": Kind("<u4", ("n",), _rising),
-    "points_odom": Kind("<f8", ("n", 3), _finite),
-    "expected": Kind("<u8", ("n",), _any),
-    "found": Kind("<u8", ("n",), _any),
     # tracks of the odometry, which no recording keeps
     "track_ids": Kind("<i8", (0,), _any),
     "track_pixels": Kind("<f8", (0, 3), _any),
@@ -121,22 +109,24 @@ def check_record(record: Any) -> None:
         raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
     if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
         raise _refused("camera", f"focal length, centre and baseline {numbers}")
-    _Walk(camera).check(record, "", 0)
+    _Walk(camera).check(record, "")
     stamps = [frame.odometry.stamp_ns for frame in record.frames]
     if any(later <= earlier for earlier, later in pairwise(stamps)):
         raise _refused("frames", "stamps that do not increase")
-    disambiguated, hypotheses = record.state.candidates.disambiguated, record.state.candidates.hypotheses
-    if disambiguated is not None and disambiguated >= len(hypotheses):
-        raise _refused("state.candidates.disambiguated", f"{disambiguated} of {len(hypotheses)} hypotheses")
     for place, frame in enumerate(record.frames):
-        query = frame.query
-        given = () if query is None else [getattr(query, name) is None for name in query.__struct_fields__[1:]]
+        if (query := frame.query) is None:
+            continue
+        if not 0 <= query.slices <= MAX_ROWS:
+            raise _refused(f"frames[{place}].query.slices", f"{query.slices} of them")
+        given = [getattr(query, name) is None for name in query.__struct_fields__[1:]]
         if any(given) and not all(given):
             raise _refused(f"frames[{place}].query", "some arrays of a map query without the others")
+    if (record.start.map_from_body is None) != (record.start.cov_rot_trans is None):
+        raise _refused("start", "a pose without its covariance, or the other way round")
 
 
 def _refused(where: str, what: str) -> RecordingError:
-    return RecordingError(f"{where}: {what}; no robot writes that, the recording itself plays with `locclient replay`")
+    return RecordingError(f"{where}: {what}; no robot writes that; Foxglove opens the recording")
 
 
 class _Walk:
@@ -145,25 +135,23 @@ class _Walk:
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
 
-    def check(self, value: Any, where: str, depth: int) -> None:
-        if depth > _MAX_DEPTH:
-            raise _refused(where, f"more than {_MAX_DEPTH} levels")
+    def check(self, value: Any, where: str) -> None:
         if isinstance(value, Section):
-            self._settings(value, where, depth)
+            self._settings(value, where)
         elif isinstance(value, msgspec.Struct):
-            self._members(value, value.__struct_fields__, where, depth)
+            self._members(value, value.__struct_fields__, where)
         elif is_dataclass(value):
-            self._members(value, [field.name for field in fields(value)], where, depth)
+            self._members(value, [field.name for field in fields(value)], where)
         elif isinstance(value, Mapping):
-            self._many(list(value.items()), where, depth)
+            self._many(list(value.items()), where)
         elif hasattr(value, "_fields"):
-            self._members(value, value._fields, where, depth)
+            self._members(value, value._fields, where)
         elif isinstance(value, list | tuple):
-            self._many(value, where, depth)
+            self._many(value, where)
         else:
             self._number(value, where)
 
-    def _members(self, value: Any, names: Sequence[str], where: str, depth: int) -> None:
+    def _members(self, value: Any, names: Sequence[str], where: str) -> None:
         lengths: dict[str, int] = {}
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
@@ -173,18 +161,18 @@ class _Walk:
                     kind = _COVARIANCE._replace(is_good=_prior_covariance)
                 self._array(member, kind, at, lengths)
             else:
-                self.check(member, at, depth + 1)
+                self.check(member, at)
 
-    def _many(self, values: Sequence[Any], where: str, depth: int) -> None:
+    def _many(self, values: Sequence[Any], where: str) -> None:
         if len(values) > MAX_ROWS:
             raise _refused(where, f"{len(values)} of them, at most {MAX_ROWS} are read")
         name = where.rpartition(".")[2].partition("[")[0]
         for place, value in enumerate(values):
             at = f"{where}[{place}]"
             if isinstance(value, np.ndarray):
-                self._array(value, _MOTION.get(place) if name == "motions" else ARRAYS.get(name), at, {})
+                self._array(value, _MOTION.get(place) if name == "motions" else None, at, {})
             else:
-                self.check(value, at, depth + 1)
+                self.check(value, at)
 
     def _array(self, array: AnyArray, kind: Kind | None, where: str, lengths: dict[str, int]) -> None:
         if kind is None:
@@ -200,13 +188,13 @@ class _Walk:
         if max(array.shape) > MAX_ROWS or not kind.is_good(array, self._camera):
             raise _refused(where, f"values that cannot be, of shape {array.shape}")
 
-    def _settings(self, value: Section, where: str, depth: int) -> None:
+    def _settings(self, value: Section, where: str) -> None:
         for name in value.__struct_fields__:
             member, at = getattr(value, name), f"{where}.{name}"
             is_number = isinstance(member, int | float) and name != "seed"
             if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
                 raise _refused(at, f"{member}")
-            self.check(member, at, depth + 1)
+            self.check(member, at)
 
     def _number(self, value: Any, where: str) -> None:
         name = where.rpartition(".")[2]

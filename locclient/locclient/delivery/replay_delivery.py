@@ -34,7 +34,7 @@ class ReplayQueue:
 
     def work(self) -> None:
         """Writes recordings that are complete; one that cannot be written or is too large is lost, and its report is not."""
-        for report, cut in [entry for entry in self._pending if entry[1].segments is not None]:
+        for report, cut in [entry for entry in self._pending if entry[1].frames is not None]:
             self._pending.remove((report, cut))
             try:
                 data = failure_file(cut, report, self._profile, self._pictures)

@@ -10,7 +10,6 @@ from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.alias_disambiguation import ViewpointGate, log_odds, mark_shared
-from locclient.localization.localizer_state import CandidatesState, all_copied, copied
 from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -163,24 +162,6 @@ class HypothesisSet:
         self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
         self.lookalikes: LookAlikes | None = None  # None where nobody measured them
-
-    def capture(self) -> CandidatesState:
-        """All of it, as values."""
-        places = [place for place, h in enumerate(self.hypotheses) if h is self._disambiguated]
-        return CandidatesState(
-            all_copied(self.hypotheses),
-            places[0] if places else None,
-            copied(self._abandoned),
-            self._viewpoint_gate.odom_from_body,
-            self.lookalikes,
-        )
-
-    def restore(self, state: CandidatesState) -> None:
-        """Becomes what was captured."""
-        self.reset(copied(state.abandoned), all_copied(state.hypotheses))
-        self._disambiguated = None if state.disambiguated is None else self.hypotheses[state.disambiguated]
-        self._viewpoint_gate = ViewpointGate(state.view_odom_from_body)
-        self.lookalikes = state.lookalikes
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""

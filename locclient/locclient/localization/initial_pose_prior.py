@@ -16,7 +16,6 @@ from locclient.localization.hypothesis_set import (
     recent,
     vote,
 )
-from locclient.localization.localizer_state import PriorState, all_copied, copied
 from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -51,18 +50,20 @@ class InitialPosePrior:
 
     def __init__(self, prior: PositionPrior, base_from_body: Array) -> None:
         self._prior, self._base_from_body = prior, base_from_body
-        self._travelled_m = 0.0
+        self.travelled_m = 0.0
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
         self.contradictions: list[PoseHypothesis] = []
         self.is_revisable = prior.is_revisable
 
     @classmethod
-    def restored(cls, state: PriorState, base_from_body: Array) -> "InitialPosePrior":
-        """As it was when `capture` was called."""
-        made = cls(state.prior, base_from_body)
-        made._travelled_m, made._since = state.travelled_m, copied(state.since)
-        made.hypothesis, made.contradictions = copied(state.hypothesis), list(all_copied(state.contradictions))
+    def at(cls, known: PoseHypothesis, base_from_body: Array, *, is_revisable: bool) -> "InitialPosePrior":
+        """A pose at a frame of the odometry as a prior."""
+        map_from_base = known.map_from_body @ se3_inverse(base_from_body)
+        covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
+        made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body)
+        identity = np.eye(4), np.zeros((6, 6))
+        made.hypothesis, made._since = known, PoseHypothesis(known.frame_index, known.stamp_ns, *identity, *identity)
         return made
 
     @property
@@ -70,14 +71,9 @@ class InitialPosePrior:
         """True if no frame has come since."""
         return self._since is None
 
-    def capture(self) -> PriorState:
-        """All of it, as values."""
-        hypotheses = copied(self._since), copied(self.hypothesis), all_copied(self.contradictions)
-        return PriorState(self._prior, self._travelled_m, *hypotheses)
-
     def propagate(self, tracker: Motion, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
         """To the present frame, by `step` (4, 4) from the last one. The caller propagates `hypothesis` with the others."""
-        self._travelled_m += float(np.linalg.norm(step[:3, 3]))
+        self.travelled_m += float(np.linalg.norm(step[:3, 3]))
         if self._since is not None:
             self._since.propagate(tracker, odometry, step, settings)
             return
@@ -123,7 +119,7 @@ class InitialPosePrior:
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
         """(N,) which positions (N, 3) may show what the robot sees now."""
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
-        return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self._travelled_m + _PLACE_REACH_M)
+        return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 
     def weighed(self, observations: Observations, settings: TrackSettings) -> Observations:
         """The fixes of a query, with what a person's word for its place is worth to each: 0 for places that were not named. Exact sources
@@ -148,5 +144,5 @@ class InitialPosePrior:
     def _cov_m2(self, scale: float = 1.0) -> Array:
         """(2, 2) of the prior's horizontal position, its own part times `scale`. It grows with the distance travelled: neither unmodelled
         drift nor a push nor an operator's error must keep the robot from its pose for ever."""
-        added = _SIGMA_M**2 + (_DRIFT_SHARE * self._travelled_m) ** 2
+        added = _SIGMA_M**2 + (_DRIFT_SHARE * self.travelled_m) ** 2
         return np.asarray(scale * self._prior.cov_rot_trans[3:5, 3:5] + added * np.eye(2))

@@ -1,6 +1,7 @@
 """The localizer: samples and tiles in, one estimate for each frame out. Pure."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.estimate import Estimate, LocalizationState, QueryResult, assemble
 from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
 from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
-from locclient.localization.localizer_state import LocalizerState, copied
 from locclient.localization.perception import Perception, SensorPerception
 from locclient.localization.pose_covariance import innovation_of, kalman_update, transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
@@ -32,6 +32,28 @@ _SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a 
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 _MORE_SLICES = 3  # in a frame: of a search where the last one began too, as a late estimate costs nothing there, and where tracks broke
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a localizer begins with: by default it searches for itself.
+
+    map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
+    of which stamp_ns and support are; else by a prior, with its is_revisable and travelled_m, the distance since it came. has_broken:
+    tracks broke since. was_tracking: the robot has known its pose before. failed_queries: the last so many map queries found nothing.
+    """
+
+    frame_index: int = 0
+    stamp_ns: int = 0
+    support: int = 0
+    map_from_body: Array | None = None
+    cov_rot_trans: Array | None = None
+    is_confirmed: bool = False
+    is_revisable: bool = False
+    travelled_m: float = 0.0
+    has_broken: bool = False
+    was_tracking: bool = False
+    failed_queries: int = 0
 
 
 class Localizer:
@@ -119,32 +141,42 @@ class Localizer:
         self._failed_places.clear()
         self.perception.give_up()
 
-    def capture(self) -> LocalizerState | None:
-        """What later estimates depend on beside maps and perception, as values; None while a map query goes on."""
+    def start(self) -> Start | None:
+        """What another localizer, with the same odometry, goes on with; None while a map query goes on, as its fix would be missing."""
         if self._work is not None:
             return None
-        return LocalizerState(
-            confirmed=copied(self._confirmed),
-            candidates=self._candidates.capture(),
-            prior=None if self._prior is None else self._prior.capture(),
-            odom_from_body=self._last_odom_from_body,
-            stamps_ns=(self._last_ns, self._query_ns),
-            failed_queries=self._failed_queries,
-            failed_places=tuple(self._failed_places),
-            search_odom_from_body=self._search_gate.odom_from_body,
-            was_tracking=self._was_tracking,
+        prior = self._prior
+        known = self._confirmed or (None if prior is None else prior.hypothesis)
+        start = Start(was_tracking=self._was_tracking, failed_queries=self._failed_queries)
+        if known is None:
+            return start
+        return replace(
+            start,
+            frame_index=known.frame_index,
+            stamp_ns=known.stamp_ns,
+            support=known.support,
+            map_from_body=known.map_from_body,
+            cov_rot_trans=known.cov_rot_trans,
+            is_confirmed=self._confirmed is not None,
+            is_revisable=prior is not None and prior.is_revisable,
+            travelled_m=0.0 if prior is None else prior.travelled_m,
+            has_broken=known.has_broken,
         )
 
-    def restore(self, state: LocalizerState) -> None:
-        """Goes on from a state, in the map that was given last."""
-        self._work = self._query_frame = None
-        self._confirmed = copied(state.confirmed)
-        self._candidates.restore(state.candidates)
-        self._prior = None if state.prior is None else InitialPosePrior.restored(state.prior, self._base_from_body)
-        self._last_odom_from_body, (self._last_ns, self._query_ns) = state.odom_from_body, state.stamps_ns
-        self._failed_queries, self._failed_places = state.failed_queries, list(state.failed_places)
-        self._search_gate = ViewpointGate(state.search_odom_from_body)
-        self._was_tracking = state.was_tracking
+    def begin(self, start: Start) -> None:
+        """Goes on from `start` with the next frame."""
+        self.forget_pose()
+        self._was_tracking, self._failed_queries = start.was_tracking, start.failed_queries
+        if start.map_from_body is None or start.cov_rot_trans is None:
+            return
+        at_frame = start.map_from_body, start.cov_rot_trans
+        known = PoseHypothesis(start.frame_index, start.stamp_ns, *at_frame, *at_frame, support=start.support)
+        known.has_broken = start.has_broken
+        if start.is_confirmed:
+            self._confirmed = known
+        else:
+            self._prior = InitialPosePrior.at(known, self._base_from_body, is_revisable=start.is_revisable)
+            self._prior.travelled_m = start.travelled_m
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """The estimate at `frame`, newer than any before."""
@@ -193,7 +225,7 @@ class Localizer:
         if last is not None and change is not None:
             last = change @ last
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
-        if last is not None and odometry.previous_from_body is not None:
+        if odometry.previous_from_body is not None:
             step = odometry.previous_from_body
         for hypothesis in [*self._hypotheses(), *([self._query_frame] if self._query_frame else [])]:
             hypothesis.propagate(self.perception, odometry, step, self._track)
@@ -221,7 +253,8 @@ class Localizer:
         if is_urgent and not self._is_urgent:
             self._work = self._query_frame = None  # a frame before the break says nothing about where the robot is now
         if self._work is None:
-            if self._relocalizer is None or not (is_urgent or self._is_query_due(frame.stamp_ns, odometry)):
+            is_due = is_urgent or self._is_query_due(frame.stamp_ns, odometry)
+            if self._relocalizer is None or not self.perception.may_query(is_due=is_due):
                 return QueryResult()
             is_at_once = self._is_sparse(frame.stamp_ns) or odometry.after_gap
             self._query_ns = frame.stamp_ns

@@ -1,6 +1,6 @@
 """What a robot perceives by its sensors, before a map says where that is: quality of images, motion, features, calibration. Pure.
 
-It is all that the localizer takes from images and samples. A kept failure replays it without them, bit for bit.
+It is all that the localizer takes from images and samples. The replay of a failure has it without them.
 """
 
 from collections.abc import Sequence
@@ -41,6 +41,9 @@ class Perception(Motion, Protocol):
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
         """As `CalibrationMonitor.is_reversed`, after a slice of that monitor's work."""
+
+    def may_query(self, *, is_due: bool) -> bool:
+        """Whether a map query begins with this frame. is_due: by the time since the last one."""
 
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
         """The features of a frame for a map query, in slices."""
@@ -103,6 +106,9 @@ class SensorPerception:
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
         self._calibration.work()
         return self._calibration.is_reversed(frame, is_localized=is_localized)
+
+    def may_query(self, *, is_due: bool) -> bool:
+        return is_due
 
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
         return relocalizer.extract(frame)

@@ -1,13 +1,15 @@
 """Replay of a failure: the present localizer over what the robot perceived, in the map that it had or in another version.
 
-In the robot's own version and by its own code it says the same again, bit for bit. Another version or a newer localizer is given the same
-perception; depth of features is known where the robot measured it or its images were kept, and the odometry, which knows no map, is as it
-was. A newer odometry or extractor is tried on the recording's reduced images: `locclient replay` plays the same file.
+It begins with the robot's pose and covariance at the beginning of the recording. In the robot's own version it finds the same statuses and
+causes, and poses within `SAME_M`; where the recording begins while the robot searched for itself, not before its first fixes. Another
+version or a newer localizer is given the same perception; depth of features is known where the robot measured it or its images were
+kept, and the odometry, which knows no map, is as it was.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from math import dist, pi, remainder
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +30,18 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
-from locclient.delivery.failure_file import KeptFrameRecord, LocalizerRecord, QueryRecord, moment
+from locclient.delivery.failure_file import LocalizerRecord
 from locclient.localization.calibration.monitor import FinishedQuery, with_calibration
-from locclient.localization.calibration.parameters import NOT_JUDGED
 from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.image_quality import ImageQuality
 from locclient.localization.localizer import Localizer
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
-from locclient.robot.failure_ring import Said, UsedMap
+from locclient.robot.failure_ring import KeptFrame, KeptQuery, UsedMap, moment_of
 
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
+SAME_M, SAME_RAD = 0.01, np.radians(0.5)  # of poses that count as the same
 
 
 class KeptFeatures(FrameFeatures):
@@ -60,12 +62,10 @@ class KeptPerception:
     def __init__(self, record: LocalizerRecord) -> None:
         self._rig = Mounting(se3_inverse(record.body_from_cam), record.base_from_body)
         self._frame = record.frames[0]
-        self._calibration = NOT_JUDGED
 
-    def show(self, frame: KeptFrameRecord) -> None:
+    def show(self, frame: KeptFrame) -> None:
         """The frame that comes next."""
         self._frame = frame
-        self._calibration = frame.calibration or self._calibration
 
     def handle_imu(self, samples: ImuSamples) -> None:
         """Nothing: the odometry's estimates are kept."""
@@ -89,11 +89,13 @@ class KeptPerception:
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
         return self._frame.is_reversed
 
+    def may_query(self, *, is_due: bool) -> bool:
+        """Where the robot did: only there features were kept."""
+        return self._frame.query is not None
+
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
         query = self._frame.query
-        if query is None:  # another version asks at another frame than the robot did
-            yield
-            return FrameFeatures(Features.empty(), np.zeros((0, 3)))
+        assert query is not None
         for _ in range(query.slices):
             yield
         return _features(query)
@@ -106,15 +108,15 @@ class KeptPerception:
 
     def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
         fixed_ns = None if self._frame.is_reversed else last_fix_ns
-        return with_calibration(estimate, self._calibration, self._rig, fixed_ns, was_localized=was_localized)
+        return with_calibration(estimate, self._frame.calibration, self._rig, fixed_ns, was_localized=was_localized)
 
 
-def _features(query: QueryRecord) -> FrameFeatures:
+def _features(query: KeptQuery) -> FrameFeatures:
     if query.pixels is None:
         raise RecordingError(
             "a map query without features is over before they are there; was the file made by a robot?"
         )
-    pixels, octaves, angles_deg, descriptors, right_px = (getattr(query, name) for name in query.__struct_fields__[1:6])
+    pixels, octaves, angles_deg, descriptors, right_px = (getattr(query, name) for name in query.__struct_fields__[1:])
     features = Features(pixels, octaves, angles_deg, descriptors)
     made = KeptFeatures(features, np.column_stack([features.pixels, np.full(len(features), np.nan)]))
     made.kept_px = np.asarray(right_px)
@@ -133,7 +135,7 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     perception = localizer.perception = KeptPerception(record)
     if record.used is not None:
         _use(localizer, load(record.used))
-    localizer.restore(record.state)
+    localizer.begin(record.start)
     said = []
     for frame in record.frames:
         if frame.used is not None:
@@ -145,7 +147,7 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
         perception.show(frame)
         stamp_ns = frame.odometry.stamp_ns
         estimate = localizer.handle_stereo(RectifiedFrame(stamp_ns, _NO_IMAGE, None, None))
-        said.append(moment(stamp_ns, Said.of(estimate)))
+        said.append(moment_of(estimate))
     return said
 
 
@@ -164,14 +166,15 @@ class Comparison:
 
     @property
     def first_difference_ns(self) -> int | None:
-        """Stamp of the first frame of which another status or place is said, None where all is the same to the last bit."""
+        """Stamp of the first frame of which another status, cause or pose is said; None where there is none."""
         pairs = zip(self.summary.moments, self.now, strict=True)
-        return next((then.stamp_ns for then, now in pairs if then != now), None)
+        return next((then.stamp_ns for then, now in pairs if not _is_same(then, now)), None)
 
     @property
-    def has_same_statuses(self) -> bool:
-        """Whether the sequence of statuses is the same."""
-        return [moment.status for moment in self.summary.moments] == [moment.status for moment in self.now]
+    def apart_m(self) -> float:
+        """The largest distance between poses of the same frame."""
+        pairs = [(a.position_map_m, b.position_map_m) for a, b in zip(self.summary.moments, self.now, strict=True)]
+        return max((dist(a, b) for a, b in pairs if a is not None and b is not None), default=0.0)
 
     @property
     def answer(self) -> str:
@@ -179,12 +182,21 @@ class Comparison:
         then_s, now_s = (longest_blind_s(moments) for moments in (self.summary.moments, self.now))
         what = f"version {self.version}" if self.version != self.summary.version else "this client"
         if self.first_difference_ns is None:
-            return f"{what} says the same of every frame"
+            return f"{what} says the same of every frame, with poses at most {1e3 * self.apart_m:.1f} mm apart"
         if now_s > BLIND_S:
             return f"{what} would have failed too: no position to rely upon for {now_s:.1f} s, then {then_s:.1f} s"
         if then_s > BLIND_S:
             return f"{what} would not have failed: at most {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
         return f"{what} says otherwise: {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
+
+
+def _is_same(then: Moment, now: Moment) -> bool:
+    if (then.status, then.cause) != (now.status, now.cause):
+        return False
+    if then.position_map_m is None or now.position_map_m is None:
+        return then.position_map_m is now.position_map_m
+    turn_rad = remainder((then.heading_rad or 0.0) - (now.heading_rad or 0.0), 2 * pi)
+    return dist(then.position_map_m, now.position_map_m) <= SAME_M and abs(turn_rad) <= SAME_RAD
 
 
 def longest_blind_s(moments: Sequence[Moment]) -> float:

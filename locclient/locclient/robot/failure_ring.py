@@ -1,16 +1,20 @@
 """Ring of the last seconds: what the localizer perceived, what it answered, and a few pictures, kept for the replay of a failure. Pure.
 
 The odometry knows no map: its estimates are kept as they were, not its samples alone, so that no image is needed to repeat what the map
-made of them. States of the localizer are taken about once a second, between two map queries; a replay begins at one of them.
+made of them. A replay begins with the pose that the robot had then.
 """
 
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import atan2
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.failure_definition import radius_95_m
+from fleetmap.failure_summary import Moment
 from fleetmap.geometry import Array
 from fleetmap.messages import FailureKind
 from fleetmap.numerics.time_sliced import TimeSliced
@@ -23,18 +27,15 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.estimate import Estimate
 from locclient.localization.image_quality import ImageQuality
-from locclient.localization.localizer import Localizer
-from locclient.localization.localizer_state import LocalizerState
+from locclient.localization.localizer import Localizer, Start
 from locclient.maps.loaded_map import LoadedMap
 
 BEFORE_NS, AFTER_NS = 5_000_000_000, 5_000_000_000  # of a failure's onset
-_SEGMENT_NS = 1_000_000_000  # between two states
+_QUERY_NS = 2_000_000_000  # longer than a map query lasts: a replay begins between two of them
 _PICTURES_NS, _LATEST_PICTURE_NS = 450_000_000, 900_000_000  # between two, of map queries and of any frame
 _SAME_ONSET_NS = 3_500_000_000  # a carried robot's onset is the break of its odometry, up to three seconds earlier
 _MAX_FRAMES = 1000  # 90 a second: a camera that is faster has a shorter ring
 _NO_TRACKS = np.zeros(0, np.int64)
-
-Motions = dict[int, tuple[Array, Array] | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +47,39 @@ class UsedMap:
     cells: tuple[tuple[int, int], ...]
 
 
-@dataclass(slots=True, eq=False)
-class KeptQuery:
-    """A map query that began with a frame: its features, None while they are extracted, and in how many slices that was done."""
+class KeptQuery(msgspec.Struct, array_like=True):
+    """A map query: in how many slices its features were extracted, features (N), and the columns of the right image (N,), NaN where
+    unknown. The arrays are None of a query that was given up before."""
 
     slices: int = 0
-    features: FrameFeatures | None = None
+    pixels: Array | None = None
+    octaves: NDArray[np.int8] | None = None
+    angles_deg: NDArray[np.float32] | None = None
+    descriptors: NDArray[np.uint8] | None = None
+    right_px: Array | None = None
+
+
+class KeptFrame(msgspec.Struct, kw_only=True):
+    """What the localizer perceived in one frame, as it is written. used, forgets, priors: what came before it, in this order.
+
+    motions, forgotten: answers of the odometry by frame.
+    """
+
+    odometry: OdometryEstimate
+    image: ImageQuality
+    used: UsedMap | None = None
+    forgets: bool = False
+    priors: list[PositionPrior] = []
+    motions: dict[int, tuple[Array, Array] | None] = {}
+    forgotten: dict[int, bool] = {}
+    is_reversed: bool = False
+    calibration: CalibrationState = NOT_JUDGED
+    query: KeptQuery | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Inputs:
-    """What came before a frame. used, forgets, priors: in this order."""
+    """What came before a frame."""
 
     used: UsedMap | None = None
     forgets: bool = False
@@ -66,59 +89,49 @@ class Inputs:
 
 
 @dataclass(slots=True, eq=False)
-class Said:
-    """What the robot said of a frame; map_from_body (4, 4), None with radius_95_m while it claimed no pose."""
+class HeldFrame:
+    """A frame of the ring. features: of its map query. picture: its images, for a few frames only.
 
-    status: str
-    cause: str
-    map_from_body: Array | None
-    radius_95_m: float | None
-
-    @classmethod
-    def of(cls, estimate: Estimate) -> "Said":
-        radius_m = None if estimate.cov_rot_trans is None else radius_95_m(estimate.cov_rot_trans)
-        return cls(estimate.status.value, estimate.cause.value, estimate.map_from_body, radius_m)
-
-
-@dataclass(slots=True, eq=False)
-class KeptFrame:
-    """All that the localizer perceived in one frame, and said.
-
-    motions, forgotten: answers of the odometry by frame. picture: its images, for a few frames only.
+    moment: what the robot said of it; after, used: where a replay of the frames behind it begins, None where it cannot.
     """
 
     inputs: Inputs
-    odometry: OdometryEstimate
-    image: ImageQuality
-    motions: Motions = field(default_factory=dict)
-    forgotten: dict[int, bool] = field(default_factory=dict)
-    is_reversed: bool = False
-    calibration: CalibrationState = NOT_JUDGED
-    query: KeptQuery | None = None
-    said: Said | None = None
+    kept: KeptFrame
+    features: FrameFeatures | None = None
     picture: RectifiedFrame | None = None
+    moment: Moment = field(init=False)
+    after: Start | None = None
+    used: UsedMap | None = None
 
     @property
     def stamp_ns(self) -> int:
-        return self.odometry.stamp_ns
-
-
-@dataclass(slots=True, eq=False)
-class Segment:
-    """A state of the localizer in a map, and the frames since."""
-
-    state: LocalizerState
-    used: UsedMap | None
-    frames: list[KeptFrame] = field(default_factory=list)
+        return self.kept.odometry.stamp_ns
 
 
 @dataclass(slots=True, eq=False)
 class FailureCut:
-    """The part of the ring around an onset; segments is None until all of it has come. is_wanted: of a failure that was reported."""
+    """The part of the ring around an onset; frames is None until all of it has come. is_wanted: of a failure that was reported.
+
+    start, used: where its replay begins.
+    """
 
     onset_ns: int
     is_wanted: bool = True
-    segments: tuple[Segment, ...] | None = None
+    frames: tuple[HeldFrame, ...] | None = None
+    start: Start = field(default_factory=Start)
+    used: UsedMap | None = None
+
+
+def moment_of(estimate: Estimate) -> Moment:
+    """What the robot says of a frame, for people."""
+    said = Moment(estimate.stamp_ns, estimate.status.value, estimate.cause.value)
+    map_from_body, covariance = estimate.map_from_body, estimate.cov_rot_trans
+    if map_from_body is None:
+        return said
+    x_m, y_m, z_m = map_from_body[:3, 3].tolist()
+    heading_rad = atan2(map_from_body[1, 0], map_from_body[0, 0])
+    radius_m = None if covariance is None else radius_95_m(covariance)
+    return msgspec.structs.replace(said, position_map_m=(x_m, y_m, z_m), heading_rad=heading_rad, radius_95_m=radius_m)
 
 
 class FailureRing:
@@ -129,15 +142,15 @@ class FailureRing:
         self._localizer, self._inner = localizer, localizer.perception
         localizer.perception = self
         self.add, self.give_up, self.judged = self._inner.add, self._inner.give_up, self._inner.judged
-        self._segments: deque[Segment] = deque()
+        self._frames: deque[HeldFrame] = deque()
+        self._is_whole = True  # since the robot began
         self._inputs = Inputs()
         self._used: UsedMap | None = None
-        self._frame: KeptFrame | None = None
+        self._frame: HeldFrame | None = None
         self._seen: RectifiedFrame | None = None
         self._cuts: list[FailureCut] = []  # that are not complete
         self._held: FailureCut | None = None  # of what goes on and may become a failure
-        self._query: KeptQuery | None = None  # the last one
-        self._query_index: int | None = None  # its frame
+        self._query: HeldFrame | None = None  # the frame of the last one
         self._pictured_ns = -(2**62)
 
     def use(self, loaded: LoadedMap) -> None:
@@ -154,22 +167,22 @@ class FailureRing:
 
     def handle(self, estimate: Estimate, begun_ns: Mapping[FailureKind, int]) -> None:
         """Ends a frame. begun_ns: since when what may become a failure goes on, by kind."""
-        frame = self._frame
-        assert frame is not None
-        frame.calibration = estimate.calibration._replace(drifts=())
-        frame.said = Said.of(estimate)
-        if self._query_index is not None and self._query_index not in frame.motions:
+        frame = self._now
+        frame.kept.calibration = estimate.calibration._replace(drifts=())
+        frame.moment, frame.after, frame.used = moment_of(estimate), self._localizer.start(), self._used
+        if self._query is not None and (index := self._query.kept.odometry.frame_index) not in frame.kept.motions:
             # Another version may find a fix in the last query's frame, and go on from there.
-            frame.motions[self._query_index] = self._inner.motion_since(self._query_index)
+            frame.kept.motions[index] = self._inner.motion_since(index)
         self._note_picture(frame)
-        self._segments[-1].frames.append(frame)
+        self._frames.append(frame)
         now_ns = frame.stamp_ns
         self._follow_onsets(begun_ns)
         for cut in [cut for cut in self._cuts if now_ns >= cut.onset_ns + AFTER_NS]:
             self._complete(cut)
-        if now_ns - self._segments[-1].frames[0].stamp_ns >= _SEGMENT_NS:
-            self._begin_segment()
-        self._forget_before(now_ns - BEFORE_NS - AFTER_NS)
+        oldest_ns = now_ns - BEFORE_NS - AFTER_NS - _QUERY_NS
+        while len(self._frames) > _MAX_FRAMES or self._frames[0].stamp_ns < oldest_ns:
+            self._frames.popleft()
+            self._is_whole = False
 
     def cut(self, onset_ns: int) -> FailureCut:
         """What was and will be kept around the onset of a failure."""
@@ -198,58 +211,56 @@ class FailureRing:
 
     def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
         self._seen = frame
-        if not self._segments:  # priors and maps until now are in the state
-            self._begin_segment()
-            self._inputs = Inputs(imu=self._inputs.imu, wheel=self._inputs.wheel)
         return self._inner.judge(frame)
 
     def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
         odometry, image = self._inner.follow(frame, image)
-        kept = replace(odometry, track_ids=_NO_TRACKS, track_pixels=None, revised=())
-        self._frame, self._inputs = KeptFrame(self._inputs, kept, image), Inputs()
+        bare = replace(odometry, track_ids=_NO_TRACKS, track_pixels=None, revised=())
+        given, self._inputs = self._inputs, Inputs()
+        kept = KeptFrame(odometry=bare, image=image, used=given.used, forgets=given.forgets, priors=given.priors)
+        self._frame = HeldFrame(given, kept)
         return odometry, image
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        assert self._frame is not None
-        found = self._frame.motions[frame_index] = self._inner.motion_since(frame_index)
+        found = self._now.kept.motions[frame_index] = self._inner.motion_since(frame_index)
         return found
 
     def will_forget(self, frame_index: int) -> bool:
-        assert self._frame is not None
-        found = self._frame.forgotten[frame_index] = self._inner.will_forget(frame_index)
+        found = self._now.kept.forgotten[frame_index] = self._inner.will_forget(frame_index)
         return found
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        assert self._frame is not None
-        found = self._frame.is_reversed = self._inner.is_reversed(frame, is_localized=is_localized)
+        found = self._now.kept.is_reversed = self._inner.is_reversed(frame, is_localized=is_localized)
         return found
 
+    def may_query(self, *, is_due: bool) -> bool:
+        return self._inner.may_query(is_due=is_due)
+
     def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        assert self._frame is not None
         if self._query is not None and self._query.features is not None:
             self._query.features.frame = None  # nothing more is measured in it
-        query = self._query = self._frame.query = KeptQuery()
-        self._query_index = self._frame.odometry.frame_index
+        held = self._query = self._now
+        query = held.kept.query = KeptQuery()
         work = self._inner.extract(relocalizer, frame)
         while True:
             try:
                 next(work)
             except StopIteration as done:
-                query.features = done.value
-                return query.features
+                held.features = done.value
+                return held.features
             query.slices += 1
             yield
 
     # --- the ring -----------------------------------------------------------------------------------------------------
 
-    def _begin_segment(self) -> None:
-        state = self._localizer.capture()
-        if state is not None:
-            self._segments.append(Segment(state, self._used))
+    @property
+    def _now(self) -> HeldFrame:
+        assert self._frame is not None
+        return self._frame
 
-    def _note_picture(self, frame: KeptFrame) -> None:
+    def _note_picture(self, frame: HeldFrame) -> None:
         since_ns = frame.stamp_ns - self._pictured_ns
-        if since_ns >= (_PICTURES_NS if frame.query is not None else _LATEST_PICTURE_NS):
+        if since_ns >= (_PICTURES_NS if frame.kept.query is not None else _LATEST_PICTURE_NS):
             self._pictured_ns, frame.picture = frame.stamp_ns, self._seen
         self._seen = None
 
@@ -263,25 +274,19 @@ class FailureRing:
             self._cuts.append(self._held)
 
     def _complete(self, cut: FailureCut) -> None:
-        """Gives a cut its segments; what still changes is copied."""
+        """Gives a cut its frames; what still changes is copied."""
         self._cuts.remove(cut)
-        chosen = [
-            part for part in self._segments if part.frames and part.frames[-1].stamp_ns >= cut.onset_ns - BEFORE_NS
-        ]
-        if not chosen:
-            return
-        last = replace(chosen[-1], frames=list(chosen[-1].frames))
-        for place, frame in enumerate(last.frames):
-            if frame.query is not None and frame.query.features is not None:
-                features = frame.query.features
-                tried = None if features.is_tried is None else features.is_tried.copy()
-                copied = FrameFeatures(features.features, features.pixels.copy(), None, tried)
-                last.frames[place] = replace(frame, query=KeptQuery(frame.query.slices, copied))
-        cut.segments = (*chosen[:-1], last)
-
-    def _forget_before(self, oldest_ns: int) -> None:
-        frames = sum(len(part.frames) for part in self._segments)
-        while len(self._segments) > 1 and (
-            frames > _MAX_FRAMES or (self._segments[1].frames and self._segments[1].frames[0].stamp_ns <= oldest_ns)
-        ):
-            frames -= len(self._segments.popleft().frames)
+        frames = list(self._frames)
+        begins = [number for number, frame in enumerate(frames) if frame.after is not None]
+        early = [number for number in begins if frames[number].stamp_ns <= cut.onset_ns - BEFORE_NS]
+        begin = early[-1] if early else begins[0] if begins and not self._is_whole else None
+        if begin is not None:
+            cut.start, cut.used = frames[begin].after or Start(), frames[begin].used
+            frames = frames[begin + 1 :]
+        for place, frame in enumerate(frames):
+            if (found := frame.features) is not None and found.frame is not None:
+                tried = None if found.is_tried is None else found.is_tried.copy()
+                copied = FrameFeatures(found.features, found.pixels.copy(), None, tried)
+                frames[place] = replace(frame, features=copied)
+                frames[place].moment = frame.moment
+        cut.frames = tuple(frames) or None

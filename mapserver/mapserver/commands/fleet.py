@@ -147,15 +147,17 @@ def replay(
         path = Path(folder) / f"failure-{failure}.mcap"
         path.write_bytes(maps.fleet.replay(failure))
         site = maps.fleet.failure(failure).failure.site
-        options = ["--store", str(store), "--site", site, *(["--json"] if json else [])]
+        report = Path(folder) / "report.json"
+        options = ["--store", str(store), "--site", site, "--report", str(report)]
         if version is not None:
-            options += ["--manifest", maps.version(site, version).manifest_sha256]
+            options += ["--version", str(version)]
         # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md), and the file is a robot's.
-        command = [sys.executable, "-m", "locclient.cli", "replay-failure", str(path), *options]
+        command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
+        output = report.read_text("utf-8") if json and report.exists() else done.output
     if done.has_network:
         typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
-    for text, is_error in ((done.errors, True), (done.output, False)):
+    for text, is_error in ((done.errors, True), (output, False)):
         for line in text.splitlines():
             typer.echo(line if json and not is_error else printable(line), err=is_error)
     if done.status:

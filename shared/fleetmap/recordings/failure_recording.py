@@ -1,7 +1,7 @@
 """A failure's recording: an MCAP file of the seconds around a failure, as robots keep them and servers take them.
 
-It is a recording like any other, with reduced images, and has two attachments more: a summary, which everybody reads, and the state and
-perception of the localizer, which only a client of the robot reads (locclient.delivery.failure_file).
+It is a recording like any other, with reduced images, and has two attachments more: a summary, which everybody reads, and the localizer's
+pose at the beginning with what it perceived since, which only a client of the robot reads (locclient.delivery.failure_file).
 """
 
 from pathlib import Path
@@ -13,15 +13,22 @@ from fleetmap.recordings.mcap.scan import McapScan
 SUMMARY, LOCALIZER = "failure.msgpack", "localizer.msgpack.zst"
 
 
+def is_failure_recording(path: Path) -> bool:
+    """True for a file with the attachments of a failure's recording, or with one of them."""
+    if path.suffix.lower() != ".mcap" or not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
+        return False
+    try:
+        return bool({SUMMARY, LOCALIZER} & set(_scanned(path).attachments))
+    except (RecordingError, OSError):
+        return False
+
+
 def attachments_of(path: Path) -> dict[str, bytes]:
     """Both attachments of a failure's recording; RecordingError for a file without one of them, or that is damaged."""
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise RecordingError(f"{path} has {size} bytes; a failure's recording has at most {MAX_FILE_BYTES}")
-    with path.open("rb") as file:
-        scan = McapScan(path, file)
-        for _ in scan.messages():
-            pass
+    scan = _scanned(path)
     damage = scan.damage.all()
     if damage:
         raise RecordingError(f"{path} is damaged: {damage[0].what} {damage[0].detail}; fetch it again")
@@ -31,3 +38,11 @@ def attachments_of(path: Path) -> dict[str, bytes]:
             f"{path} is no failure's recording: {missing[0]} is missing; `locclient replay` plays others"
         )
     return {name: scan.attachments[name] for name in (SUMMARY, LOCALIZER)}
+
+
+def _scanned(path: Path) -> McapScan:
+    with path.open("rb") as file:
+        scan = McapScan(path, file)
+        for _ in scan.messages():
+            pass
+    return scan

@@ -127,13 +127,12 @@ def fail(fault: str, at: int, store: Path, folder: Path) -> dict[str, Any] | Non
         assert outcome is not None
         said[outcome.estimate.stamp_ns] = outcome.estimate.status.value
         context = context or outcome.failure
-        if context is not None and context.cut is not None and context.cut.segments is not None:
+        if context is not None and context.cut is not None and context.cut.frames is not None:
             break
     if context is None or context.cut is None or robot.ring is None:
         return None
     robot.ring.finish()
-    assert context.cut.segments is not None
-    kept = held_bytes(list(robot.ring._segments), set())
+    kept = held_bytes(list(robot.ring._frames), set())
     report = failure_report(context, profile(robot), report_id="f1", wall_ns=10**18)
     path = folder / "failure.mcap"
     path.write_bytes(failure_file(context.cut, report, profile(robot), "full"))
@@ -145,7 +144,8 @@ def fail(fault: str, at: int, store: Path, folder: Path) -> dict[str, Any] | Non
         "cause": str(report.cause),
         "kind": str(report.kind),
         "has_same_statuses": [moment.status for moment in found.now] == [said[stamp_ns] for stamp_ns in stamps],
-        "is_same_to_the_bit": found.first_difference_ns is None,
+        "is_same": found.first_difference_ns is None,
+        "apart_mm": 1e3 * found.apart_m,
         "statuses": len({said[stamp_ns] for stamp_ns in stamps}),
         "bytes": path.stat().st_size,
         "ring_bytes": kept,
@@ -179,7 +179,8 @@ def measure(failures: int, seed: int) -> dict[str, Any]:
         "different": len({(run["fault"], run["at"]) for run in runs}),
         "without_failure": silent,
         "same_statuses": sum(run["has_same_statuses"] for run in runs),
-        "same_to_the_bit": sum(run["is_same_to_the_bit"] for run in runs),
+        "same": sum(run["is_same"] for run in runs),
+        "apart_mm_max": max(run["apart_mm"] for run in runs),
         "causes": dict(Counter(run["cause"] for run in runs)),
         "bytes_median": int(np.median(sizes)),
         "bytes_max": int(sizes.max()),

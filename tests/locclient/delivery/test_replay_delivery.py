@@ -77,7 +77,7 @@ def test_a_server_that_knows_no_recordings_leaves_them_waiting(outbox: Outbox) -
 
 
 def test_more_failures_than_are_held_are_named(outbox: Outbox, caplog: pytest.LogCaptureFixture) -> None:
-    unfinished: Any = SimpleNamespace(segments=None)
+    unfinished: Any = SimpleNamespace(frames=None)
     profile: Any = None
     queue = ReplayQueue(outbox, profile, "full")
     with caplog.at_level(logging.WARNING):

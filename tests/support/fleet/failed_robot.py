@@ -38,12 +38,12 @@ def failed(
         outcome = robot.handle(bundle)
         said[outcome.estimate.stamp_ns] = outcome.estimate.status.value
         context = context or outcome.failure
-        if context is not None and context.cut is not None and context.cut.segments is not None:
+        if context is not None and context.cut is not None and context.cut.frames is not None:
             break
     if context is None:
         return None
     robot.ring.finish()
-    stamps = [frame.stamp_ns for segment in context.cut.segments for frame in segment.frames]
+    stamps = [frame.stamp_ns for frame in context.cut.frames]
     report = failure_report(context, profile(robot), report_id="f1", wall_ns=10**18)
     data = failure_file(context.cut, report, profile(robot), pictures)
     return report, data, [said[stamp_ns] for stamp_ns in stamps]
