@@ -23,13 +23,6 @@ def make_passphrase() -> str:
     return "-".join("".join(secrets.choice(_LETTERS) for _ in range(_GROUP)) for _ in range(_GROUPS))
 
 
-def new_key() -> "CryptoSigner":
-    """An Ed25519 key."""
-    from securesystemslib.signer import CryptoSigner
-
-    return CryptoSigner.generate_ed25519()
-
-
 def key_pem(key: "PrivateKeyTypes", passphrase: str | None) -> bytes:
     """A private key as PKCS8 PEM, encrypted with the passphrase if there is one."""
     from cryptography.hazmat.primitives import serialization as s
@@ -38,20 +31,22 @@ def key_pem(key: "PrivateKeyTypes", passphrase: str | None) -> bytes:
     return key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, how)
 
 
-def save_key(path: Path, signer: "CryptoSigner", passphrase: str | None) -> None:
-    """Writes a key that must not be there yet; StoreError where that is not possible."""
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+def make_key(path: Path, passphrase: str | None) -> "CryptoSigner":
+    """A new Ed25519 key in a file that must not be there yet; StoreError where that is not possible."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from securesystemslib.signer import CryptoSigner
 
-    data = key_pem(load_pem_private_key(signer.private_bytes, None), passphrase)
+    key = Ed25519PrivateKey.generate()
     with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
         if not path.parent.is_dir():
             make_folder(path.parent)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
+            file.write(key_pem(key, passphrase))
             file.flush()
             os.fsync(descriptor)
         sync_folder(path.parent)
+    return CryptoSigner(key)
 
 
 def load_private(path: Path, passphrase: str | None) -> "PrivateKeyTypes":
@@ -69,11 +64,11 @@ def load_private(path: Path, passphrase: str | None) -> "PrivateKeyTypes":
 
 def load_key(path: Path, passphrase: str | None) -> "CryptoSigner":
     """A key that signs lists; errors as of `load_private`, UsageError for a key of another kind."""
-    from securesystemslib.signer import CryptoSigner, SSlibKey
+    from securesystemslib.signer import CryptoSigner
 
     key = load_private(path, passphrase)
     try:
-        return CryptoSigner(key, SSlibKey.from_crypto(key.public_key()))
+        return CryptoSigner(key)
     except ValueError as error:
         raise UsageError(f"{path} is a key of another kind than lists are signed with ({error})") from error
 
@@ -98,9 +93,7 @@ class KeyFolder:
 
     def make(self, name: str) -> "CryptoSigner":
         """A new key of this name; StoreError where there is one already."""
-        signer = new_key()
-        save_key(self.path(name), signer, credential(name))
-        return signer
+        return make_key(self.path(name), credential(name))
 
     def replace(self, name: str) -> "CryptoSigner":
         """As `make`, in the place of a key that is kept under another name until it is removed by hand."""

@@ -17,7 +17,7 @@ from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
 from mapserver.store.files import locked, make_folder
 from mapserver.store.rows import SiteReleases
-from mapserver.trust.keys import KeyFolder, make_passphrase, new_key, save_key
+from mapserver.trust.keys import KeyFolder, make_key, make_passphrase
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
 
 if TYPE_CHECKING:
@@ -185,9 +185,8 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
 
 def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":
     """A root key with its file and passphrase. number: of the root in which it begins to count."""
-    key, path, passphrase = new_key(), folder / f"root-{number}.pem", make_passphrase()
-    save_key(path, key, passphrase)
-    return key, (path, passphrase)
+    path, passphrase = folder / f"root-{number}.pem", make_passphrase()
+    return make_key(path, passphrase), (path, passphrase)
 
 
 def _repository(store: MapStore) -> "ListRepository":

@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata
 
 from fleetmap.errors import StateError, StoreError, UsageError
@@ -18,7 +19,7 @@ from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, signing, update_lists
-from mapserver.trust.keys import load_key, make_passphrase, new_key, save_key
+from mapserver.trust.keys import load_key, make_key, make_passphrase
 from mapserver.trust.repository import ListRepository
 from mapserver.trust.signing import check_base
 from mapserver.trust.status import trust_status
@@ -144,7 +145,7 @@ def test_old_lists_are_removed_and_roots_are_not(store: MapStore) -> None:
 
 
 def test_another_key_than_the_root_key_changes_nothing(store: MapStore) -> None:
-    thief = new_key()
+    thief = CryptoSigner.generate_ed25519()
     before = {path: path.read_bytes() for path in store.folder.glob("[kt]*/*.*")}
     for act in (signing.rotate_online, signing.rotate_root):
         with pytest.raises(StateError, match="is not the root key of"):
@@ -290,9 +291,8 @@ def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapSto
 def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = make_passphrase()
     assert len(words.replace("-", "")) * 5 == 80
-    key = new_key()
     path = tmp_path / "keys" / "root-ada.pem"
-    save_key(path, key, words)
+    key = make_key(path, words)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
     assert b"ENCRYPTED" in path.read_bytes()
@@ -301,7 +301,7 @@ def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pyt
         with pytest.raises(UsageError, match="passphrase"):
             load_key(path, wrong)
     with pytest.raises(StoreError, match="never overwritten"):
-        save_key(path, key, words)
+        make_key(path, words)
     (tmp_path / "credentials").mkdir()
     (tmp_path / "credentials" / "fleetmap-online").write_text(words + "\n")
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
