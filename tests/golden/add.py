@@ -1,7 +1,6 @@
 """Adds the files of formats that have none yet; never writes one again. `python tests/golden/add.py`, once for each new format."""
 
 import json
-import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -22,7 +21,6 @@ from mapserver.fleet.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
-from mapserver.store.migrations import MIGRATIONS  # noqa: E402
 from mapserver.surfels.surfel_map import encode_surfels, surfel_report  # noqa: E402
 from support.storage.map_samples import draft_details, random_survey, random_tile, wall  # noqa: E402
 
@@ -31,7 +29,7 @@ EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBre
 
 
 def write_store(folder: Path) -> None:
-    """Versions 1 to 3 of site lab: current again, retired, draft; and one job."""
+    """Version 1 of site lab, a draft."""
     with MapStore.open(folder, create=True, clock_ns=lambda: 1_767_323_045_000_000_000) as store:
         for seed in (1, 2, 3):
             rng = np.random.default_rng(seed)
@@ -75,16 +73,13 @@ def write_tile(path: Path) -> None:
 
 
 def add_from_store(folder: Path) -> None:
-    """Manifest, export and database."""
+    """Manifest and export."""
     write_store(folder)
     with MapStore.open(folder) as store:
         if not (path := GOLDEN / f"manifest-{MANIFEST_FORMAT}.json").exists():
             path.write_bytes(store.blob(store.version("lab", 1).manifest_sha256))
         if not (path := GOLDEN / f"version-{EXPORT_FORMAT}.fmex").exists():
             store.export_version("lab", 1, path)
-    if not (path := GOLDEN / f"store-{len(MIGRATIONS)}.sqlite3").exists():
-        shutil.copy(folder / "store.sqlite3", path)
-        shutil.copytree(folder / "blobs", GOLDEN / "store-blobs", dirs_exist_ok=True)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from mapserver.fleet_statistics.kpis import Counters, kpis
 from mapserver.store import Event, FailureRow, JobInfo, SiteInfo
 
 _NOW_NS = 1_767_323_045_000_000_000
-_SITE = asdict(SiteInfo("hall", 3, 3, "cd" * 32))
+_SITE = asdict(SiteInfo("hall", 3, 3))
 _VERSION = {
     **{"site": "hall", "version": 3, "state": "current", "parent": 2, "created": "2026-01-02T03:04:05Z"},
     **{"manifest_sha256": "ab" * 32, "tiles": 42, "landmarks": 80412, "map_bytes": 1830220},

@@ -87,7 +87,7 @@ class HealthData:
     def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
         """Where a robot was and what it said of itself, thinned, oldest first."""
         found = self._store.fleet.trace(site, robot, since_hour=hour_of(since_ns))
-        return [row for row in found if row.heard_ns is not None and since_ns <= row.heard_ns < until_ns]
+        return [row for row in found if since_ns <= row.heard_ns < until_ns]
 
     def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:
         """A site's figures of whole hours: those that both ends lie in, too."""

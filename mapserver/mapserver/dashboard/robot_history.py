@@ -30,10 +30,8 @@ class Stretch:
 
 
 def stretches(rows: Sequence[TraceRow], since_ns: int, until_ns: int) -> list[Stretch]:
-    """The stretches of a range, oldest first; rows of older stores, which do not say when they were heard, are left out."""
-    heard = sorted(
-        (row.heard_ns, row) for row in rows if row.heard_ns is not None and since_ns <= row.heard_ns < until_ns
-    )
+    """The stretches of a range, oldest first."""
+    heard = sorted((row.heard_ns, row) for row in rows if since_ns <= row.heard_ns < until_ns)
     groups: list[list[tuple[int, TraceRow]]] = []
     for ns, row in heard:
         last = groups[-1] if groups else []

@@ -1,4 +1,4 @@
-"""The SQLite file of an open store: numbered migrations, reading, write transactions, the log. All settings of SQLite are here."""
+"""The SQLite file of an open store: its migrations, reading, write transactions, the log. All settings of SQLite are here."""
 
 import os
 import sqlite3
@@ -12,10 +12,10 @@ from urllib.parse import quote
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
-from mapserver.store.access.chain import COLUMNS, AuditLine, last_sha256, line_sha256
+from mapserver.store.access.chain import COLUMNS, AuditLine, line_sha256
 from mapserver.store.files import sync_folder
-from mapserver.store.migrations import MIGRATIONS
 from mapserver.store.rows import LogEntry
+from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
 
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
@@ -79,21 +79,10 @@ class Transactions:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
     def shrink(self, pages: int) -> None:
-        """Gives at most so many unused pages of the file back to the disk; none of a file that is not `make_shrinkable`."""
+        """Gives at most so many unused pages of the file back to the disk."""
         with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
             # `execute` takes one step, which frees one page
             self._database.conn.executescript(f"PRAGMA incremental_vacuum({pages:d})")
-
-    def make_shrinkable(self) -> None:
-        """Writes the whole file anew, once, so that `shrink` works; needs as much space again. Raises StoreError where there is none."""
-        with self._lock:
-            if self._database.conn.execute("PRAGMA auto_vacuum").fetchone()[0] == _INCREMENTAL:
-                return
-            try:
-                self._database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")
-                self._database.conn.execute("VACUUM")
-            except sqlite3.Error as error:
-                raise StoreError(f"the store {self._path} cannot be written anew ({error}); make space") from error
 
     def rows(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> list[Row]:
         """The rows, each as a `kind` with a field for every column. Raises StoreError where the disk refuses."""
@@ -103,12 +92,11 @@ class Transactions:
         """One line of the log, chained to the one before it, within a transaction; site: empty where it is about none."""
         actor = entry.actor
         last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone() or (0, "")
-        before = last[1] or last_sha256(self.audit_lines())
         values: tuple[object, ...] = (last[0] + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
         values += (actor.name, actor.reason, actor.operator, actor.address)
         connection.execute(
             f"INSERT INTO events ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, line_sha256(before, values)),
+            (*values, line_sha256(last[1], values)),
         )
 
     def audit_lines(self, last: int | None = None) -> list[AuditLine]:
@@ -165,7 +153,7 @@ def is_older(path: Path) -> bool:
             head = file.read(_HEAD_BYTES)
     except OSError:
         return False
-    return len(head) == _HEAD_BYTES and 0 < int.from_bytes(head[_FORMAT_AT : _FORMAT_AT + 4], "big") < len(MIGRATIONS)
+    return len(head) == _HEAD_BYTES and 0 < int.from_bytes(head[_FORMAT_AT : _FORMAT_AT + 4], "big") < FORMAT
 
 
 def _check_ours_of(database: Database, path: Path) -> None:
@@ -173,7 +161,7 @@ def _check_ours_of(database: Database, path: Path) -> None:
 
 
 def _current(database: Database) -> Database:
-    if int(database.conn.execute("PRAGMA user_version").fetchone()[0]) == len(MIGRATIONS):
+    if int(database.conn.execute("PRAGMA user_version").fetchone()[0]) == FORMAT:
         return database
     connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     with closing(database.conn):
@@ -190,7 +178,7 @@ def _prepare(database: Database, path: Path) -> None:
     database.conn.execute("PRAGMA journal_mode = WAL")
     database.conn.execute("PRAGMA foreign_keys = ON")
     done = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
-    if 0 < done < len(MIGRATIONS):
+    if 0 < done < FORMAT:
         _copy(database.conn, path, path.with_name(f"{path.stem}-format-{done}{path.suffix}"))
     _migrate(database)
 
@@ -219,23 +207,25 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> None:
     if application != APPLICATION_ID and (application != 0 or number != 0 or tables != 0):
         reason = f"{path} is not the database of a map store (application id {application}); choose another --store"
         raise StoreError(reason)
-    if number > len(MIGRATIONS):
+    if application == APPLICATION_ID and number <= LAST_UNNAMED:
+        raise StoreError(
+            f"{path} was made by an earlier fleetmap (store format {number}), and stays as it is; export its versions with that one "
+            "(`mapserver export FILE`), and import them into another --store, or build them again there"
+        )
+    if number > FORMAT:
         raise NewerFormatError(
-            f"{path} has store format {number}, this fleetmap reads up to {len(MIGRATIONS)}; update fleetmap to open it"
+            f"{path} has store format {number}, this fleetmap reads up to {FORMAT}; update fleetmap to open it"
         )
 
 
 def _migrate(database: Database) -> None:
-    done = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
-    for number in range(done + 1, len(MIGRATIONS) + 1):
-        with _transaction(database, durable=True) as connection:
-            # Another process may have come first between the look above and the lock that this transaction holds.
-            if int(connection.execute("PRAGMA user_version").fetchone()[0]) >= number:
-                continue
-            for statement in MIGRATIONS[number - 1]:
-                connection.execute(statement)
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {number}")
+    if database.conn.execute("PRAGMA user_version").fetchone()[0] == FORMAT:
+        return
+    with _transaction(database, durable=True) as connection:
+        # What is pending is asked under the lock: another process may have come first.
+        MIGRATIONS.apply(database)
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {FORMAT}")
 
 
 def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:

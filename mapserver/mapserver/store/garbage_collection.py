@@ -40,7 +40,7 @@ def collect(
 ) -> Garbage:
     """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
 
-    Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs, the vocabularies of sites.
+    Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs.
     """
     garbage = Garbage()
     if dry_run:
@@ -103,5 +103,4 @@ def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set
     tables = ("version_blobs", *EXTRA_TABLES.values())
     rows = [row for t in tables for row in transactions.query(f"SELECT site, version, sha256 FROM {t}")]
     kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
-    of_sites = "SELECT vocabulary_sha256 sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL UNION SELECT sha256 FROM site_files"
-    return kept | {row["sha256"] for row in transactions.query(of_sites)}
+    return kept | {row["sha256"] for row in transactions.query("SELECT sha256 FROM site_files")}

@@ -12,7 +12,7 @@ Bytes are on the disk before the transaction that mentions them, so a crash leav
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -95,7 +95,8 @@ class MapStore(StoreQueries):
 
         read_only: of a store that cannot be written, by its rights or because the disk is full, what is there is read; one of an
         older format stays as it is.
-        Raises StoreError where there is none or it cannot be opened, NewerFormatError for one made by a newer fleetmap.
+        Raises StoreError where there is none, it cannot be opened or an earlier fleetmap made it, NewerFormatError for one made by
+        a newer fleetmap.
         """
         is_new = not (path / "store.sqlite3").is_file()
         if is_new and not create:
@@ -259,8 +260,6 @@ class MapStore(StoreQueries):
             return collect(self._transactions, self._blobs, retention, dry_run=True, actor=actor)
         with self._locked(shared=False):
             garbage = collect(self._transactions, self._blobs, retention, dry_run=False, actor=actor)
-            with suppress(StoreError):  # the next time, when there is space
-                self._transactions.make_shrinkable()
             self._transactions.shrink(1 << 30)
             keep_reserve(self._root)
             return garbage

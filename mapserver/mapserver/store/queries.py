@@ -86,7 +86,7 @@ class StoreQueries:
         return self._transactions.rows(
             SiteInfo,
             """SELECT s.site, (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
-               (SELECT count(*) FROM versions v WHERE v.site = s.site) versions, s.vocabulary_sha256
+               (SELECT count(*) FROM versions v WHERE v.site = s.site) versions
                FROM sites s ORDER BY s.site""",
         )
 

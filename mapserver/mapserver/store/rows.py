@@ -46,7 +46,6 @@ class SiteInfo:
     site: str
     current_version: int | None
     versions: int
-    vocabulary_sha256: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +223,7 @@ class FailureFilter:
 class TraceRow:
     """Where a robot was and what its estimate was worth, thinned; hour: since 1970, by the server's clock.
 
-    heard_ns: by the same clock, None in rows of older stores; flags: with commas; frame_ms: CPU of a frame, mean of the last ones.
+    heard_ns: by the same clock; flags: with commas; frame_ms: CPU of a frame, mean of the last ones.
     exposure, sharpness: of the left camera's last image.
     """
 
@@ -237,7 +236,7 @@ class TraceRow:
     x_map_m: float | None
     y_map_m: float | None
     radius_95_m: float | None
-    heard_ns: int | None = None
+    heard_ns: int
     flags: str | None = None
     frame_ms: float | None = None
     exposure: float | None = None

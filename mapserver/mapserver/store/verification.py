@@ -65,8 +65,7 @@ def _links(folder: Path) -> list[Path]:
 def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
     """The addresses whose bytes are whole."""
     rows = transactions.query(
-        """SELECT sha256 FROM version_blobs UNION
-           SELECT vocabulary_sha256 FROM sites WHERE vocabulary_sha256 IS NOT NULL UNION SELECT sha256 FROM site_files
+        """SELECT sha256 FROM version_blobs UNION SELECT sha256 FROM site_files
            UNION SELECT sha256 FROM grid_blobs UNION SELECT sha256 FROM surfel_blobs"""
     )
     mentioned, present = {row["sha256"] for row in rows}, blobs.addresses()

@@ -53,11 +53,6 @@ def apply_changes(
     if changes.new_current is not None:
         row = (site, changes.new_current, now_ns)
         connection.execute("INSERT INTO currents (site, version, since_ns) VALUES (?, ?, ?)", row)
-        connection.execute(
-            """UPDATE sites SET vocabulary_sha256 = coalesce(vocabulary_sha256, (SELECT vocabulary_sha256 FROM versions
-               WHERE site = ?1 AND version = ?2)) WHERE site = ?1""",
-            (site, changes.new_current),
-        )
     if (new := changes.new_canary) is not None:
         connection.execute(
             """INSERT INTO canaries (site, version, base_version, share, threshold, state, started_ns, actor, reason,

@@ -247,7 +247,6 @@ def traced(at_s: float, status: str, **more: object) -> TraceRow:
 def test_traces_become_stretches_of_one_state() -> None:
     rows = [traced(10 * n, "TRACKING", frame_ms=10.0 + n) for n in range(4)]
     rows += [traced(33, "LOST", flags="dark"), traced(43, "LOST", flags="dark"), traced(300, "TRACKING")]
-    rows.append(traced(310, "TRACKING", heard_ns=None))  # of an older store
     found = stretches(rows, 0, 320_000_000_000)
     told = [(s.status, s.flags, s.since_ns // 10**9, s.until_ns // 10**9) for s in found]
     assert told == [

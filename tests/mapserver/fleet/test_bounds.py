@@ -1,6 +1,5 @@
 """Nothing that robots send grows without bound: failures in rate, size and number, pictures in bytes, traces, robots. Rows 8, 9, 23."""
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,7 @@ from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_service import BusService
-from mapserver.store import Actor, FailureFilter, MapStore, Retention
-from support.fleet.contracts_documents import REPOSITORY
+from mapserver.store import Actor, FailureFilter, MapStore
 from support.storage.map_samples import save_sample_draft
 
 SECOND_NS = 10**9
@@ -254,20 +252,3 @@ def test_the_database_shrinks_again(tmp_path: Path, clock: Clock) -> None:
     with MapStore.open(root, clock_ns=clock) as store:
         Fleet(store, clock_ns=clock).prune()
     assert pages() < full / 4
-
-
-def test_an_older_database_shrinks_after_gc(tmp_path: Path) -> None:
-    """It was made without the setting, as all before this version: gc writes it anew, once."""
-    golden = REPOSITORY / "tests" / "golden"
-    root = tmp_path / "store"
-    root.mkdir()
-    shutil.copy(golden / "store-6.sqlite3", root / "store.sqlite3")
-    shutil.copytree(golden / "store-blobs", root / "blobs")
-    with MapStore.open(root) as store:
-        before = store.versions("lab")
-        assert store._transactions.query("PRAGMA auto_vacuum") == [{"auto_vacuum": 0}]
-        store.collect_garbage(Retention(100, 100, 1e6))
-    with MapStore.open(root) as store:
-        assert store._transactions.query("PRAGMA auto_vacuum") == [{"auto_vacuum": 2}]
-        assert [info.version for info in store.versions("lab")] == [info.version for info in before]
-        assert store.verify().faults == []

@@ -1,9 +1,7 @@
 """The chained log: a line that was changed afterwards is found (row 38 of docs/security.md)."""
 
 import json
-import shutil
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,6 @@ from mapserver.store import Actor, MapStore
 from mapserver.trust import init_here
 from support.storage.map_samples import save_sample_draft
 
-GOLDEN = Path(__file__).resolve().parents[2] / "golden"
 TRIGGERS = ("events_are_kept", "events_stay_as_they_are")
 
 
@@ -69,24 +66,3 @@ def test_a_changed_line_is_found(folder: Path, statement: str, words: str) -> No
     status, printed = run("--store", str(folder), "--verify")
     assert status == 3
     assert words in printed
-
-
-@pytest.mark.parametrize(
-    "change", [lambda folder: None, lambda f: rewrite(f, "UPDATE events SET detail = 'x' WHERE id = 1")]
-)
-def test_the_lines_of_an_older_store_are_covered_by_the_next_one(
-    tmp_path: Path, change: Callable[[Path], None]
-) -> None:
-    shutil.copy(GOLDEN / "store-6.sqlite3", tmp_path / "store.sqlite3")
-    shutil.copytree(GOLDEN / "store-blobs", tmp_path / "blobs")
-    with MapStore.open(tmp_path) as store:
-        store.audit("opened", "by a newer version")
-    assert run("--store", str(tmp_path), "--verify")[0] == 0
-    with MapStore.open(tmp_path) as store:
-        before = len(store.audit_lines())
-    change(tmp_path)
-    changed = run("--store", str(tmp_path), "--verify")
-    with sqlite3.connect(tmp_path / "store.sqlite3") as connection:
-        is_changed = connection.execute("SELECT detail FROM events WHERE id = 1").fetchone()[0] == "x"
-    assert changed[0] == (3 if is_changed else 0)
-    assert not is_changed or f"line {before} was changed" in changed[1]

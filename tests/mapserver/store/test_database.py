@@ -1,13 +1,22 @@
-"""Reading beside a write: it neither waits nor sees what is not committed."""
+"""Reading beside a write: it neither waits nor sees what is not committed. Stores of older formats."""
 
+import errno
+import os
+import sqlite3
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from sqlite_utils import Database, Migrations
 
 from fleetmap.errors import StoreError
-from mapserver.store.database import Transactions
+from mapserver.store import MapStore, schema
+from mapserver.store import database as database_module
+from mapserver.store.database import APPLICATION_ID, Transactions
+from mapserver.store.schema import FORMAT, LAST_UNNAMED
+from support.storage.map_samples import save_sample_draft
 
 COUNT = "SELECT count(*) AS n FROM events"
 _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'note', 'x')"
@@ -57,3 +66,64 @@ def test_closing_leaves_one_file(tmp_path: Path) -> None:
     opened.query(COUNT)
     opened.close()
     assert [path.name for path in tmp_path.iterdir()] == ["store.sqlite3"]
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+@pytest.mark.parametrize("number", [1, LAST_UNNAMED])
+def test_a_store_of_before_is_refused_and_stays_as_it_is(tmp_path: Path, number: int, read_only: bool) -> None:
+    path = tmp_path / "store.sqlite3"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE sites (site TEXT PRIMARY KEY, vocabulary_sha256 TEXT)")
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {number}")
+    before = path.read_bytes()
+    with pytest.raises(StoreError, match=rf"store format {number}\).*`mapserver export FILE`.*another --store"):
+        MapStore.open(tmp_path, read_only=read_only)
+    assert path.read_bytes() == before
+    assert [found.name for found in tmp_path.iterdir() if found.is_file()] == [path.name]
+
+
+def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        save_sample_draft(store)
+    later = Migrations("fleetmap")
+    later()(schema.tables)
+
+    @later()
+    def wings(database: Database) -> None:
+        database.execute("ALTER TABLE sites ADD COLUMN wing TEXT")
+
+    monkeypatch.setattr(database_module, "MIGRATIONS", later)
+    monkeypatch.setattr(database_module, "FORMAT", FORMAT + 1)
+    path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{FORMAT}.sqlite3"
+    before = path.read_bytes()
+    with MapStore.open(tmp_path, read_only=True) as store:
+        assert store._transactions.query("SELECT site, wing FROM sites") == [{"site": "lab", "wing": None}]
+        with pytest.raises(StoreError, match="refuses to be written"):
+            store.record_robot_report("lab", "r1", {}, 1)
+    assert (path.read_bytes(), copy.exists()) == (before, False)
+
+    def is_full(_: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(database_module, "sync_folder", is_full)
+        with pytest.raises(StoreError, match="make space: the store is as it was"):
+            MapStore.open(tmp_path)
+    assert format_of(path) == FORMAT
+    copy.unlink()
+    MapStore.open(tmp_path).close()
+    assert (format_of(path), format_of(copy)) == (FORMAT + 1, FORMAT)
+    copied = copy.read_bytes()
+    with MapStore.open(tmp_path) as store:
+        assert [info.version for info in store.versions("lab")] == [1]
+        applied = store._transactions.query("SELECT name FROM _sqlite_migrations ORDER BY rowid")
+    assert [row["name"] for row in applied] == ["tables", "wings"]
+    assert copy.read_bytes() == copied, "once"
+
+
+def format_of(path: Path) -> int:
+    with closing(sqlite3.connect(path)) as connection:
+        return int(connection.execute("PRAGMA user_version").fetchone()[0])

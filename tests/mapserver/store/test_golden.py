@@ -1,30 +1,23 @@
 """Files of every released format are read by the code of today; newer ones are refused by naming what reads them."""
 
-import errno
 import importlib
 import json
-import os
-import shutil
-import sqlite3
 import struct
-from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.errors import NewerFormatError, StoreError
+from fleetmap.errors import NewerFormatError
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT, decode_manifest, decode_tile, encode_manifest, pack
 from fleetmap.mapformat.version_file import EXPORT_FORMAT
 from fleetmap.messages import decode_message, encode_message
 from fleetmap.version_grid import known_grid
 from mapserver import releases
-from mapserver.store import Actor, FailureFilter, MapStore
+from mapserver.store import Actor, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
-from mapserver.store.migrations import MIGRATIONS
 from mapserver.surfels.surfel_map import known_surfels
-from support.storage.map_samples import save_sample_draft
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 
@@ -37,7 +30,6 @@ GOLDEN = Path(__file__).parents[2] / "golden"
         ("manifest-{}.json", MANIFEST_FORMAT),
         ("archive-{}.fmar", ARCHIVE_FORMAT),
         ("version-{}.fmex", EXPORT_FORMAT),
-        ("store-{}.sqlite3", len(MIGRATIONS)),
     ],
 )
 def test_every_format_has_its_file(name: str, newest: int) -> None:
@@ -107,93 +99,6 @@ def test_exports(number: int, tmp_path: Path) -> None:
         assert store.verify().faults == []
 
 
-@pytest.mark.parametrize("number", range(1, len(MIGRATIONS) + 1))
-def test_databases_of_every_format_open_whole(tmp_path: Path, number: int) -> None:
-    shutil.copy(GOLDEN / f"store-{number}.sqlite3", tmp_path / "store.sqlite3")
-    shutil.copytree(GOLDEN / "store-blobs", tmp_path / "blobs")
-    with MapStore.open(tmp_path) as store:
-        assert store.verify().faults == []
-        assert [robot.robot for robot in store.robots("lab")] == ["r1"]
-        states = [info.state for info in store.versions("lab")]
-        assert states == (["published", "current", "draft"] if number == 1 else ["current", "retired", "draft"])
-        if number == 1:
-            assert releases.roll_back(store, "lab") == 1
-        assert releases.publish(store, "lab") == 3
-        assert releases.roll_back(store, "lab") == 1
-        assert store.verify().faults == []
-        if number >= 2:
-            assert [job.state for job in store.jobs()] == ["done"]
-        evidence = store.evidence("lab", 3)
-        assert (evidence is not None) is (number >= 3)
-        assert evidence is None or evidence.held_out.draft.localised_share == 0.975
-        if number >= 4:
-            (failure,) = store.fleet.failures(FailureFilter())
-            picture = b"jpeg" if number < 7 else b"\xff\xd8jpeg\xff\xd9"  # what is no JPEG is refused since then
-            assert (failure.failure_id, store.fleet.picture(failure.number, 0)) == ("f1", picture)
-            assert store.fleet.counters("lab", "cause", key="dark")["lab", "dark"].failures == 1
-
-
-def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    older, number = GOLDEN / f"store-{len(MIGRATIONS) - 1}.sqlite3", len(MIGRATIONS) - 1
-    path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{number}.sqlite3"
-    shutil.copy(older, path)
-    before = path.read_bytes()
-    with MapStore.open(tmp_path, read_only=True) as store:
-        assert [info.state for info in store.versions("lab")] == ["current", "retired", "draft"]
-        with pytest.raises(StoreError, match="refuses to be written"):
-            store.record_robot_report("lab", "r1", {}, 1)
-    assert (path.read_bytes(), copy.exists()) == (before, False)
-
-    def is_full(_: Path) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    with monkeypatch.context() as patch:
-        patch.setattr("mapserver.store.database.sync_folder", is_full)
-        with pytest.raises(StoreError, match="make space: the store is as it was"):
-            MapStore.open(tmp_path)
-    assert format_of(path) == number
-    copy.unlink()
-    MapStore.open(tmp_path).close()
-    assert (format_of(path), format_of(copy)) == (number + 1, number)
-    assert rows_of(copy) == rows_of(older)
-    copied = copy.read_bytes()
-    MapStore.open(tmp_path).close()
-    assert copy.read_bytes() == copied, "once"
-
-
-def format_of(path: Path) -> int:
-    with closing(sqlite3.connect(path)) as connection:
-        return int(connection.execute("PRAGMA user_version").fetchone()[0])
-
-
-def rows_of(path: Path) -> list[str]:
-    with closing(sqlite3.connect(path)) as connection:
-        return sorted(connection.iterdump())
-
-
-def test_a_draft_of_an_older_store_is_known_by_the_job_that_its_log_names(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store, actor=Actor("nightly", "nightly job 17"))
-        save_sample_draft(store, actor=Actor("ada", "nightly job 18 was lost"))
-    connection = sqlite3.connect(tmp_path / "store.sqlite3")
-    connection.execute("ALTER TABLE versions DROP COLUMN job")
-    for name in ("judged_ms", "found_ms", "continued"):
-        connection.execute(f"ALTER TABLE tallies DROP COLUMN {name}")
-    for name in ("operator", "address", "sha256"):
-        connection.execute(f"ALTER TABLE events DROP COLUMN {name}")
-    connection.execute("ALTER TABLE failures DROP COLUMN area")
-    for name in ("heard_ns", "flags", "frame_ms", "exposure", "sharpness"):
-        connection.execute(f"ALTER TABLE traces DROP COLUMN {name}")
-    for name in ("tokens", "sessions", "operators", "site_files", "grid_blobs", "surfel_blobs", "failure_replays"):
-        connection.execute(f"DROP TABLE {name}")
-    connection.execute("PRAGMA user_version = 4")
-    connection.close()
-    with MapStore.open(tmp_path) as store:
-        assert [info.job for info in store.versions("lab")] == [17, None]
-
-
 def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
     with pytest.raises(NewerFormatError, match=f"format {TILE_FORMAT + 1}.*up to {TILE_FORMAT}"):
         decode_tile(pack(b"FMTL", TILE_FORMAT + 1, b""))
@@ -208,8 +113,3 @@ def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
         with pytest.raises(NewerFormatError, match=f"format {EXPORT_FORMAT + 1}.*up to {EXPORT_FORMAT}"):
             store.import_version(tmp_path / "newer.fmex")
         assert store.sites() == []
-    connection = sqlite3.connect(tmp_path / "store" / "store.sqlite3")
-    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
-    connection.close()
-    with pytest.raises(NewerFormatError, match=f"format {len(MIGRATIONS) + 1}.*up to {len(MIGRATIONS)}"):
-        MapStore.open(tmp_path / "store")

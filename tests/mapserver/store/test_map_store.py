@@ -14,8 +14,8 @@ import pytest
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
 from mapserver import releases
-from mapserver.store import DraftContent, MapStore, map_store, queries
-from mapserver.store.database import MIGRATIONS
+from mapserver.store import DraftContent, MapStore, map_store, queries, schema
+from mapserver.store.schema import FORMAT
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 
@@ -172,10 +172,10 @@ def test_a_store_of_a_newer_format_is_refused(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
     connection = sqlite3.connect(tmp_path / "store.sqlite3")
-    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) + 1}")
+    connection.execute(f"PRAGMA user_version = {FORMAT + 1}")
     connection.close()
     before = (tmp_path / "store.sqlite3").read_bytes()
-    with pytest.raises(NewerFormatError, match=rf"format {len(MIGRATIONS) + 1}.*up to {len(MIGRATIONS)}"):
+    with pytest.raises(NewerFormatError, match=rf"format {FORMAT + 1}.*up to {FORMAT}"):
         MapStore.open(tmp_path)
     assert (tmp_path / "store.sqlite3").read_bytes() == before
 
@@ -243,5 +243,4 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tm
 
 
 def test_the_table_names_every_served_kind_of_a_version() -> None:
-    kinds = "".join(MIGRATIONS[0])
-    assert all(f"'{kind}'" in kinds for kind in queries._OF_VERSIONS)
+    assert all(f"'{kind}'" in schema._TABLES for kind in queries._OF_VERSIONS)

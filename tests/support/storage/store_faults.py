@@ -38,7 +38,6 @@ from support.storage.faulty_disk import Disk, install  # noqa: E402
 from support.storage.lost_writes import POLICIES, DiskImage  # noqa: E402
 from support.storage.map_samples import draft_details, random_tile  # noqa: E402
 
-GOLDEN = REPOSITORY / "tests" / "golden"
 ADA = Actor("ada", "a fault")
 MODES = ("kill", "tear", "ENOSPC", "EIO", "ENOSPC from then on", "EIO from then on", "power cut")
 TRACED = {"strace kill": "signal=KILL", "strace ENOSPC": "error=ENOSPC", "strace EIO": "error=EIO"}
@@ -87,7 +86,7 @@ def save(store: MapStore, seed: int) -> None:
 
 def scenarios(folder: Path) -> list[Scenario]:
     """All operations, each with the store that it begins with."""
-    start, old, export = folder / "start", folder / "old", folder / "lab-8.fmex"
+    start, export = folder / "start", folder / "lab-8.fmex"
     with MapStore.open(start, create=True, clock_ns=clock_ns) as store:
         for seed in (1, 2, 3):
             save(store, seed)
@@ -102,9 +101,6 @@ def scenarios(folder: Path) -> list[Scenario]:
         for seed in (6, 7, 8):
             save(store, seed)
         store.export_version("lab", 8, export)
-    old.mkdir()
-    shutil.copy(GOLDEN / "store-1.sqlite3", old / "store.sqlite3")
-    shutil.copytree(GOLDEN / "store-blobs", old / "blobs")
     nothing_kept = Retention(keep_versions=0, keep_drafts=0, keep_days=0)
     acts: tuple[tuple[str, Path, Act], ...] = (
         ("publish", start, lambda store: releases.publish(store, "lab", 5, force=True, actor=ADA)),
@@ -113,24 +109,18 @@ def scenarios(folder: Path) -> list[Scenario]:
         ("gc", start, lambda store: store.collect_garbage(nothing_kept, actor=ADA)),
         ("import", start, lambda store: store.import_version(export, actor=ADA)),
         ("save a draft", start, lambda store: save(store, 9)),
-        ("open an old format", old, lambda store: store.sites()),
     )
     return [_scenario(folder, *act) for act in acts]
 
 
 def _scenario(folder: Path, name: str, start: Path, act: Act) -> Scenario:
     clean = folder / "clean"
-    before, events = _states_of_old(start) if "old" in name else _states(start)
+    before, events = _states(start)
     copy(start, clean)
     with MapStore.open(clean, clock_ns=clock_ns) as store:
         act(store)
     after, _ = _states(clean)
     return Scenario(name, start, act, before, after, events)
-
-
-def _states_of_old(start: Path) -> tuple[State, tuple[int, ...]]:
-    copy(start, start.with_name("migrated"))
-    return _states(start.with_name("migrated"))
 
 
 def _states(folder: Path) -> tuple[State, tuple[int, ...]]:

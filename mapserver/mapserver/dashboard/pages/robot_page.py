@@ -165,7 +165,7 @@ def way(rows: list[TraceRow]) -> list[Line]:
     found: list[Line] = []
     last: tuple[int, float, float] | None = None
     for row in rows:
-        if row.x_map_m is None or row.y_map_m is None or row.heard_ns is None:
+        if row.x_map_m is None or row.y_map_m is None:
             last = None
             continue
         here, tone = (round(row.x_map_m, 2), round(row.y_map_m, 2)), STATUSES.get(row.status, ("", "quiet"))[1]

@@ -1,7 +1,4 @@
-"""The chain of the log: the hash of a line covers the line and the hash of the line before it. Pure.
-
-Lines of a store from before the chain have no hash of their own; the first chained line covers them all.
-"""
+"""The chain of the log: the hash of a line covers the line and the hash of the line before it. Pure."""
 
 import hashlib
 import json
@@ -33,24 +30,14 @@ def line_sha256(before: str, values: Sequence[object]) -> str:
     return hashlib.sha256(json.dumps([before, *values], separators=(",", ":")).encode()).hexdigest()
 
 
-def last_sha256(lines: Iterable[AuditLine]) -> str:
-    """The hash behind all these lines, oldest first."""
-    before = ""
-    for line in lines:
-        before = line.sha256 or line_sha256(before, astuple(line)[:-1])
-    return before
-
-
 def chain_faults(lines: Iterable[AuditLine]) -> list[str]:
     """Lines that were changed or are missing, oldest first. A log that was written anew from some line on has no fault."""
     faults: list[str] = []
-    before, number, is_chained = "", 0, False
+    before, number = "", 0
     for line in lines:
         if line.id != number + 1:
             faults.append(f"lines {number + 1} to {line.id - 1} are missing")
-        expected = line_sha256(before, astuple(line)[:-1])
-        if line.sha256 != expected and (line.sha256 or is_chained):
+        if line.sha256 != line_sha256(before, astuple(line)[:-1]):
             faults.append(f"line {line.id} was changed, or stands behind one that was removed")
-        is_chained |= bool(line.sha256)
-        before, number = line.sha256 or expected, line.id
+        before, number = line.sha256, line.id
     return faults
