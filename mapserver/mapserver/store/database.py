@@ -207,10 +207,10 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> None:
     if application != APPLICATION_ID and (application != 0 or number != 0 or tables != 0):
         reason = f"{path} is not the database of a map store (application id {application}); choose another --store"
         raise StoreError(reason)
-    if application == APPLICATION_ID and number <= LAST_UNNAMED:
+    if application == APPLICATION_ID and number < LAST_UNNAMED:
         raise StoreError(
-            f"{path} was made by an earlier fleetmap (store format {number}), and stays as it is; export its versions with that one "
-            "(`mapserver export FILE`), and import them into another --store, or build them again there"
+            f"{path} was made by an earlier fleetmap (store format {number}; this one migrates {LAST_UNNAMED}), and stays as it is; "
+            "export its versions with that one (`mapserver export FILE`), and import them into another --store, or build them again there"
         )
     if number > FORMAT:
         raise NewerFormatError(

@@ -267,7 +267,10 @@ CREATE TABLE failure_replays (
 
 @MIGRATIONS()
 def tables(database: Database) -> None:
-    """The first schema."""
+    """The first schema; a store of the last numbered format has it but for one column."""
+    if database["versions"].exists():
+        database.execute("ALTER TABLE sites DROP COLUMN vocabulary_sha256")
+        return
     for statement in _TABLES.strip().split("\n\n"):
         database.execute(statement)
 
