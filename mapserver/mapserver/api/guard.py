@@ -22,10 +22,10 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapserver.api.problems import problem
+from mapserver.api.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.operators.operators import LIFE_S, Operators
 from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
-from mapserver.operators.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.store import Actor
 
 _log = logging.getLogger(__name__)

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from fleetmap.bus import ZenohBus
     from fleetmap.foxglove.server import FoxgloveServer
     from mapserver.api.guard import GuardSettings
+    from mapserver.api.sign_in_proxy import SignInProxy
     from mapserver.config import MapserverConfig
     from mapserver.fleet.fleet import Fleet
-    from mapserver.operators.sign_in_proxy import SignInProxy
     from mapserver.serving.bus_access import BusGuard
     from mapserver.serving.http_connections import BoundedListener
     from mapserver.store import MapStore
@@ -120,7 +120,7 @@ class HttpOptions:
     def load_proxy(self) -> "SignInProxy | None":
         """The proxy that signs people in, None without one; UsageError as `SignInProxy.of`, and for half of the two options."""
         from fleetmap.errors import UsageError
-        from mapserver.operators.sign_in_proxy import SignInProxy
+        from mapserver.api.sign_in_proxy import SignInProxy
 
         if self.sign_in_proxy:
             return SignInProxy.of(self.sign_in_proxy, self.sign_in_group or ())
@@ -250,10 +250,10 @@ def _run(
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
     from mapserver.api.request_limits import MAX_BODY_BYTES
+    from mapserver.api.sign_in_proxy import ProxiedPeople
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
-    from mapserver.operators.sign_in_proxy import ProxiedPeople
     from mapserver.serving.background_tasks import (
         BackgroundTask,
         admission_tasks,

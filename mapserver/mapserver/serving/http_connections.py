@@ -13,7 +13,6 @@ from operator import itemgetter
 from typing import Any, NoReturn
 
 from fleetmap.log_lines import LogLimit
-from mapserver.operators.sign_in_proxy import plain_address
 
 MAX_CONNECTIONS, MAX_OF_ADDRESS = 512, 64
 MAX_HEAD_BYTES = 16 << 10
@@ -143,3 +142,9 @@ def _network(host: str) -> str:
     if address.version == 4:
         return str(address)
     return str(address.ipv4_mapped or f"{ip_address(int(address) >> 64 << 64)}/64")
+
+
+def plain_address(address: str) -> str:
+    """Of IPv4 addresses in IPv6 the former, as sockets of both kinds write them."""
+    found = ip_address(address.partition("%")[0])
+    return str(getattr(found, "ipv4_mapped", None) or found)

@@ -7,13 +7,13 @@ import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 from typing import NamedTuple
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from fleetmap.errors import UsageError
 from mapserver.operators.roles import SCOPES, Identity, Role
+from mapserver.serving.http_connections import plain_address
 
 USER, GROUPS = b"x-forwarded-user", b"x-forwarded-groups"
 PREFIX = "proxy:"  # in front of their names in the log: no name of ours has a colon
@@ -106,9 +106,3 @@ def _address(given: str) -> str:
         return plain_address(given)
     except ValueError as error:
         raise UsageError(f"--sign-in-proxy {given!r}: write the proxy's address like 127.0.0.1") from error
-
-
-def plain_address(address: str) -> str:
-    """Of IPv4 addresses in IPv6 the former, as sockets of both kinds write them."""
-    found = ip_address(address.partition("%")[0])
-    return str(getattr(found, "ipv4_mapped", None) or found)
