@@ -270,6 +270,7 @@ def tables(database: Database) -> None:
     """The first schema; a store of the last numbered format has it but for one column."""
     if database["versions"].exists():
         database.execute("ALTER TABLE sites DROP COLUMN vocabulary_sha256")
+        database.execute("DELETE FROM traces WHERE heard_ns IS NULL")  # nobody knows when, and no page shows them
         return
     for statement in _TABLES.strip().split("\n\n"):
         database.execute(statement)

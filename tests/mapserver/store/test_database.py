@@ -16,6 +16,7 @@ from fleetmap.errors import StoreError
 from mapserver import releases
 from mapserver.store import FailureFilter, MapStore, schema
 from mapserver.store import database as database_module
+from mapserver.store.access.chain import chain_faults
 from mapserver.store.database import APPLICATION_ID, Transactions
 from mapserver.store.schema import FORMAT, LAST_UNNAMED
 from support.storage.map_samples import save_sample_draft
@@ -90,6 +91,13 @@ def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Pa
     path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{LAST_UNNAMED}.sqlite3"
     shutil.copy(golden / f"store-{LAST_UNNAMED}.sqlite3", path)
     shutil.copytree(golden / "store-blobs", tmp_path / "blobs")
+    with (
+        closing(sqlite3.connect(path)) as connection,
+        connection,
+    ):  # as one that began before the chain and the moments of traces
+        connection.execute("DROP TRIGGER events_stay_as_they_are")
+        connection.execute("UPDATE events SET sha256 = '' WHERE id <= 2")
+        connection.execute("INSERT INTO traces (hour, key_id, stamp_ns, status) VALUES (0, 1, 1, 'LOST')")
     before = path.read_bytes()
     with MapStore.open(tmp_path, read_only=True) as store:
         assert [info.state for info in store.versions("lab")] == ["current", "retired", "draft"]
@@ -102,6 +110,8 @@ def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Pa
         assert releases.publish(store, "lab") == 3
         assert releases.roll_back(store, "lab") == 1
         assert store.verify().faults == []
+        assert chain_faults(store.audit_lines()) == []
+        assert store._transactions.query("SELECT * FROM traces WHERE heard_ns IS NULL") == []
     assert (failure.failure_id, format_of(path), format_of(copy)) == ("f1", FORMAT, LAST_UNNAMED)
 
 
