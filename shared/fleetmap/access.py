@@ -1,9 +1,9 @@
-"""Who may say what on the bus: from the names in certificates to the rules that zenoh obeys, and MemoryBus too.
+"""Who may say what on the bus: from the names in certificates to the rules that zenoh obeys.
 
 Nothing is allowed that no rule names. The list of certificates is therefore the list of who is not revoked.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -68,10 +68,6 @@ class Rule:
     acts: tuple[Act, ...]
     keys: tuple[str, ...]
 
-    def allows(self, flow: Direction, act: Act, key_expr: str) -> bool:
-        """Whether such a message passes; `key_expr` may hold wildcards itself."""
-        return flow is self.flow and act in self.acts and any(key_includes(key, key_expr) for key in self.keys)
-
 
 class Access:
     """The rules for some holders of certificates; nobody else may say anything."""
@@ -97,11 +93,6 @@ class Access:
     def has_robot(self, site: str, robot: str) -> bool:
         """Whether such a robot is enrolled."""
         return (site, robot) in self._robots
-
-    def permits(self, certificate: str, flow: Direction, act: Act, key_expr: str) -> bool:
-        """Whether a message from (IN) or to (OUT) the holder of a certificate passes."""
-        holder = self._holders.get(certificate)
-        return holder is not None and any(rule.allows(flow, act, key_expr) for rule in _rules(holder))
 
     def zenoh_config(self) -> dict[str, Any]:
         """Sections of zenoh's configuration that enforce the rules, and bound how often and how much a participant sends."""
@@ -134,21 +125,6 @@ class Access:
                 _size_limit("questions", Act.QUERY, "fleetmap/**", _QUESTION_BYTES),
             ],
         }
-
-
-def key_includes(key_expr: str, other: str) -> bool:
-    """Whether a key expression covers every key that `other`, a key or key expression, stands for."""
-    return _includes(key_expr.split("/"), other.split("/"))
-
-
-def _includes(chunks: Sequence[str], others: Sequence[str]) -> bool:
-    if not chunks:
-        return not others
-    if chunks[0] == "**":
-        return any(_includes(chunks[1:], others[skip:]) for skip in range(len(others) + 1))
-    if not others or others[0] == "**" or chunks[0] not in {"*", others[0]}:
-        return False
-    return _includes(chunks[1:], others[1:])
 
 
 def _rules(holder: Holder) -> tuple[Rule, ...]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
+from fleetmap.bus import ZenohBus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from fleetmap.recordings.calibration_files import format_calibration
 from locclient.delivery.outbox import Outbox
@@ -23,6 +23,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import FailureFilter, MapStore
 from mapserver.trust import init_here
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.nav2_client import ACTIVE, LifecycleManager, eventually, rmw_router
 from support.fleet.tls_site import TlsSite
 from support.recordings.recording_samples import calibration

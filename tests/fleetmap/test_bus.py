@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from fleetmap.access import key_includes
-from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, MemoryBus, MemoryHub, ZenohBus, check_endpoint
+from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, ZenohBus, check_endpoint
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
+from support.fleet.memory_bus import MemoryBus, MemoryHub, key_includes
 
 
 @pytest.fixture(params=["memory", "zenoh"])

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.log_lines import LineFormatter, LogLimit, printable
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 FORGED = "hall\n2026-11-22 00:00:00,000 INFO mapserver: ada promoted version 9"
 

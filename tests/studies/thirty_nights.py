@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from benchmarks.common.recorded_runs import SITE, played, tool
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetsim.commands import record_order
@@ -33,6 +32,7 @@ from mapserver.nightly import NightRequest, last_report, run_night
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from studies.study import PAGES, Column, Row, publish, results, table
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 SEED, OTHER_SEED, NIGHTS = 547, 787, 30  # of the site, of the building that the foreign recording is from
 WORK = PAGES.parents[1] / "out" / "thirty_nights"

@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from fleetmap.bus import MemoryBus, ZenohBus, has_tls, is_loopback
+from fleetmap.bus import ZenohBus, has_tls, is_loopback
 from fleetmap.errors import UsageError
 from fleetmap.log_lines import LogLimit
 from mapserver.store import MapStore
@@ -49,9 +49,7 @@ def prepare_bus(store: MapStore, endpoint: str, *, insecure: bool) -> "tuple[Zen
 class BusGuard:
     """Opens the bus anew when robots were enrolled or revoked, or a certificate was replaced; says who is there and should not be."""
 
-    def __init__(
-        self, register: RobotRegister, bus: ZenohBus | MemoryBus, clock_s: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, register: RobotRegister, bus: ZenohBus, clock_s: Callable[[], float] = time.monotonic) -> None:
         self.register, self._bus, self._clock_s = register, bus, clock_s
         self.access = register.access()
         self._state, self._tls_state = register.state(), register.tls_state()

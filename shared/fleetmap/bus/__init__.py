@@ -1,7 +1,6 @@
-"""The bus between server and robots: `Bus` is the contract, `ZenohBus` the network, `MemoryBus` the same in one process."""
+"""The bus between server and robots: `Bus` is the contract, `ZenohBus` the network."""
 
 from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback
-from fleetmap.bus.memory import MemoryBus, MemoryHub
 from fleetmap.bus.protocol import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen
 from fleetmap.bus.robot_questions import RobotQuestions
 from fleetmap.bus.tls import TlsFiles, handshake_fault
@@ -14,8 +13,6 @@ __all__ = [
     "Handle",
     "LatchedPublisher",
     "Listen",
-    "MemoryBus",
-    "MemoryHub",
     "RobotQuestions",
     "TlsFiles",
     "ZenohBus",

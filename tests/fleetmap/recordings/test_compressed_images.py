@@ -11,7 +11,6 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from rosbags.typesys import Stores, get_typestore
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, StoredFrame, open_recording
 from fleetmap.recordings.images import decode_frame
@@ -21,6 +20,7 @@ from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import HEIGHT, WIDTH, calibration

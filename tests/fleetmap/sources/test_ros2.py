@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
+from fleetmap.bus import ZenohBus
 from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
@@ -26,6 +26,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
 from fleetmap.sources.source import open_source
 from fleetmap.sources.stereo_pairs import StereoPairs
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 
 TOPICS = Topics(left="/rig/left/image_raw", right="/rig/right/image_raw", imu="/rig/imu")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
@@ -17,6 +16,7 @@ from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import PublisherInputs, open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from fleetmap.bus import MemoryBus, MemoryHub, ZenohBus
+from fleetmap.bus import ZenohBus
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.geometry import se3
 from fleetmap.messages import Status
@@ -22,6 +22,7 @@ from locclient.daemon.publishers import PublisherInputs, open_publisher
 from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.nav2_client import (
     ACTIVE,
     FINALIZED,

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import FleetmapError, RecordingError, StoreError
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import (
@@ -41,6 +40,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import Actor, MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 

@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import blob_path
@@ -32,6 +31,7 @@ from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
 

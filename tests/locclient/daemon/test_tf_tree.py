@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import UsageError
 from fleetmap.geometry import (
     Array,
@@ -31,6 +30,7 @@ from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.estimates import estimate
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.nav2_client import typestore
 from support.fleet.tf2_buffer import tf2_lookups
 from support.recordings.recording_samples import calibration

@@ -2,11 +2,11 @@
 
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, UnreachableError
 from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message, part_of
 from locclient.maps import chunked_download
 from locclient.maps.chunked_download import ChunkReader
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 DATA = bytes(range(256)) * 3000  # three parts
 WHOLE = PART_BYTES + 5

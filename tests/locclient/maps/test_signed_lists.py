@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import FleetmapError, LinkError, UntrustedError
 from fleetmap.mapformat import blob_path
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
@@ -39,6 +38,7 @@ from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, init_here, update_lists
 from mapserver.trust.repository import ListRepository, site_targets
 from mapserver.trust.signing import admitted_versions
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 SITE, ROBOT = "lab", "r1"

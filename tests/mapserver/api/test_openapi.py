@@ -14,7 +14,6 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.messages import CameraNote, FailureReport, Placement, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
@@ -24,6 +23,7 @@ from mapserver.api.version_routes import ApiSettings
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.store import Actor, FailureReplay, MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)

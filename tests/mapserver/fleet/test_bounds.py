@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, Thumbnail, encode_message
 from mapserver import releases
@@ -18,6 +17,7 @@ from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
 SECOND_NS = 10**9

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import MapClient
@@ -22,6 +21,7 @@ from mapserver.fleet_statistics.canary_test import (
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, DraftContent, MapStore, Retention
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 SETTINGS = CanarySettings()

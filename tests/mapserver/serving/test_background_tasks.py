@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.errors import StoreError
 from fleetmap.messages import FailureReport, RobotHealth
 from mapserver import releases
@@ -16,6 +15,7 @@ from mapserver.fleet_statistics.canary_test import CanarySettings
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
 NS = 1_000_000_000

@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509 import load_pem_x509_certificate
 
 from fleetmap.access import Access, Holder, Purpose
-from fleetmap.bus import MemoryBus, MemoryHub, TlsFiles, ZenohBus
+from fleetmap.bus import TlsFiles, ZenohBus
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, decode_message, encode_message, robot_key
 from fleetmap.trust import enrolment
@@ -25,6 +25,7 @@ from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.authorities import Authorities, Authority
 from mapserver.trust.enrolment import Enrolled, RobotRegister
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
 DAY_NS = 86_400_000_000_000

@@ -7,7 +7,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.bus import MemoryBus
 from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageError
 from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import (
@@ -34,6 +33,7 @@ from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
 from mapserver.store import Actor, FailureFilter, MapStore
+from support.fleet.memory_bus import MemoryBus
 from support.fleet.served_world import World, served_world
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 

@@ -19,11 +19,12 @@ from tuf.api.metadata import (
     Timestamp,
 )
 
-from fleetmap.bus import Bus, MemoryBus, MemoryHub, ZenohBus
+from fleetmap.bus import Bus, ZenohBus
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import sha256_hex
 from fleetmap.messages import WantedVersion, part_of, trust_key
 from fleetmap.trust import TrustedMap, ask_over, manifest_target, site_role
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 SITE = "hall"
 ROLE = site_role(SITE)

@@ -8,12 +8,12 @@ from pathlib import Path
 import httpx
 from fastapi.testclient import TestClient
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
 

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleetmap.bus import MemoryBus, MemoryHub
 from fleetmap.mapformat import Tile, decode_tile
 from fleetmap.messages import (
     WantedVersion,
@@ -16,6 +15,7 @@ from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import DraftContent, MapStore
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import draft_details, save_sample_draft
 
 

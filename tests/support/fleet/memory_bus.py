@@ -1,9 +1,10 @@
-"""The bus inside one process, for tests and for replays without a server."""
+"""The bus inside one process; obeys the rules of `fleetmap.access`, as zenoh does."""
 
 import threading
+from collections.abc import Sequence
 from typing import Any
 
-from fleetmap.access import Access, Act, Direction, key_includes
+from fleetmap.access import Access, Act, Direction, _rules
 from fleetmap.bus.protocol import (
     Answer,
     Attach,
@@ -39,7 +40,7 @@ class MemoryHub:
         """Whether a message of or for a participant passes; the server itself (None) is asked nothing."""
         if self.access is None or certificate is None:
             return True
-        return self.access.permits(certificate, flow, act, key_expr)
+        return permits(self.access, certificate, flow, act, key_expr)
 
 
 class MemoryBus(Bus):
@@ -154,3 +155,27 @@ class MemoryBus(Bus):
         handle = Handle(undo)
         self._handles = [*(other for other in self._handles if not other.closed()), handle]
         return handle
+
+
+def permits(access: Access, certificate: str, flow: Direction, act: Act, key_expr: str) -> bool:
+    """Whether a message from (IN) or to (OUT) the holder of a certificate passes; `key_expr` may hold wildcards itself."""
+    holder = access.holder(certificate)
+    return holder is not None and any(
+        flow is rule.flow and act in rule.acts and any(key_includes(key, key_expr) for key in rule.keys)
+        for rule in _rules(holder)
+    )
+
+
+def key_includes(key_expr: str, other: str) -> bool:
+    """Whether a key expression covers every key that `other`, a key or key expression, stands for."""
+    return _includes(key_expr.split("/"), other.split("/"))
+
+
+def _includes(chunks: Sequence[str], others: Sequence[str]) -> bool:
+    if not chunks:
+        return not others
+    if chunks[0] == "**":
+        return any(_includes(chunks[1:], others[skip:]) for skip in range(len(others) + 1))
+    if not others or others[0] == "**" or chunks[0] not in {"*", others[0]}:
+        return False
+    return _includes(chunks[1:], others[1:])
