@@ -8,7 +8,6 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
-from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, accelerometer_images, fixed_pattern, lens, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
@@ -107,22 +106,21 @@ def checked(
     recording: Recording,
     on_frame: Callable[[], None] = lambda: None,
     executor: Executor = SERIAL,
-    follow: Follow | None = None,
 ) -> CheckedRecording:
     """What is found in the recording, and the calibration to survey it with. RecordingError where a check that decides failed.
 
     A parameter that is wrong for sure is corrected, and the recording measured again: where that finds something wrong still, the
-    evidence conflicts, and a person must look at it. follow: see `measure_calibration`.
+    evidence conflicts, and a person must look at it.
     """
     limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
-    checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow)
+    checks = run_checks(recording, on_frame, **limits, executor=executor)
     _refuse(recording, checks.findings)
     used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
     rig, corrections = corrected(recording.calibration, checks.calibration)
     again: list[Finding] = []
     if corrections:
-        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor, follow)
+        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor)
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
     elif checks.measured_offset_s is not None and abs(checks.measured_offset_s) >= _CORRECTED_FROM_S:
         corrections = {CalibrationParameter.TIME_OFFSET.value: round(checks.measured_offset_s, 7)}

@@ -24,9 +24,9 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
 from mapserver.build.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
-from mapserver.build.image_spill import ImageSpill
 from mapserver.build.job_lock import Job, JobProgress, recorded_job
 from mapserver.build.layers import covered_requests, grid_layer, layer_sessions, surfel_layer
+from mapserver.build.mapped_images import MappedImageStore
 from mapserver.build.progress import ProgressView, StageTimes
 from mapserver.build.report import (
     Accuracy,
@@ -40,7 +40,6 @@ from mapserver.build.report import (
     sentence,
     write_file,
 )
-from mapserver.build.survey_beginnings import SurveyBeginnings
 from mapserver.build.survey_recordings import (
     Admission,
     OpenRecordings,
@@ -56,9 +55,7 @@ from mapserver.build.survey_recordings import (
 )
 from mapserver.build.trajectory import OtherTrajectory
 from mapserver.build.worker import (
-    SideProcess,
     open_executor,
-    open_side_process,
     open_side_thread,
     single_threaded_libraries,
 )
@@ -140,8 +137,7 @@ class _Run:
     console: Console
     times: StageTimes
     started_s: float
-    images: ImageSpill
-    side: SideProcess | None
+    images: MappedImageStore
 
     def tools(self, executor: Executor, view: ProgressView, told: JobProgress | None = None) -> SurveyTools:
         """With progress that is shown and timed, and told to those who look at the job."""
@@ -193,13 +189,13 @@ def build_draft(
         raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
+    folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
     with (
         single_threaded_libraries(),
-        open_side_process(options.threads) as side,
-        OpenRecordings(options.reading, request.store) as reading,
-        ImageSpill(reading.folder) as images,
+        OpenRecordings(options.reading, folder) as reading,
+        MappedImageStore(folder) as images,
     ):
-        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images, side)
+        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
         admitted = _admitted(run)
         with (
             MapStore.open(request.store, create=True) as maps,
@@ -217,29 +213,17 @@ def build_draft(
 def _admitted(run: _Run) -> dict[Path, Admission]:
     request, options = run.request, run.request.options
     run.times.begin("examination")
-    config = None
-    if len(request.recordings) == 1 and _is_first(request):
-        config = SurveyConfig(run.settings, default_vocabulary(), run.zones)
-    with ProgressView(run.console) as view, open_executor(options.threads, None, run.side) as executor:
-        beginnings = SurveyBeginnings(config, run.tools(executor, view))
+    with ProgressView(run.console) as view, open_executor(options.threads, None) as executor:
         return admit_recordings(
             request.recordings,
             run.reading,
             run.console,
             needs_truth=options.frame_from_ground_truth,
             unusable=run.unusable,
-            beginnings=beginnings,
+            executor=executor,
+            progress=view,
             look_at=options.look_at,
         )
-
-
-def _is_first(request: BuildRequest) -> bool:
-    """True if the site has no version yet; later maps have their own camera."""
-    try:
-        with MapStore.open(request.store) as maps:
-            return request.site not in {info.site for info in maps.sites()} or maps.current(request.site) is None
-    except StoreError:  # there is none; what else is wrong with it is said where it is made
-        return True
 
 
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
@@ -266,7 +250,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
     options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
-        open_executor(options.threads, options.scheduler, run.side) as executor,
+        open_executor(options.threads, options.scheduler) as executor,
     ):
         survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
@@ -313,10 +297,9 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
     archive = encode_archive(survey_map)
-    held_bytes = [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, run.side.peak_rss_bytes if run.side else 0]
     cost = BuildCost(
         seconds=time.perf_counter() - run.started_s,
-        peak_rss_mb=sum(held_bytes) / 1e6,
+        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
     report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
     asked = covered_requests(maps, site, built.joined)
@@ -360,7 +343,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
     trajectories = map_trajectories(built.joined)
     sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     drafted = DraftMap(tiles, default_vocabulary(), camera)
-    with open_executor(options.threads, None, run.side) as executor:
+    with open_executor(options.threads, None) as executor:
         evidence = examine_draft(drafted, before, sessions, replayed, executor)
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))

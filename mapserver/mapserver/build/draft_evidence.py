@@ -1,9 +1,9 @@
 """Evidence about a draft: frames read from recordings, relocalized in the tiles as robots get them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,12 +24,11 @@ from fleetmap.version_grid import known_grid
 from mapserver.build.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
-from mapserver.quality.figures import Evidence, RigEvidence, Starts, TrajectoryBreaks
+from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread, starts_without_prior
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pipeline import Survey
 from mapserver.survey.survey_map import SurveyMap
 
@@ -64,31 +63,16 @@ def held_out_of(
     rectifier: Rectifier,
     survey: Survey,
     orb: OrbSettings,
-    known: Sequence[HeldOut],
 ) -> list[HeldOut]:
-    """Frames of a surveyed recording that did not become keyframes, read again unless they are known. Damaged ones are left out."""
+    """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
-    there = {frame.number: frame for frame in known if frame.number in numbers}
-    read = _read(recording, selected, [n for n in numbers if n not in there], rectifier, orb)
-    return sorted([*there.values(), *read], key=lambda frame: frame.number)
-
-
-def likely_held_out(odometry: OdometryPass) -> list[int]:
-    """What `held_out_of` will choose if the map takes all frames and keyframes."""
-    keyframes = [k.frame_index for k in odometry.keyframes]
-    return held_out_frames(keyframes, np.ones(len(odometry.estimates), bool), PROBES)
-
-
-def read_held_out(part: Recording, numbers: Sequence[int], rectifier: Rectifier, orb: OrbSettings) -> list[HeldOut]:
-    """The frames with these numbers, which are all that `part` has; closes it."""
-    with part:
-        return _read(part, {number: n for n, number in enumerate(numbers)}, numbers, rectifier, orb)
+    return _read(recording, selected, numbers, rectifier, orb)
 
 
 def _read(
     recording: Recording,
-    selected: Sequence[int] | dict[int, int],
+    selected: Sequence[int],
     numbers: Sequence[int],
     rectifier: Rectifier,
     orb: OrbSettings,
@@ -188,9 +172,6 @@ class DraftMap(NamedTuple):
         """It as robots see it."""
         return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
 
-    def starts(self, frames: Sequence[Probe]) -> Starts | None:
-        return starts_without_prior(self.view(), frames)
-
 
 def examine_draft(
     drafted: DraftMap,
@@ -207,12 +188,15 @@ def examine_draft(
     stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
     drafted = drafted._replace(tiles=stored)
     probes = Probes(held_out, replayed, last)
-    beside = executor.beside(drafted.starts, probes.frames)
     current = None if before is None else DraftMap(before.tiles, drafted.vocabulary, before.survey.camera).view()
     draft = drafted.view()
-    evidence = examine(draft, current, probes, _breaks(sessions))
-    starts = starts_without_prior(draft, probes.frames) if beside is None else beside.result()
-    return msgspec.structs.replace(evidence, directions=tile_directions(stored), starts=starts)
+    tasks: list[Callable[[], Any]] = [
+        lambda: starts_without_prior(draft, probes.frames),
+        lambda: examine(draft, current, probes, _breaks(sessions)),
+    ]
+    starts, evidence = executor.map(lambda _, task: task(), None, tasks)
+    found: Evidence = msgspec.structs.replace(evidence, directions=tile_directions(stored), starts=starts)
+    return found
 
 
 def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:

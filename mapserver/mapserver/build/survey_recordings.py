@@ -1,9 +1,10 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import count
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -19,27 +20,27 @@ from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import DataIssue, SensorSet, Trajectory
-from mapserver.build.admission import checked
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
+from mapserver.build.admission import SAMPLED_FRAMES, TURN_FRAMES, checked
 from mapserver.build.draft_evidence import HeldOut, held_out_of
-from mapserver.build.image_spill import KeptFrames
+from mapserver.build.mapped_images import KeptFrames
 from mapserver.build.report import check_truth
 from mapserver.build.sensor_subset import reduced
-from mapserver.build.survey_beginnings import BegunSurvey, SurveyBeginnings, survey_inputs_of
 from mapserver.build.trajectory import OtherTrajectory, given_poses, with_depths
+from mapserver.build.worker import read_ahead
 from mapserver.calibration import CalibrationParameter
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
+from mapserver.doctor.run_checks import frames_to_check
 from mapserver.quality.figures import RigEvidence
-from mapserver.survey.executor import SERIAL
+from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import Joined, chained
 from mapserver.survey.pipeline import Survey, survey
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.survey_inputs import Progress, SurveyConfig, SurveyInputs, SurveyTools, no_progress
 
 _log = logging.getLogger(__name__)
-_SHARED_STRETCHES = 3  # of which a calibration takes one
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,13 @@ class Surveyed:
 class Admission:
     """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
 
-    begun: its survey, where the calibration was measured from that. given: its initial trajectory, None for our own odometry.
+    given: its initial trajectory, None for our own odometry.
     """
 
     statements: tuple[str, ...]
     rig: RigCalibration
     calibration: RigEvidence
     corrections: dict[str, float]
-    begun: BegunSurvey | None = None
     given: Trajectory | None = None
     leaves_wheels_out: bool = False
 
@@ -145,12 +145,11 @@ class Reading(Protocol):
 class OpenRecordings:
     """Recordings opened as `options` say. The one used last stays open; frames that its first use decoded are decoded once.
 
-    folder: takes their temporary file, or the nearest folder above it that exists.
+    folder: takes their temporary file.
     """
 
     def __init__(self, options: RecordingOptions, folder: Path) -> None:
-        self._options = options
-        self.folder = next(each for each in (folder, *folder.absolute().parents) if each.is_dir())
+        self._options, self._folder = options, folder
         self._path: Path | None = None
         self._opened: tuple[Recording, NDArray[np.int64]]
 
@@ -171,12 +170,48 @@ class OpenRecordings:
         if path != self._path:
             self.__exit__()
             recording, indices = self._options.opened(path)
-            self._opened = replace(recording, frames=KeptFrames(recording.frames, self.folder)), indices
+            self._opened = replace(recording, frames=KeptFrames(recording.frames, self._folder)), indices
             self._path = path
         yield self._opened
         frames = self._opened[0].frames
         assert isinstance(frames, KeptFrames)
         frames.keeps = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedParts:
+    """The selected frames (F,) of a recording as FrameParts: each part reads files of its own, and carries nothing of the others."""
+
+    recording: Recording
+    indices: NDArray[np.int64]
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        return self.recording.frame_stamps_ns[self.indices]
+
+    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
+        part = self.recording.part(self.indices[first:end])
+        return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    recording: Recording
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        with self.recording as recording:
+            for index in range(len(recording)):
+                yield recording.read_frame(index)
+
+
+def survey_inputs_of(
+    recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
+) -> SurveyInputs:
+    """The selected frames (F,) of a recording, read ahead, and its samples."""
+    frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
+    samples = recording.imu, recording.calibration, rectifier, recording.wheel
+    parts = RecordedParts(recording, indices)
+    return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)
 
 
 def admit_recordings(
@@ -186,10 +221,11 @@ def admit_recordings(
     *,
     needs_truth: bool,
     unusable: dict[Path, str] | None = None,
-    beginnings: SurveyBeginnings | None = None,
+    executor: Executor = SERIAL,
+    progress: Progress = no_progress,
     look_at: Callable[[Sequence[Path]], None] = lambda _: None,
 ) -> dict[Path, Admission]:
-    """Checks all recordings, so that a hopeless one is refused before the work begins; `beginnings` begin the survey of a single one.
+    """Checks all recordings, so that a hopeless one is refused before the work begins.
 
     unusable: takes those that are refused, with the reason; without it, or where all are, that is an error. look_at: told each path.
     """
@@ -197,7 +233,7 @@ def admit_recordings(
     for path in paths:
         look_at([path])
         with _noting(path, unusable):
-            admitted[path] = _admission(path, options, console, needs_truth, beginnings)
+            admitted[path] = _admission(path, options, console, needs_truth, executor, progress)
     if not admitted:
         raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
@@ -228,7 +264,8 @@ def _admission(
     options: Reading,
     console: Console,
     needs_truth: bool,
-    beginnings: SurveyBeginnings | None,
+    executor: Executor,
+    progress: Progress,
 ) -> Admission:
     with options.open(path) as (recording, indices):
         for issue in recording.issues:
@@ -236,17 +273,13 @@ def _admission(
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
         other = options.trajectory
-        follow = None if beginnings is None else beginnings.follow(recording, indices, is_given=other is not None)
-        executor = SERIAL if beginnings is None else beginnings.executor
-        result = checked(recording, executor=executor, follow=follow)
+        total, done = frames_to_check(recording, SAMPLED_FRAMES, TURN_FRAMES), count(1)
+        result = checked(recording, lambda: progress("examination", min(next(done), total), total), executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        begun = None if beginnings is None else beginnings.last
-        begun = begun if begun is not None and begun.rig is result.rig else None
         statements, found = tuple(result.statements()), result.calibration
-        admission = Admission(
-            statements, result.rig, found, result.corrections, begun, leaves_wheels_out=result.leaves_wheels_out
-        )
+        wheels = result.leaves_wheels_out
+        admission = Admission(statements, result.rig, found, result.corrections, leaves_wheels_out=wheels)
         if other is None:
             return admission
         given = given_poses(replace(recording, calibration=result.rig), indices, other)
@@ -267,13 +300,8 @@ def survey_recording(
         recording = replace(opened, calibration=admission.rig)
         if admission.leaves_wheels_out:
             recording = replace(recording, wheel=())
-        if (begun := admission.begun) is not None:
-            rectifier, done = begun.rectifier, begun.finished(options, tools)
-            known = [] if begun.held_out is None else begun.held_out.result()
-        else:
-            known = []
-            rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-            done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), options, tools)
+        rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
+        done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), options, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
@@ -286,7 +314,7 @@ def survey_recording(
             findings=admission.statements,
             calibration=admission.calibration,
             corrections=admission.corrections,
-            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb, known),
+            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 
 

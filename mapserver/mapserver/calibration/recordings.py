@@ -14,20 +14,15 @@ from fleetmap.sensors.samples import ImuSamples, SensorSet, Stamps
 from mapserver.calibration.estimate import CalibrationEstimate, continued_from, estimate_from
 from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData
-from mapserver.calibration.survey_data import stretch_of_survey, thinned
-from mapserver.survey.bundle.bundle_rounds import state_of
-from mapserver.survey.chain import AdjustedChain
-from mapserver.survey.executor import Work
+from mapserver.calibration.survey_data import stretch_of_survey
 from mapserver.survey.pipeline import begin_survey
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter
-Follow = Callable[[Recording], Work[CalibrationEstimate]]
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
-_OBSERVATIONS = 300  # of a keyframe in the mean: what so many features leave over
 _PASSES = 3
 # A correction above this changes what is matched and how: the images are rectified again and followed anew.
 _ANEW = {
@@ -46,13 +41,11 @@ def estimate_calibration(
     recordings: Sequence[Recording],
     settings: SurveySettings,
     tools: SurveyTools | None = None,
-    follow: Follow | None = None,
     is_enough: IsEnough = lambda *_: False,
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
-    follow: the estimate from the only recording, instead of the first pass here. is_enough: whether an estimate need
-    not be any better, however far the parameters that are named are from the given calibration.
+    is_enough: whether an estimate need not be any better, however far the parameters that are named are from the given calibration.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
     if not recordings:
@@ -69,11 +62,8 @@ def estimate_calibration(
     for _ in range(_PASSES):
         axes = RigAxes.of(rig, Rectifier(rig))
         current = corrected_rig(rig, axes, before) if before.any() else rig
-        if follow is not None and current is rig:
-            estimate = follow(recordings[0]).result()
-        else:
-            found = estimate_from([followed(r, current, settings, tools or SurveyTools()) for r in recordings])
-            estimate = continued_from(before, found)
+        found = estimate_from([followed(r, current, settings, tools or SurveyTools()) for r in recordings])
+        estimate = continued_from(before, found)
         after = estimate.corrections()
         moved = [p for p, limit in _ANEW.items() if abs(after[INDEX[p]] - before[INDEX[p]]) > limit]
         if not moved or is_enough(estimate, moved):
@@ -105,17 +95,6 @@ def followed(
     inputs = SurveyInputs(frames, len(chosen), recording.imu, rig, rectifier, recording.wheel)
     chain = begin_survey(inputs, settings, tools)
     return stretch_of_survey(chain.state, chain.odometry.keyframes, (rig, rectifier), recording.wheel)
-
-
-def stretch_of_chain(
-    chain: AdjustedChain, recording: Recording, rig: tuple[RigCalibration, Rectifier]
-) -> CalibrationData:
-    """The same from a survey of a whole recording that has begun: of its busiest stretch, thinned to what a calibration needs."""
-    stamps_ns, seen_ns = np.array([e.stamp_ns for e in chain.odometry.estimates], np.int64), chain.state.stamps_ns
-    ends_ns = stamps_ns[busiest_frames(stamps_ns, recording.imu)[[0, -1]]]
-    state = state_of(chain.state, (seen_ns >= ends_ns[0]) & (seen_ns <= ends_ns[1]))
-    keyframes = [k for k in chain.odometry.keyframes if ends_ns[0] <= k.stamp_ns <= ends_ns[1]]
-    return stretch_of_survey(thinned(state, _OBSERVATIONS), keyframes, rig, recording.wheel)
 
 
 def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:

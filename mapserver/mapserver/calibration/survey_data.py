@@ -56,18 +56,6 @@ def stretch_of_survey(
     )
 
 
-def thinned(state: SurveyState, observations: int) -> SurveyState:
-    """The state with so many observations of a keyframe in the mean: landmarks are kept by chance, or as many as there are."""
-    marks, wanted = state.landmarks, observations * len(state.stamps_ns)
-    if len(marks.obs_keyframe) <= wanted:
-        return state
-    views = np.bincount(marks.obs_landmark, minlength=len(marks.points_map))
-    order = np.random.default_rng(0).permutation(len(views))
-    kept = np.zeros(len(views), bool)
-    kept[order[np.cumsum(views[order]) <= wanted]] = True
-    return replace(state, landmarks=marks.keep_observations(kept[marks.obs_landmark], 2))
-
-
 def _busiest(state: SurveyState) -> NDArray[np.bool_]:
     """(K,) the run of keyframes with the most turning, all of them where they are few."""
     count = len(state.stamps_ns)

@@ -38,14 +38,12 @@ def doctor(
     from fleetmap.console import plain_console
     from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from mapserver.doctor import Verdict, run_checks
-    from mapserver.doctor.calibration import followed_frames
     from mapserver.doctor.findings import worst
-    from mapserver.doctor.run_checks import SAMPLED_FRAMES, TURN_FRAMES
+    from mapserver.doctor.run_checks import frames_to_check
 
     with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
         with Progress(console=plain_console(stderr=True), transient=True) as progress:
-            wanted = min(SAMPLED_FRAMES, len(source)) + (min(TURN_FRAMES, len(source)) if len(source.imu) else 0)
-            task = progress.add_task("frames, and steps of the adjustment", total=wanted + followed_frames(source))
+            task = progress.add_task("frames, and steps of the adjustment", total=frames_to_check(source))
             findings = run_checks(source, lambda: progress.advance(task)).findings
         if json_file != _STDOUT:
             _print(source, findings)

@@ -67,7 +67,7 @@ class SurveyOptions(SiteOptions):
     threads: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: one per core.")] = None
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...); `local` starts processes here."),
+        typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...)."),
     ] = None
 
     def asked(self, context: typer.Context) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
 from mapserver.calibration.parameters import RANGES
-from mapserver.calibration.recordings import Follow, busiest_frames
+from mapserver.calibration.recordings import busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.timing import SPARSE_S, median_period_s
 from mapserver.survey.executor import Executor
@@ -96,12 +96,10 @@ def followed_frames(recording: Recording) -> int:
     return len(busiest_frames(recording.frame_stamps_ns, recording.imu)) if is_judged else 0
 
 
-def measure_calibration(
-    recording: Recording, on_frame: Callable[[], None], executor: Executor, follow: Follow | None = None
-) -> MeasuredCalibration:
+def measure_calibration(recording: Recording, on_frame: Callable[[], None], executor: Executor) -> MeasuredCalibration:
     """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration.
 
-    follow: see `estimate_calibration`. Where nothing is wrong the calibration is used as it is: a finer measure would change nothing.
+    Where nothing is wrong the calibration is used as it is: a finer measure would change nothing.
     """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
@@ -110,7 +108,7 @@ def measure_calibration(
     try:
         focal_px = Rectifier(recording.calibration).camera.focal_px
         enough = partial(_is_good, focal_px)
-        estimate = estimate_calibration([recording], SurveySettings(), tools, follow, enough)
+        estimate = estimate_calibration([recording], SurveySettings(), tools, enough)
     except (FleetmapError, np.linalg.LinAlgError) as error:
         return _unknown(f"the frames could not be followed: {error}", "record a drive in the light, with every frame")
     return MeasuredCalibration(findings_of(estimate, focal_px), estimate)

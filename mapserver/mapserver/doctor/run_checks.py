@@ -10,11 +10,9 @@ from fleetmap.geometry import Array, se3, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from mapserver.calibration import CalibrationEstimate
-from mapserver.calibration.recordings import Follow
 from mapserver.doctor import accelerometer_images, inertial, timing
 from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accelerometer
-from mapserver.doctor.calibration import MeasuredCalibration, measure_calibration
+from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration
 from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.depth import depth_share, measured_depth
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
@@ -33,11 +31,8 @@ from mapserver.doctor.stereo import (
     swapped_cameras,
 )
 from mapserver.doctor.wheel_images import WheelFit, fit_wheels
-from mapserver.survey.executor import SERIAL, Executor, Work
+from mapserver.survey.executor import SERIAL, Executor
 
-_Turns = tuple[
-    CameraTurns, int, list[str], int
-]  # how many frames were tried, what was wrong with some, how often one repeats
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
 _STEP_S = 0.045  # between two frames that show a speed: a step of 20 Hz
@@ -73,14 +68,11 @@ class _Frames:
             self.errors.append(str(error))
             return None
 
-    def taken(self, turns: CameraTurns, tried: int, errors: list[str], repeats: int) -> CameraTurns:
-        """The turns of frames that were read elsewhere."""
-        self.repeats += repeats
-        self.tried += tried
-        self.errors += errors
-        for _ in range(tried):
-            self._on_frame()
-        return turns
+
+def frames_to_check(recording: Recording, sampled: int = SAMPLED_FRAMES, turn_frames: int = TURN_FRAMES) -> int:
+    """How often `run_checks` calls `on_frame`, about."""
+    turns = min(turn_frames, len(recording)) if len(recording.imu) else 0
+    return min(sampled, len(recording)) + turns + followed_frames(recording)
 
 
 def run_checks(
@@ -90,12 +82,11 @@ def run_checks(
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
     executor: Executor = SERIAL,
-    follow: Follow | None = None,
 ) -> CheckResults:
     """Everything the checks say about a recording.
 
     Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair the busiest 30 s; `on_frame` is
-    called after each. follow: see `measure_calibration`.
+    called after each.
     """
     stamps_ns, imu = recording.frame_stamps_ns, recording.imu
     frames = _Frames(recording, on_frame)
@@ -113,7 +104,6 @@ def run_checks(
     seen = _sampled(recording, frames, rectifier, sampled, executor)
     findings += _soon_seen(recording, rectifier, seen, frames)
     turns: CameraTurns | None = None
-    beside: list[Work[_Turns]] = []
 
     def judged(turns: CameraTurns) -> tuple[Finding, Metres]:
         """The accelerometer's axes, and who is right about metres."""
@@ -132,19 +122,9 @@ def run_checks(
         if judged(turns)[1].wheels_finding().verdict is Verdict.FAIL:
             used = replace(recording, wheel=())
 
-    def followed(given: Recording) -> Work[CalibrationEstimate]:
-        """Turns are looked at once the estimate is on its way."""
-        assert follow is not None
-        work = follow(given)
-        looking = executor.beside(_turns_alone, _bare(recording), turn_frames) if turns is None and not beside else None
-        beside.extend([] if looking is None else [looking])
-        return work
-
     if recording.sensor_set in _PAIRS:
-        calibration = measure_calibration(used, on_frame, executor, None if follow is None else followed)
-    if beside:
-        turns = frames.taken(*beside[0].result())
-    elif turns is None:
+        calibration = measure_calibration(used, on_frame, executor)
+    if turns is None:
         turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
     checked, measured_offset_s = gyro_check(turns, imu, shift_s)
     upside_down = turn_upside_down(turns, imu, shift_s, rectifier.body_from_cam)
@@ -277,20 +257,6 @@ def _turns(motions: Iterable[tuple[int, int, Array | None]]) -> CameraTurns:
     moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
     rates = np.array([so3_log(motion[:3, :3]) for motion in moved]).reshape(-1, 3) / (np.diff(spans) * 1e-9)
     return CameraTurns(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
-
-
-def _bare(recording: Recording) -> Recording:
-    """What turns are seen in, to be read in another process."""
-    part = recording.part(np.arange(len(recording)))
-    return replace(part, wheel=(), priors=(), ground_truth=None, issues=())
-
-
-def _turns_alone(recording: Recording, count: int) -> _Turns:
-    """The camera's turns in a recording, which is closed then."""
-    with recording:
-        frames = _Frames(recording, lambda: None)
-        rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-        return _camera_turns(recording, frames, rectifier, count, SERIAL), frames.tried, frames.errors, frames.repeats
 
 
 def _motion(

@@ -145,7 +145,7 @@ def _close_loops(begun: AdjustedChain, options: SurveyConfig, tools: SurveyTools
     if odometry.scale_known:
         learn_priors(marginals, begun.priors, begun.base_from_body, odometry)
     parts = find_parts(covisibility_of(state), _sigmas_m(odometry), options.settings.join_sigma_m)
-    closer = kind(posed_keyframes(odometry, state), options, marginals, begun.matched, tools.executor.nearby, parts)
+    closer = kind(posed_keyframes(odometry, state), options, marginals, begun.matched, tools.executor, parts)
     for i in range(len(odometry.keyframes)):
         closer.close(i)
         tools.at("loops", i + 1, len(odometry.keyframes))

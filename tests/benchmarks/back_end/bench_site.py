@@ -30,7 +30,7 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetsim.scene.layout import Layout
-from mapserver.build.image_spill import ImageSpill
+from mapserver.build.mapped_images import MappedImageStore
 from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
@@ -84,7 +84,7 @@ class _Gate(GraphMarginals):
 
 def measure(drive: Path, keyframes: int, threads: int) -> dict[str, Any]:
     """One survey's figures."""
-    with ImageSpill(drive.parent) as store:
+    with MappedImageStore(drive.parent) as store:
         survey = SimulatedSurvey.read(drive, keyframes, store)
         return _measure(survey, store, threads)
 

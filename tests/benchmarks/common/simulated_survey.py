@@ -7,7 +7,7 @@ detector where they do not. All else is the survey's own code.
 
 import pickle
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
@@ -63,10 +63,6 @@ class GreyPictures:
 
     def release(self) -> None:
         """Nothing to do."""
-
-    def another(self) -> AbstractContextManager[ImageStore]:
-        """This one, which keeps nothing."""
-        return nullcontext(self)
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,13 @@
 """Whoever does the work of a survey, the map is the same to the byte."""
 
-import os
-import stat
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from functools import lru_cache
-from pathlib import Path
 
 import pytest
+from distributed import Client, LocalCluster
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from fleetmap.bow import decode_vocabulary
@@ -22,7 +17,7 @@ from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from mapserver.build import worker as workers
-from mapserver.build.worker import Processes, Threads, open_executor, open_side_thread, read_ahead
+from mapserver.build.worker import Cluster, Threads, open_executor, open_side_thread, read_ahead
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.pipeline import survey
@@ -54,89 +49,27 @@ def test_threads_make_the_same_map() -> None:
         assert surveyed_by(worker) == alone()
 
 
-def test_processes_make_the_same_map() -> None:
-    with open_executor(2, "local") as worker:
-        assert surveyed_by(worker) == alone()
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Client]:
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as there,
+        Client(there) as client,
+    ):
+        yield client
 
 
-def listening(processes: set[int]) -> set[str]:
-    """Local addresses on which one of these processes listens, as the kernel writes them."""
-    inodes = set()
-    for process in processes:
-        for path in Path(f"/proc/{process}/fd").iterdir():
-            with suppress(OSError):
-                inodes.add(str(path.readlink()))
-    found = set()
-    for name in ("tcp", "tcp6"):
-        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
-            words = line.split()
-            if words[3] == "0A" and f"socket:[{words[9]}]" in inodes:
-                found.add(words[1])
-    return found
-
-
-def own_processes() -> set[int]:
-    """This process and all below it."""
-    found, fresh = set(), {os.getpid()}
-    while fresh:
-        found |= fresh
-        children = (Path(f"/proc/{p}/task/{p}/children").read_text().split() for p in fresh)
-        fresh = {int(child) for line in children for child in line} - found
-    return found
-
-
-def stranger(address: str) -> str:
-    """What somebody else on the machine gets who asks a scheduler to run code."""
-    program = (
-        "import sys, os\nfrom distributed import Client\n"
-        "with Client(sys.argv[1], timeout='10s') as client:\n print('ran', client.submit(os.getpid).result(timeout=20))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, address], capture_output=True, text=True, timeout=60, check=False
-    )
-    return done.stdout
-
-
-def add(shared: int, batch: int) -> int:
-    return shared + batch
-
-
-def test_nobody_else_on_the_machine_reaches_the_processes() -> None:
-    before = listening(own_processes())
-    with open_executor(2, "local") as worker:
-        assert list(worker.map(add, 10, range(4))) == [10, 11, 12, 13]
-        assert len(own_processes()) >= 3
-        assert listening(own_processes()) == before
-    # The control: dask's own cluster, as it was used before.
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp"
-    ) as open_one:
-        assert listening(own_processes()) > before
-        assert stranger(open_one.scheduler_address).startswith("ran ")
-
-
-def test_what_processes_share_is_written_once_and_removed() -> None:
-    with open_executor(2, "local") as worker:
-        values = [10, 20, 30, 40]
-        for value in values:
-            assert list(worker.map(add, value, range(3))) == [value, value + 1, value + 2]
-        assert isinstance(worker, Processes)
-        assert len(list(worker._folder.iterdir())) == 2
-        assert stat.S_IMODE(worker._folder.stat().st_mode) == 0o700
-    assert not worker._folder.exists()
+def test_a_cluster_makes_the_same_map(cluster: Client) -> None:
+    assert surveyed_by(Cluster(cluster)) == alone()
 
 
 def _blas_threads(*_: object) -> list[int]:
     return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
 
-@pytest.mark.parametrize("scheduler", [None, "local"])
-def test_linear_algebra_has_no_threads_beside_those_of_a_survey(scheduler: str | None) -> None:
+def test_linear_algebra_has_no_threads_beside_those_of_a_survey() -> None:
     """A program that uses the library may have loaded it with any number of threads, and gets them back."""
     with threadpool_limits(3, user_api="blas"):
-        with open_executor(2, scheduler) as executor:
+        with open_executor(2, None) as executor:
             there = next(iter(executor.map(_blas_threads, 0, [()])))
         assert there
         assert set(there) == {1}
@@ -150,7 +83,7 @@ def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatc
             pass
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "ws://127.0.0.1:9", "nonsense", ""])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "ws://127.0.0.1:9", "nonsense", "", "local"])
 def test_a_scheduler_without_tls_is_not_used(address: str) -> None:
     with pytest.raises(UsageError, match="tls://HOST:PORT"), open_executor(1, address):
         pass

@@ -1,8 +1,11 @@
 """A survey in segments: the same map whoever makes them, as good as the whole, and whole where a segment cannot start."""
 
+import pickle
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,7 +15,7 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, Stamps, Trajectory
-from mapserver.build.image_spill import ImageSpill
+from mapserver.build.mapped_images import MappedImageStore
 from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
@@ -100,27 +103,27 @@ def test_segments_make_a_map_as_good_as_the_whole() -> None:
     assert ate_m(done) < max(1.1 * ate_m(whole), ate_m(whole) + 0.001)
 
 
-class WatchedSpill(ImageSpill):
-    """Remembers the stores beside it."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
-        self.others: list[ImageSpill] = []
-
-    def another(self) -> ImageSpill:
-        self.others.append(super().another())
-        return self.others[-1]
+@pytest.mark.parametrize("in_file", [True, False])
+def test_who_makes_them_and_where_pictures_lie_does_not_matter(in_file: bool, tmp_path: Path) -> None:
+    with open_executor(2, None) as executor, MappedImageStore(tmp_path) as images:
+        made = surveyed(SEGMENTS, executor, images=images if in_file else None)
+        assert encode_archive(made.map) == encode_archive(alone().map)
+        assert all((keyframe.images is images) == in_file for keyframe in made.odometry.keyframes)
 
 
-@pytest.mark.parametrize("scheduler", [None, "local"])
-def test_who_makes_them_and_where_pictures_lie_does_not_matter(scheduler: str | None, tmp_path: Path) -> None:
-    """In threads segments set their pictures aside, each in a store of its own; processes send them, by way of memory."""
-    with open_executor(2, scheduler) as executor, WatchedSpill(tmp_path) as images:
-        made = surveyed(SEGMENTS, executor, images=images)
-    assert encode_archive(made.map) == encode_archive(alone().map)
-    assert len(images.others) == 3
-    assert all(other._file._file.closed for other in images.others)
-    assert [bool(other._places) for other in images.others] == [scheduler is None] * 3
+class Elsewhere:
+    """An executor whose batches and results travel as to another machine."""
+
+    def map(self, function: Any, shared: Any, batches: Any) -> Iterator[Any]:
+        for batch in batches:
+            yield pickle.loads(pickle.dumps(function(shared, pickle.loads(pickle.dumps(batch)))))
+
+
+def test_processes_elsewhere_send_their_pictures(tmp_path: Path) -> None:
+    with MappedImageStore(tmp_path) as images:
+        made = surveyed(SEGMENTS, Elsewhere(), images=images)
+        assert encode_archive(made.map) == encode_archive(alone().map)
+        assert all(keyframe.images is images for keyframe in made.odometry.keyframes)
 
 
 def test_a_segment_that_cannot_start_is_surveyed_with_the_one_before() -> None:

@@ -2,9 +2,8 @@
 
 from collections import deque
 from collections.abc import Container, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import count, islice
 from typing import Protocol
 
 import cv2
@@ -30,7 +29,7 @@ class Pictures:
 
 
 class ImageStore(Protocol):
-    """Storage for the pictures of keyframes, and for what is found in them: those of a long survey do not fit in memory."""
+    """Storage for the pictures of keyframes, and for what is found in them: those of a long survey do not fit in memory. For any thread."""
 
     def put(self, pictures: Pictures) -> int:
         """The number under which `get` gives them back."""
@@ -44,19 +43,18 @@ class ImageStore(Protocol):
     def release(self) -> None:
         """A stage is over: what `keep` returned may leave memory until it is read again."""
 
-    def another(self) -> AbstractContextManager["ImageStore"]:
-        """A store of the same kind, for what a part of the survey needs until it is done; in another process it keeps all in memory."""
-
 
 class MemoryImageStore:
     """Keeps all pictures as they are."""
 
     def __init__(self) -> None:
-        self._pictures: list[Pictures] = []
+        self._numbers = count()
+        self._pictures: dict[int, Pictures] = {}
 
     def put(self, pictures: Pictures) -> int:
-        self._pictures.append(pictures)
-        return len(self._pictures) - 1
+        number = next(self._numbers)
+        self._pictures[number] = pictures
+        return number
 
     def get(self, number: int) -> Pictures:
         return self._pictures[number]
@@ -66,9 +64,6 @@ class MemoryImageStore:
 
     def release(self) -> None:
         """See ImageStore."""
-
-    def another(self) -> AbstractContextManager[ImageStore]:
-        return nullcontext(MemoryImageStore())
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """One segment of a survey: its frames, what is made of them in any process, and whether its odometry had settled in time."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,12 +8,12 @@ import numpy as np
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
 from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
 from mapserver.survey.bundle.odometry_factors import edge_covariance
 from mapserver.survey.chain import AdjustedChain, begun_chain
-from mapserver.survey.keyframes.keyframes import ImageStore, Keyframe, without_pictures
+from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
@@ -51,19 +51,6 @@ class SegmentTask:
 
 
 @dataclass(frozen=True, slots=True)
-class KeyframePictures:
-    """The frames of keyframes, one after the other from their image store; to another process they travel as they are."""
-
-    keyframes: Sequence[Keyframe] = ()
-
-    def __iter__(self) -> Iterator[RectifiedFrame]:
-        return (keyframe.frame for keyframe in self.keyframes)
-
-    def __reduce__(self) -> tuple[type[list[RectifiedFrame]], tuple[list[RectifiedFrame]]]:
-        return list, (list(self),)
-
-
-@dataclass(frozen=True, slots=True)
 class Rig:
     """What all segments of a survey share."""
 
@@ -76,8 +63,8 @@ class Rig:
 class SegmentSurvey:
     """What became of a segment: odometry of its frames and state of its keyframes, those at both its ends included.
 
-    Keyframes have their frame's number in the survey, and their pictures in `pictures`, in their order; nothing where the survey's image
-    store has them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
+    Keyframes have their frame's number in the survey, and their pictures in the store that the task named, or one of the process that made
+    them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
     odometry. unsettled, lost: why its beginning, or its end, cannot be joined to a neighbour.
     """
 
@@ -85,7 +72,6 @@ class SegmentSurvey:
     odometry: OdometryPass
     state: SurveyState
     matched: set[tuple[int, int]]
-    pictures: Iterable[RectifiedFrame]
     led: Array
     led_covariance: Array
     unsettled: str | None
@@ -135,10 +121,7 @@ def survey_segment(rig: Rig, task: SegmentTask) -> SegmentSurvey | str:
         chain = survey_alone(rig, task, SurveyTools(images=task.images))
     except SurveyError as error:
         return str(error)
-    made = segment_survey(chain, task.segment)
-    keyframes = made.odometry.keyframes
-    bare = replace(made.odometry, keyframes=[without_pictures(k) for k in keyframes])
-    return replace(made, odometry=bare, pictures=KeyframePictures(keyframes))
+    return segment_survey(chain, task.segment)
 
 
 def survey_alone(rig: Rig, task: SegmentTask, tools: SurveyTools) -> AdjustedChain:
@@ -178,7 +161,6 @@ def segment_survey(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
         kept,
         replace(state, motion=replace(state.motion, imu=ImuSamples.empty())),
         matched,
-        (),
         se3_inverse(odom_from_body[settled]) @ odom_from_body[first],
         edge_covariance(odometry, settled, first),
         _doubt(chain, slice(settled, first + 1)),

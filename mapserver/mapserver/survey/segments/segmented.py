@@ -1,14 +1,12 @@
 """The beginning of a survey in segments: made in parallel, judged at their joints; what cannot be joined is made in one piece."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from itertools import pairwise
 
 from fleetmap.errors import SurveyError
-from fleetmap.features import patch_align
 from mapserver.survey.chain import AdjustedChain, begun_chain
-from mapserver.survey.keyframes.keyframes import ImageStore, MemoryImageStore, Pictures, set_aside
+from mapserver.survey.keyframes.keyframes import ImageStore, MemoryImageStore, set_aside
 from mapserver.survey.odometry_pass import Cut
 from mapserver.survey.segments.join import joined_chain, refusal
 from mapserver.survey.segments.segment import (
@@ -55,23 +53,19 @@ def _in_parallel(segments: Sequence[Segment], rig: Rig, inputs: SurveyInputs, to
     """What became of each; what processes return of pictures goes into the survey's own store as it comes."""
     images = tools.images
     assert images is not None
-    with ExitStack() as every:
-        own = {segment: every.enter_context(ExitStack()) for segment in segments}  # open until its survey is stored
-        tasks = (task_of(segment, inputs, own[segment].enter_context(images.another())) for segment in segments)
-        for segment, survey in zip(segments, tools.executor.map(survey_segment, rig, tasks), strict=True):
-            kept = survey if isinstance(survey, str) else _stored(survey, images)
-            own[segment].close()
-            tools.at("odometry", segment.last + 1, inputs.frame_count)
-            tools.release()
-            yield segment, kept
+    tasks = (task_of(segment, inputs, images) for segment in segments)
+    for segment, survey in zip(segments, tools.executor.map(survey_segment, rig, tasks), strict=True):
+        tools.at("odometry", segment.last + 1, inputs.frame_count)
+        tools.release()
+        yield segment, survey if isinstance(survey, str) else _stored(survey, images)
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
-    keyframes = []
-    for keyframe, frame in zip(survey.odometry.keyframes, survey.pictures, strict=True):
-        number = images.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
-        keyframes.append(set_aside(replace(keyframe, images=images, image_number=number), images))
-    return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes), pictures=())
+    keyframes = [
+        k if k.images is images else set_aside(replace(k, images=images, image_number=images.put(k.pictures)), images)
+        for k in survey.odometry.keyframes
+    ]
+    return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
 
 
 def _refusals(made: Sequence[_Made]) -> dict[int, str]:

@@ -1,6 +1,7 @@
 """Pictures that were set aside come back as they were, however many there are."""
 
 import errno
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 from fleetmap.errors import StoreError
 from fleetmap.features.patch_align import half_pyramid
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.build import image_spill
-from mapserver.build.image_spill import ImageSpill
+from mapserver.build import mapped_images
+from mapserver.build.mapped_images import MappedImageStore
 from mapserver.survey.keyframes.keyframes import Pictures
 
 
@@ -24,7 +25,7 @@ def pictures(number: int) -> Pictures:
 
 def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
     """More of them than are held in memory, asked for in another order."""
-    with ImageSpill(tmp_path) as shelf:
+    with MappedImageStore(tmp_path) as shelf:
         numbers = [shelf.put(pictures(n)) for n in range(120)]
         for n in [*range(119, -1, -7), 0, 1, 119]:
             back, wanted = shelf.get(numbers[n]), pictures(n)
@@ -42,10 +43,10 @@ def test_pictures_come_back_to_the_bit(tmp_path: Path) -> None:
 
 def test_features_stay_what_they_are_out_of_memory_and_after_the_store(tmp_path: Path) -> None:
     """Arrays of several segments, one larger than a segment, an empty one."""
-    rng, segment = np.random.default_rng(1), image_spill._SEGMENT_BYTES
+    rng, segment = np.random.default_rng(1), mapped_images._SEGMENT_BYTES
     given = [rng.integers(0, 256, (n, 32), np.uint8) for n in (7, segment // 32 - 100, 200, 0, segment // 16, 3)]
     given += [rng.uniform(-1, 1, (5, 3)), rng.uniform(-1, 1, (6, 2)).astype(np.float32)]
-    with ImageSpill(tmp_path) as shelf:
+    with MappedImageStore(tmp_path) as shelf:
         kept = shelf.keep(given)
         shelf.release()
         assert list(tmp_path.iterdir()) == []
@@ -57,15 +58,37 @@ def test_features_stay_what_they_are_out_of_memory_and_after_the_store(tmp_path:
         assert own.flags.aligned
 
 
+def test_threads_get_their_own_pictures_back(tmp_path: Path) -> None:
+    with MappedImageStore(tmp_path) as shelf, ThreadPoolExecutor(4) as pool:
+        numbers = list(pool.map(lambda n: shelf.put(pictures(n)), range(200)))
+        assert sorted(numbers) == list(range(200))
+        for n, number in enumerate(numbers):
+            np.testing.assert_array_equal(shelf.get(number).frame.left, pictures(n).frame.left)
+
+
+def test_what_was_read_leaves_memory(tmp_path: Path) -> None:
+    """As the kernel counts it: of 256 MB that were put and read, less than half is held."""
+    rng = np.random.default_rng(0)
+    with MappedImageStore(tmp_path) as shelf:
+        for number in range(256):
+            left = rng.integers(0, 256, (1024, 768), np.uint8)
+            shelf.put(Pictures(RectifiedFrame(number, left, None, None), half_pyramid(left)))
+        for number in range(256):
+            shelf.get(number).frame.left.sum()
+        lines = Path("/proc/self/smaps").read_text().split("VmFlags")
+        held_kb = sum(int(part.split("Rss:")[1].split()[0]) for part in lines if str(tmp_path) in part)
+    assert 0 < held_kb < 128 * 1024
+
+
 def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(image_spill.os, "posix_fallocate", full)
-    with ImageSpill(tmp_path) as shelf, pytest.raises(StoreError, match="make space"):
+    monkeypatch.setattr(mapped_images.os, "posix_fallocate", full)
+    with MappedImageStore(tmp_path) as shelf, pytest.raises(StoreError, match="make space"):
         shelf.keep([np.zeros((3, 2))])
 
 
 def test_a_folder_that_takes_no_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere"):
-        ImageSpill(tmp_path / "nowhere")
+        MappedImageStore(tmp_path / "nowhere")

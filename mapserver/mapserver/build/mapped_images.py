@@ -1,0 +1,139 @@
+"""Pictures of keyframes, and what is found in them, in a temporary file that is read where it lies: long surveys do not fit in memory."""
+
+import mmap
+import os
+import tempfile
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from fleetmap.errors import StoreError, disk_errors
+from fleetmap.geometry import AnyArray
+from fleetmap.numerics.free_memory import give_back_free_memory
+from fleetmap.sensors.samples import CameraFrame
+from mapserver.survey.keyframes.keyframes import MemoryImageStore, Pictures
+
+if TYPE_CHECKING:
+    from fleetmap.recordings import FrameSource
+
+_HELD = 64  # keyframes whose pictures stay in memory: more than one is compared with
+_SEGMENT_BYTES, _SEGMENTS_HELD = 1 << 24, 4  # of the file; those that were written leave memory
+_KEPT_BYTES = 1_000_000_000  # all that an examination decodes of a pair of 1280 x 720
+_ALIGNED_BYTES = 64
+
+
+class MappedImageStore:
+    """An ImageStore over an unnamed file in `folder`, which the system removes with the process. Methods may be called from any thread."""
+
+    def __init__(self, folder: Path) -> None:
+        with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with its owner
+        self._lock = threading.Lock()
+        self._segments: list[mmap.mmap] = []
+        self._size, self._used = 0, 0  # of the file, and of its last segment
+        self._pictures: list[Pictures] = []
+        self._read: set[int] = set()  # pictures since the last release
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def put(self, pictures: Pictures) -> int:
+        """See ImageStore."""
+        frame = pictures.frame
+        with disk_errors("a picture of the survey cannot be set aside", "make space beside the store"), self._lock:
+            left, *halves = (self._mapped(level) for level in pictures.pyramid)
+            right, disparity = (None if a is None else self._mapped(a) for a in (frame.right, frame.disparity_px))
+            kept = replace(frame, left=left, right=right, disparity_px=disparity)
+            self._pictures.append(Pictures(kept, (left, *halves)))
+            number = len(self._pictures) - 1
+        self.note(number)
+        return number
+
+    def get(self, number: int) -> Pictures:
+        """See ImageStore."""
+        self.note(number)
+        return self._pictures[number]
+
+    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
+        """See ImageStore."""
+        with disk_errors("what a keyframe shows cannot be set aside", "make space beside the store"), self._lock:
+            return [self._mapped(array) for array in arrays]
+
+    def release(self) -> None:
+        """See ImageStore."""
+        self._leave_memory()
+        give_back_free_memory()
+
+    def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
+        """As what an empty one is in another process, which need not have the folder."""
+        return MemoryImageStore, ()
+
+    def note(self, number: int) -> None:
+        """Something is read; after some of it all leaves memory."""
+        self._read.add(number)
+        if len(self._read) > _HELD:
+            self._leave_memory()
+
+    def _leave_memory(self) -> None:
+        """Takes the file out of this process's memory; what is read again comes back from the system's own, or from the disk."""
+        self._read = set()
+        for segment in self._segments:
+            segment.madvise(mmap.MADV_DONTNEED)
+
+    def _mapped(self, array: AnyArray) -> AnyArray:
+        """The same array in the file, writable, so that numba compiles no second version for it; OSError where the disk has no room."""
+        data = np.ascontiguousarray(array)
+        if not data.size:
+            return data
+        if not self._segments or self._used + data.nbytes > len(self._segments[-1]):
+            length = -(-max(data.nbytes, _SEGMENT_BYTES) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+            # Room is taken before it is written to: a full disk would end the process then.
+            os.posix_fallocate(self._file.fileno(), self._size, length)
+            self._segments.append(mmap.mmap(self._file.fileno(), length, offset=self._size))
+            self._size, self._used = self._size + length, 0
+            if len(self._segments) % _SEGMENTS_HELD == 0:
+                self._leave_memory()
+        kept = np.frombuffer(self._segments[-1], data.dtype, data.size, self._used).reshape(data.shape)
+        kept[...] = data
+        self._used += -(-data.nbytes // _ALIGNED_BYTES) * _ALIGNED_BYTES
+        return kept
+
+
+class KeptFrames:
+    """Frames of another source. Those that are decoded while `keeps` holds are decoded once: a temporary file in `folder` has them."""
+
+    def __init__(self, source: "FrameSource", folder: Path) -> None:
+        self._source, self._store = source, MappedImageStore(folder)
+        self.stored, self.part, self.hash_into = source.stored, source.part, source.hash_into
+        self._frames: dict[int, CameraFrame] = {}
+        self._bytes = 0
+        self.keeps = True
+
+    def frame(self, index: int) -> CameraFrame:
+        """See FrameSource."""
+        if index in self._frames:
+            self._store.note(index)
+            return self._frames[index]
+        frame = self._source.frame(index)
+        images = (frame.left, frame.right, frame.depth_m)
+        if self.keeps:
+            try:
+                kept: list[Any] = [None if image is None else self._store.keep([image])[0] for image in images]
+                self._frames[index] = CameraFrame(frame.stamp_ns, *kept)
+                self._bytes += sum(image.nbytes for image in images if image is not None)
+                self.keeps = self._bytes < _KEPT_BYTES
+            except StoreError:  # no room: what is not kept is decoded again
+                self.keeps = False
+        return frame
+
+    def close(self) -> None:
+        """See FrameSource."""
+        self._source.close()
+        self._store.__exit__()
