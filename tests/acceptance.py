@@ -22,7 +22,7 @@ from typing import Any
 from support.recordings.realdata import DATA
 
 TESTS = Path(__file__).resolve().parent
-SOURCES = os.pathsep.join(str(TESTS.parent / folder) for folder in ("shared", "mapserver", "locclient", "tests"))
+SOURCES = os.pathsep.join(str(TESTS.parent / folder) for folder in ("shared", "", "tests"))
 COMPARISONS = {"at_most": operator.le, "at_least": operator.ge, "equals": operator.eq}
 
 

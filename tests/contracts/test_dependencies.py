@@ -11,7 +11,7 @@ import pytest
 from support.fleet.contracts_documents import REPOSITORY, code_words, rows, text
 
 OWN = {"fleetmap", "fleetsim", "mapserver", "locclient"}
-SHARED = ("shared/fleetmap", "shared/fleetsim", "locclient/locclient")
+SHARED = ("shared/fleetmap", "shared/fleetsim", "locclient")
 # Modules whose distribution has another name.
 DISTRIBUTIONS = {
     "argon2": "argon2-cffi",
@@ -62,12 +62,12 @@ def test_a_robot_imports_what_the_extra_client_brings(folder: str) -> None:
 
 
 def test_the_server_imports_what_the_extra_server_brings() -> None:
-    assert imported(REPOSITORY / "mapserver/mapserver") - on_demand() <= declared(None) | declared("server")
+    assert imported(REPOSITORY / "mapserver") - on_demand() <= declared(None) | declared("server")
 
 
 def test_nothing_is_declared_that_nothing_imports() -> None:
     shared = {name for folder in SHARED for name in imported(REPOSITORY / folder)}
-    server = imported(REPOSITORY / "mapserver/mapserver")
+    server = imported(REPOSITORY / "mapserver")
     assert declared(None) - shared <= BEHIND
     assert declared("server") <= server
     assert not declared("server") & shared, "the robot would need it too"

@@ -13,7 +13,7 @@ import pytest
 from fleetmap import messages
 from fleetmap.messages import Cause, Flag
 from locclient.replay.run_metrics import METRICS
-from mapserver.build.report import BuildReport
+from mapserver.drafting.report import BuildReport
 from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.night import NightReport
 from mapserver.quality import figures

@@ -14,7 +14,7 @@ VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
 # Functions act on poses and messages of that name; only one that is nothing but the word returns a matrix.
 VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
 ALLOWED = {
-    "mapserver/mapserver/fleet/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
+    "mapserver/fleet/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
     "shared/fleetmap/recordings/bags/codecs.py": {"pose"},  # the codec of PoseStamped, beside those of image and imu
     "shared/fleetmap/recordings/bags/foxglove.py": {"pose"},
 }

@@ -9,7 +9,7 @@ import pytest
 from fleetmap.cli_exit import PRINTED, runnable
 from support.fleet.contracts_documents import REPOSITORY, click_command
 
-PACKAGES = ("mapserver/mapserver", "locclient/locclient", "shared/fleetmap")
+PACKAGES = ("mapserver", "locclient", "shared/fleetmap")
 GIVEN = ["mapserver", "any", "--store", "maps", "--site", "hall"]  # what somebody typed who reads the message
 # Named as what they are, not as a step to take
 NAMED = {"mapserver build", "mapserver calibrate", "mapserver doctor", "mapserver nightly"}

@@ -18,8 +18,8 @@ DOCUMENT = "docs/settings.md"
 # The simulator has no configuration file: its sections are values in its code.
 PACKAGES = {
     "shared/fleetmap": "fleetmap",
-    "mapserver/mapserver": "mapserver",
-    "locclient/locclient": "locclient",
+    "mapserver": "mapserver",
+    "locclient": "locclient",
 }
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
     "mapserver": (MapserverConfig(), MAPSERVER_TIERS),

@@ -13,8 +13,8 @@ from support.fleet.contracts_documents import REPOSITORY
 PACKAGES = {
     "fleetmap": REPOSITORY / "shared" / "fleetmap",
     "fleetsim": REPOSITORY / "shared" / "fleetsim",
-    "mapserver": REPOSITORY / "mapserver" / "mapserver",
-    "locclient": REPOSITORY / "locclient" / "locclient",
+    "mapserver": REPOSITORY / "mapserver",
+    "locclient": REPOSITORY / "locclient",
 }
 
 

@@ -21,7 +21,7 @@ from fleetmap.sensors.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from mapserver.survey.merge.join_test import JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import JoinVerdict, NotJoined
 from mapserver.survey.merge.pipeline import extend
 from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings

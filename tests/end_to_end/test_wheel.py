@@ -46,7 +46,7 @@ def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run([REPOSITORY / "deploy/install.sh", wheel, "client", folder], folder.parent, **settings)
     programs = folder / "bin"
     (installed,) = folder.glob("lib/python*/site-packages")
-    for source in (REPOSITORY / "shared/fleetmap", REPOSITORY / "locclient/locclient"):
+    for source in (REPOSITORY / "shared/fleetmap", REPOSITORY / "locclient"):
         take_kernels(source, installed / source.name)
     return programs
 

@@ -24,7 +24,8 @@ def records() -> list[type[msgspec.Struct]]:
     """Every record of the three packages, without settings, which nothing computes."""
     for path in SOURCES:
         if "(msgspec.Struct" in path.read_text("utf-8"):
-            importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts[1:]))
+            module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            importlib.import_module(module.removeprefix("shared."))
     found, waiting = [], [msgspec.Struct]
     while waiting:
         kinds = [kind for kind in waiting.pop().__subclasses__() if kind is not Section]

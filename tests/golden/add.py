@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 GOLDEN = Path(__file__).resolve().parent
-sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in ("shared", "mapserver", "locclient"))]
+sys.path[:0] = [str(GOLDEN.parent), *(str(GOLDEN.parents[1] / part) for part in ("shared", ""))]
 
 import msgspec  # noqa: E402
 import numpy as np  # noqa: E402

@@ -30,9 +30,9 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetsim.scene.layout import Layout
-from mapserver.build.mapped_images import MappedImageStore
-from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
+from mapserver.drafting.mapped_images import MappedImageStore
+from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey import pipeline
 from mapserver.survey.keyframes.keyframes import ImageStore, MemoryImageStore

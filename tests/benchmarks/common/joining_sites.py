@@ -22,7 +22,7 @@ from mapserver.config import survey_settings
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
-from mapserver.survey.merge.join_test import JoinTest, Visit
+from mapserver.survey.merge.membership import JoinTest, Visit
 from mapserver.survey.odometry_pass import FrameChain, continued_covariances
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.simulated_run import EstimatorSession

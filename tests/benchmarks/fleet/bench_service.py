@@ -42,7 +42,7 @@ _CHANGED_SHARE = 0.05  # of the tiles, and of the landmarks of each
 _LISTS = ("/v1/sites", f"/v1/sites/{SITE}/versions", "/v1/robots")
 _HTTP_PER_S = 20.0
 _REPOSITORY = Path(__file__).resolve().parents[3]
-_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient", "tests"))
+_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", "", "tests"))
 
 
 @dataclass

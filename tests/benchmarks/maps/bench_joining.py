@@ -42,8 +42,8 @@ from fleetmap.sensors.samples import Trajectory
 from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
-from mapserver.build.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
-from mapserver.survey.merge.join_test import JoinVerdict, NotJoined
+from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
+from mapserver.survey.merge.membership import JoinVerdict, NotJoined
 from mapserver.survey.merge.pipeline import extend
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(TESTS), *(str(TESTS.parent / part) for part in ("shared", "mapserver", "locclient"))]
+sys.path[:0] = [str(TESTS), *(str(TESTS.parent / part) for part in ("shared", ""))]
 
 from support.storage.fuzzed_formats import FORMATS, fuzz  # noqa: E402
 from support.storage.store_faults import MODES, TRACED, run  # noqa: E402

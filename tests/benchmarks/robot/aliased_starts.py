@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import PositionPrior, Trajectory
 from fleetsim.recorder import Order, Session, prepare
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings, TrackSettings
-from mapserver.build.draft_evidence import PROBES
+from mapserver.drafting.draft_evidence import PROBES
 from mapserver.quality.probes import Probe, starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap

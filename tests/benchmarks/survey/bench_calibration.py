@@ -24,13 +24,13 @@ from fleetmap.recordings import open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetsim.recorder import Order
-from mapserver.build.admission import rig_evidence
 from mapserver.calibration import CalibrationParameter, estimate_calibration, estimate_from
 from mapserver.calibration.parameters import COLUMNS, INDEX
 from mapserver.calibration.recordings import LONGEST_S
 from mapserver.config import survey_settings
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import TOLERANCES, MeasuredCalibration, corrected, findings_of
+from mapserver.drafting.admission import rig_evidence
 from support.recordings.calibration_faults import standard_faults
 from support.worlds.calibration_scene import Stretch, make_stretch, measured, true_corrections, with_errors
 
@@ -163,7 +163,7 @@ def good(first_seed: int, count: int) -> dict[str, Any]:
 def decision(
     stretch: Stretch, given: RigCalibration, sensors: dict[str, bool]
 ) -> tuple[list[str], str, RigCalibration]:
-    """What warns or fails, what a build does, and the calibration that it takes: as `mapserver.build.admission` decides."""
+    """What warns or fails, what a build does, and the calibration that it takes: as `mapserver.drafting.admission` decides."""
     first = judged(stretch, given, 0, sensors)
     loud = [f.name for f in first.findings if f.verdict in LOUD]
     if any(f.verdict is Verdict.FAIL for f in first.findings):

@@ -18,9 +18,9 @@ from typing import Any
 from rich.console import Console
 
 from fleetmap.live_survey import LiveSurveyState
-from mapserver.build.build import BuildOptions
-from mapserver.build.survey_recordings import RecordingOptions
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildOptions
+from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.live import LiveRequest, RecordedDrive, run_live
 
 

@@ -23,7 +23,7 @@ from mapserver.evaluation.trajectory_error import best_clock_shift
 from support.recordings.realdata import DATA
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", "mapserver", "locclient"))
+SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", ""))
 LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy")
 
 

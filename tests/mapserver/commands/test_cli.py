@@ -17,8 +17,8 @@ from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import cli
-from mapserver.build.build import BuildRequest, Draft
 from mapserver.config import MapserverConfig, read_config, survey_settings
+from mapserver.drafting.draft import BuildRequest, Draft
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
@@ -46,7 +46,7 @@ atexit.register(lambda: print([m for m in {HEAVY!r} if m in sys.modules]))
 sys.argv = ["{package}", "--help"]
 {package}.cli.main()
 """
-    paths = [str(REPOSITORY / part) for part in ("shared", "mapserver", "locclient")]
+    paths = [str(REPOSITORY / part) for part in ("shared", "")]
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}\n{code}"],
         capture_output=True,

@@ -21,7 +21,6 @@ from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver import releases
-from mapserver.build.job_lock import recorded_job
 from mapserver.dashboard import bar_chart, fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
@@ -33,10 +32,11 @@ from mapserver.dashboard.pages.robot_page import way
 from mapserver.dashboard.plan import make_plan
 from mapserver.dashboard.robot_history import SILENT, stretches
 from mapserver.dashboard.underlays import grid_picture
+from mapserver.drafting.job_lock import recorded_job
 from mapserver.fleet.fleet import Fleet, RobotStatus
-from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, rate
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings

@@ -9,7 +9,6 @@ import pytest
 
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
-from mapserver.build.admission import rig_evidence
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
 from mapserver.calibration.parameters import COLUMNS, RANGES
 from mapserver.doctor import Verdict
@@ -21,6 +20,7 @@ from mapserver.doctor.calibration import (
     in_words,
     measure_calibration,
 )
+from mapserver.drafting.admission import rig_evidence
 from mapserver.survey.executor import SERIAL
 from mapserver.survey.settings import SurveySettings
 from support.recordings.realdata import real_data

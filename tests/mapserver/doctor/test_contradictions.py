@@ -16,10 +16,10 @@ from fleetmap.geometry import Array
 from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
-from mapserver.build.sensor_subset import reduced
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
+from mapserver.drafting.sensor_subset import reduced
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 

@@ -15,7 +15,6 @@ from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, format_calibration, open_recording, read_calibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
-from mapserver.build.sensor_subset import reduced
 from mapserver.calibration import CalibrationParameter
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
@@ -26,6 +25,7 @@ from mapserver.doctor.inertial import gravity_magnitude, rolling_shutter
 from mapserver.doctor.run_checks import TURN_FRAMES, _camera_turns, _Frames
 from mapserver.doctor.sharpness import sharpness
 from mapserver.doctor.timing import camera_gaps, camera_imu_overlap, camera_rate, imu_gaps, imu_rate, stamp_order
+from mapserver.drafting.sensor_subset import reduced
 from mapserver.survey.executor import SERIAL
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import make_sample, write_euroc

@@ -16,9 +16,9 @@ from mapserver import releases
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
-from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft

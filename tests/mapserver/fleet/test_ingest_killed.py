@@ -17,7 +17,7 @@ from support.storage.map_samples import save_sample_draft
 
 ROBOTS, FAILURES = 4, 20
 _REPOSITORY = Path(__file__).resolve().parents[3]
-_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", "mapserver"))
+_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", ""))
 
 
 def serve(folder: Path, endpoint: str) -> tuple[subprocess.Popen[str], str]:

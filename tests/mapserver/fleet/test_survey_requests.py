@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 from fleetmap.errors import StateError, UsageError
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
-from mapserver.build.layers import covered_requests
 from mapserver.cli import app
+from mapserver.drafting.layers import covered_requests
 from mapserver.fleet import survey_requests as requests
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
-from mapserver.fleet_statistics.resurvey_test import ResurveySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.survey.merge.multi_session import Joined

@@ -17,10 +17,10 @@ from fleetmap.live_survey import LiveSurveyState
 from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
-from mapserver.build.build import BuildOptions
 from mapserver.cli import app
 from mapserver.commands import live as live_command
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildOptions
 from mapserver.live import LiveRequest, RecordedDrive, SensorDrive, drives, live_survey, run_live
 from mapserver.store import MapStore
 from support.recordings.live_drives import MappingHere, write_rgbd

@@ -17,9 +17,9 @@ from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sources.playback import RecordingSource
-from mapserver.build.build import BuildOptions
 from mapserver.cli import app
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildOptions
 from mapserver.library import build_map
 from mapserver.live import LiveRequest, LiveResult, SensorDrive, live_survey, run_live
 from mapserver.live.mapping_process import MappingProcess, thinned, thinning

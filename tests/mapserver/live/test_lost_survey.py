@@ -9,8 +9,8 @@ from rich.console import Console
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.live_survey import LiveSurveyState
 from fleetmap.sensors.samples import SensorSet
-from mapserver.build.build import BuildOptions
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildOptions
 from mapserver.live import LiveRequest, live_survey, run_live
 from support.recordings.kidnapped_ride import APART_FRAMES, kidnapped
 from support.recordings.live_drives import MappingHere, played

@@ -36,9 +36,9 @@ from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
 from mapserver import cli, releases
-from mapserver.build.build import BuildRequest, Draft
-from mapserver.build.survey_recordings import RecordingOptions, admit_recordings, survey_all
 from mapserver.config import survey_settings
+from mapserver.drafting.draft import BuildRequest, Draft
+from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import arrivals

@@ -20,7 +20,7 @@ from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
-from mapserver.build.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
+from mapserver.drafting.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge

@@ -14,7 +14,7 @@ from locclient.maps.tile_cache import TileCache
 from mapserver import releases
 from mapserver.fleet.canary_controller import find, review
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet_statistics.canary_test import (
+from mapserver.fleet_statistics.canary_decision import (
     CanarySettings,
     number_of,
 )

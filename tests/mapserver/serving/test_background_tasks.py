@@ -11,7 +11,7 @@ from mapserver import releases
 from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
-from mapserver.fleet_statistics.canary_test import CanarySettings
+from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore

@@ -15,9 +15,9 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, Stamps, Trajectory
-from mapserver.build.mapped_images import MappedImageStore
-from mapserver.build.worker import open_executor
 from mapserver.config import survey_settings
+from mapserver.drafting.mapped_images import MappedImageStore
+from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor

@@ -12,7 +12,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
-from mapserver.build.survey_recordings import RecordingOptions
+from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.live import RecordedDrive
 from mapserver.live.mapping_process import NO_SKETCH, MapSketch, sketch_of
 from mapserver.survey.live.live_map import LiveMap

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "mapserver", "locclient", "tests")]
+sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "", "tests")]
 
 import numpy as np  # noqa: E402
 

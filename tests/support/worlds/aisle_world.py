@@ -17,7 +17,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
-from mapserver.survey.merge.join_test import JoinTest, Visit
+from mapserver.survey.merge.membership import JoinTest, Visit
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SurveySettings
 
@@ -102,7 +102,7 @@ def frame(seen: Aisle, map_from_body: Array, rng: np.random.Generator) -> FrameF
     return FrameFeatures(features, pixels)
 
 
-def join_test(
+def membership(
     known: tuple[Relocalizer, NDArray[np.bool_]],
     seen: Aisle | Sequence[Aisle],
     map_from_body: Array,

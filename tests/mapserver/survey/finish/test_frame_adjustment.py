@@ -10,7 +10,7 @@ import pytest
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.build.worker import Threads
+from mapserver.drafting.worker import Threads
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.finish.frame_adjustment import PlacedFrames, place_frames
 from mapserver.survey.finish.trajectory import frame_trajectory

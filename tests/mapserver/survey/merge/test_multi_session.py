@@ -13,7 +13,7 @@ from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.changes import known_well
-from mapserver.survey.merge.join_test import JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import JoinVerdict, NotJoined
 from mapserver.survey.merge.merge import fewer_keyframes
 from mapserver.survey.merge.multi_session import Joining, Session, chained
 from mapserver.survey.settings import SurveySettings

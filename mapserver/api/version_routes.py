@@ -1,0 +1,96 @@
+"""Endpoints of releases: quality, differences, publishing, promoting, rolling back, canaries."""
+
+import shlex
+import time
+from typing import NamedTuple, cast
+
+from fastapi import FastAPI, Request
+from starlette.exceptions import HTTPException
+
+from mapserver import releases
+from mapserver.api.guard import GuardSettings, actor_of
+from mapserver.api.parameters import Site, Version
+from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView, version_view
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
+from mapserver.quality.gate import GateSettings
+from mapserver.releases import Difference
+from mapserver.store import CanaryRow, MapStore, VersionInfo
+
+
+class ApiSettings(NamedTuple):
+    """Who is let in, and how drafts, canaries and tiles are judged."""
+
+    guard: GuardSettings = GuardSettings()
+    gate: GateSettings = GateSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
+
+
+def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
+    """Adds the endpoints; the guard lets those change something who may."""
+
+    @app.get("/v1/sites/{site}/versions/{version}/quality")
+    def quality(site: Site, version: Version) -> QualityView:
+        """What the gate said about a version, and the report of its build."""
+        info = store.version(site, version)
+        report = store.manifest(site, version).report
+        return QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
+
+    @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
+    def diff(site: Site, before: Version, after: Version) -> Difference:
+        """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
+        return releases.difference(store, site, before, after)
+
+    @app.post("/v1/sites/{site}/versions/{version}/publish")
+    def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionView:
+        """Takes a draft through the gate and makes it current."""
+        actor = actor_of(request, act.actor, act.reason)
+        if act.trust_calibration:
+            releases.trust_calibration(store, store.version(site, version), actor)
+        releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
+        return version_view(store, store.version(site, version))
+
+    @app.post("/v1/sites/{site}/versions/{version}/promote")
+    def promote(request: Request, site: Site, version: Version, act: Act) -> VersionView:
+        """Makes a version that was published before the current one."""
+        releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
+        return version_view(store, store.version(site, version))
+
+    @app.post("/v1/sites/{site}/rollback")
+    def rollback(request: Request, site: Site, act: Act) -> VersionView:
+        """Makes the version current that was so before; the current one retires."""
+        releases.roll_back(store, site, actor=actor_of(request, act.actor, act.reason))
+        return version_view(store, cast(VersionInfo, store.current(site)))
+
+    @app.get("/v1/sites/{site}/canary")
+    def canary(site: Site) -> CanaryView:
+        """The version that some robots try, or tried last, beside the others' counts."""
+        store.current(site)
+        found = store.canaries(site)
+        if not found:
+            raise HTTPException(
+                404,
+                f"site {site} never had a canary; `mapserver promote VERSION "
+                f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` begins one",
+            )
+        return _view(store, found[0], settings.canary)
+
+    @app.post("/v1/sites/{site}/versions/{version}/canary")
+    def start_canary(request: Request, site: Site, version: Version, act: CanaryAct) -> CanaryView:
+        """Lets a share of the robots run a version before the others; a draft goes through the gate first.
+
+        `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
+        """
+        share = settings.canary.share if act.share is None else act.share
+        actor = actor_of(request, act.actor, act.reason)
+        releases.start_canary(store, site, version, share, actor=actor, gate=settings.gate)
+        return _view(store, store.canaries(site)[0], settings.canary)
+
+
+def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> CanaryView:
+    members = [
+        robot.robot for robot in store.robots(row.site) if number_of(row.site, row.version, robot.robot) < row.threshold
+    ]
+    return CanaryView(row, find(store, row, settings, time.time_ns()), members)

@@ -1,0 +1,254 @@
+"""Answers of the API, and the bodies of requests that change something."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+
+from mapserver.fleet.fleet import RobotStatus
+from mapserver.fleet.survey_requests import MOST_CORNERS
+from mapserver.fleet_statistics.canary_decision import CanaryFinding
+from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.quality.figures import TrustedCalibration
+from mapserver.serving.robot_placing import MOST_SIGMA_M
+from mapserver.store import (
+    CanaryRow,
+    Event,
+    FailureRow,
+    JobInfo,
+    MapStore,
+    PictureRow,
+    SiteInfo,
+    VerdictRow,
+    VersionInfo,
+)
+
+
+class VersionView(BaseModel):
+    """A version; map_bytes is what a robot downloads for the whole site, vocabulary apart.
+
+    trusted_calibrations: those that a person trusts, by name and reason, although no recording judged them.
+    """
+
+    model_config = ConfigDict(from_attributes=True)
+    site: str
+    version: int
+    state: str
+    parent: int | None
+    created: str
+    manifest_sha256: str
+    tiles: int
+    landmarks: int
+    map_bytes: int
+    vocabulary_sha256: str
+    vocabulary_bytes: int
+    trusted_calibrations: list[TrustedCalibration] = []
+
+
+def version_view(store: MapStore, info: VersionInfo) -> VersionView:
+    """A version as the API tells it."""
+    return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
+
+
+@dataclass(frozen=True, slots=True)
+class SiteList:
+    """Sites by name."""
+
+    sites: list[SiteInfo]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class VersionList:
+    """Versions of a site, oldest first."""
+
+    versions: list[VersionView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class RobotList:
+    """Robots that ever reported, by site and name."""
+
+    robots: list[RobotStatus]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class EventList:
+    """What happened to a site, oldest first: who did what, when (nanoseconds since 1970) and why."""
+
+    events: list[Event]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class JobList:
+    """Jobs, newest first."""
+
+    jobs: list[JobInfo]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class QualityView:
+    """What is known about a version's quality: what the gate said, oldest first, calibrations that a person trusts, the build's report."""
+
+    site: str
+    version: int
+    state: str
+    verdicts: list[VerdictRow]
+    trusted_calibrations: list[TrustedCalibration]
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class KpisView:
+    """The figures of one robot, version, tile, cause or site; key is empty for a site as a whole."""
+
+    site: str
+    key: str
+    measures: Kpis
+
+
+@dataclass(frozen=True, slots=True)
+class KpisList:
+    """Figures by site and key."""
+
+    by: str
+    measures: list[KpisView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class HourView:
+    """The figures of one hour; hour_ns: its begin, nanoseconds since 1970."""
+
+    hour_ns: int
+    measures: Kpis
+
+
+@dataclass(frozen=True, slots=True)
+class HourList:
+    """Figures by the hour, oldest first; hours without reports are left out."""
+
+    hours: list[HourView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FailureList:
+    """Failures, the last to arrive first."""
+
+    failures: list[FailureRow]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class FailureView:
+    """One failure. report: the robot's report without pictures; pictures: those that are still kept."""
+
+    failure: FailureRow
+    report: dict[str, Any]
+    pictures: list[PictureRow]
+
+
+@dataclass(frozen=True, slots=True)
+class CanaryView:
+    """The last version that some robots tried first, and what its counts say; robots: those that take part and are known."""
+
+    canary: CanaryRow
+    finding: CanaryFinding
+    robots: list[str]
+
+
+Metres = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def _body(**example: JsonValue) -> ConfigDict:
+    return ConfigDict(extra="forbid", json_schema_extra={"examples": [example]})
+
+
+class Act(BaseModel):
+    """Why something is changed, and by whom; the name is that of the session or token where there is one."""
+
+    model_config = _body(actor="ada", reason="robots lose themselves in aisle 3")
+    actor: Annotated[str | None, Field(min_length=1, max_length=200)] = None
+    reason: Annotated[str, Field(max_length=2000)] = ""
+
+
+class PublishAct(Act):
+    """Who publishes, and why; with `force` also what the gate refuses, except beyond hard limits.
+
+    With `trust_calibration` the person says that the calibration is right, although no recording judged it.
+    """
+
+    model_config = _body(actor="ada", reason="hall 2 was emptied", force=True)
+    force: bool = False
+    trust_calibration: bool = False
+
+    @model_validator(mode="after")
+    def _choice_has_a_reason(self) -> Self:
+        if (self.force or self.trust_calibration) and not self.reason:
+            raise ValueError(f"publishing {'by force' if self.force else 'with trust_calibration'} needs a reason")
+        return self
+
+
+class CanaryAct(Act):
+    """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
+
+    model_config = _body(actor="ada", reason="the nightly map", share=0.05)
+    share: Annotated[float | None, Field(gt=0, lt=1)] = None
+
+
+class PlaceAct(Act):
+    """Who says where a robot stands: metres in `map`, the heading from x towards y, and how far off the word may be (one sigma)."""
+
+    model_config = _body(actor="ada", x_map_m=12.5, y_map_m=3.0, heading_rad=1.57, sigma_m=0.5)
+    x_map_m: Metres
+    y_map_m: Metres
+    heading_rad: Annotated[float | None, Field(allow_inf_nan=False)] = None
+    sigma_m: Annotated[float, Field(gt=0, le=MOST_SIGMA_M)] = 0.5
+
+
+class SurveyAct(Act):
+    """Who asks for a survey of a polygon, and why; its corners in metres of `map`, the first not repeated at the end."""
+
+    model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
+    corners_map_m: Annotated[
+        list[tuple[Metres, Metres]],
+        Field(min_length=3, max_length=MOST_CORNERS),
+    ]
+
+
+_NOT_FOUND: dict[str, JsonValue] = {
+    **{"type": "about:blank", "title": "Not Found", "status": 404, "instance": "/v1/sites/hall/versions/9"},
+    "detail": "site hall has no version 9; `mapserver versions --site hall` lists them",
+}
+
+
+class Problem(BaseModel):
+    """An error, as RFC 9457 describes it."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [_NOT_FOUND]})
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str
+
+
+@dataclass(frozen=True, slots=True)
+class ServerVersion:
+    """What runs here, and the newest formats that it reads and writes."""
+
+    fleetmap: str
+    tile_format: int
+    manifest_format: int
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceState:
+    """`ok`, or what is missing."""
+
+    status: str

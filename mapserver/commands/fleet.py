@@ -1,0 +1,170 @@
+"""`mapserver fleet`: fleet health as a page, as files for other programs, and as a route for the next survey."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import ConfigFile, Group, settings_of
+from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
+
+if TYPE_CHECKING:
+    from mapserver.fleet.resurvey_list import ResurveyList
+
+
+class ExportFormat(StrEnum):
+    """What `fleet export` writes."""
+
+    JSONL = "jsonl"
+    MCAP = "mcap"
+
+
+def report(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(metavar="OUT.html", help="File to write; replaced if it exists.")],
+    site: SiteName,
+    store: StoreFolder,
+    hours: Annotated[int, typer.Option(min=1, max=9600, help="Hours to look back.")] = 24,
+    config: ConfigFile = None,
+) -> None:
+    """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
+    import time
+
+    from fleetmap.errors import disk_errors
+    from mapserver.dashboard.pages.shift_page import html_page
+    from mapserver.fleet.shift_summary import SummarySettings, summarise
+    from mapserver.store import MapStore
+
+    settings = settings_of(context)
+    judged_by = SummarySettings(settings.canary, settings.resurvey)
+    with MapStore.open(store, read_only=True) as maps:
+        page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
+    with disk_errors(f"{out} cannot be written", "choose another place"):
+        out.write_text(page, "utf-8")
+    typer.echo(str(out))
+
+
+def export(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write; replaced if it exists.")],
+    store: StoreFolder,
+    site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
+    hours: Annotated[int | None, typer.Option(min=1, help="Only the last N hours; default: everything.")] = None,
+    format_: Annotated[
+        ExportFormat | None, typer.Option("--format", help="jsonl or mcap; default: by the file's name.")
+    ] = None,
+) -> None:
+    """Write failures as JSON lines, or as MCAP with log, places and pictures, which Foxglove opens."""
+    import time
+
+    from fleetmap.errors import UsageError
+    from mapserver.fleet.exports import write_json_lines, write_mcap
+    from mapserver.store import FailureFilter, MapStore
+
+    chosen = format_ or next((known for known in ExportFormat if out.suffix == f".{known}"), None)
+    if chosen is None:
+        raise UsageError(f"{out}: name it .jsonl or .mcap, or name --format")
+    since_ns = None if hours is None else time.time_ns() - hours * 3_600_000_000_000
+    with MapStore.open(store, read_only=True) as maps:
+        if site is not None:
+            maps.current(site)  # raises for an unknown site
+        write = write_mcap if chosen is ExportFormat.MCAP else write_json_lines
+        count = write(maps, FailureFilter(site=site, since_ns=since_ns), out)
+    typer.echo(f"{count} failures")
+
+
+def resurvey(
+    context: typer.Context,
+    site: SiteName,
+    store: StoreFolder,
+    route: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the route: .csv, or GeoJSON for any other name.")
+    ] = None,
+    json: Json = False,
+    config: ConfigFile = None,
+) -> None:
+    """List the tiles that should be surveyed again and why, those that people asked for first; with --route a way through them."""
+    import time
+
+    from mapserver.fleet.resurvey_list import resurvey_list
+    from mapserver.store import MapStore
+
+    settings = settings_of(context).resurvey
+    with MapStore.open(store, read_only=True) as maps:
+        found = resurvey_list(maps, site, settings, time.time_ns())
+    if route is not None:
+        _write_route(found, route)
+    if json:
+        print_json(found)
+        return
+    for concern in found.tiles:
+        typer.echo(f"{concern.name}: {'; '.join(concern.reasons)}")
+    for request in found.requests:
+        typer.echo(
+            f"request {request.id} of {request.actor or 'somebody'}: {len(request.corners_map_m)} corners, {request.reason or '-'}"
+        )
+    typer.echo(f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints")
+
+
+def _write_route(found: "ResurveyList", path: Path) -> None:
+    import json as json_text
+
+    from fleetmap.errors import disk_errors
+    from mapserver.fleet_statistics.resurvey_decision import route_csv, route_geojson
+
+    if path.suffix == ".csv":
+        text = route_csv(found.route)
+    else:
+        text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
+    with disk_errors(f"{path} cannot be written", "choose another place"):
+        path.write_text(text, "utf-8")
+
+
+def replay(
+    failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
+    store: StoreFolder,
+    version: Annotated[
+        int | None, typer.Option(metavar="N", help="Version of the map to try; default: the robot's then.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
+    import sys
+    from importlib.util import find_spec
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    from fleetmap.errors import StateError
+    from fleetmap.log_lines import printable
+    from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
+    from mapserver.store import MapStore
+
+    if find_spec("locclient") is None:
+        raise StateError(
+            "the client of the robots is not installed here; install the distribution `fleetmap` as a whole"
+        )
+    with MapStore.open(store, read_only=True) as maps, TemporaryDirectory() as folder:
+        path = Path(folder) / f"failure-{failure}.mcap"
+        path.write_bytes(maps.fleet.replay(failure))
+        site = maps.fleet.failure(failure).failure.site
+        report = Path(folder) / "report.json"
+        options = ["--store", str(store), "--site", site, "--report", str(report)]
+        if version is not None:
+            options += ["--version", str(version)]
+        # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md), and the file is a robot's.
+        command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
+        done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
+        output = report.read_text("utf-8") if json and report.exists() else done.output
+    if done.has_network:
+        typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
+    for text, is_error in ((done.errors, True), (output, False)):
+        for line in text.splitlines():
+            typer.echo(line if json and not is_error else printable(line), err=is_error)
+    if done.status:
+        raise typer.Exit(done.status)
+
+
+FLEET = Group(
+    "Fleet health: a page, files, tiles to survey again, failures replayed.",
+    {"report": report, "export": export, "resurvey": resurvey, "replay": replay},
+)

@@ -1,0 +1,188 @@
+"""`mapserver live`: a survey is mapped while it drives, seen by everybody who looks, and stored as a draft at its end."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import ConfigFile, config_path, expand_options
+from fleetmap.errors import UsageError
+from mapserver.commands.options import SurveyOptions
+
+if TYPE_CHECKING:
+    from fleetmap.bus import Bus
+    from fleetmap.foxglove import ViewerAddress
+    from fleetmap.foxglove.server import FoxgloveServer
+    from fleetmap.live_survey import LiveSurveyState
+    from mapserver import BuildOptions
+    from mapserver.config import MapserverConfig
+    from mapserver.live import Drive
+    from mapserver.live.live_viewer import LiveViewer
+    from mapserver.survey.settings import SurveySettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveCommandOptions(SurveyOptions):
+    """Options of `live` beside those of `nightly`."""
+
+    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
+    speed: Annotated[float, typer.Option(help="Speed of the recording; 1 is its own, 0 as fast as it goes.")] = 1.0
+    sensors: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
+    ] = None
+    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Where --sensors are recorded to.")] = None
+    server: Annotated[
+        str | None,
+        typer.Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey."),
+    ] = None
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there; nobody signs in.")
+    ] = None
+    insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines see what --foxglove shows.")] = False
+
+
+@expand_options
+def live(
+    context: typer.Context,
+    options: LiveCommandOptions,
+    recording: Annotated[Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
+    config: ConfigFile = None,
+) -> None:
+    """Map a survey while it drives; Ctrl-C ends the drive, and what was seen becomes a draft."""
+    options.check()
+    sensors = (options.sensors or config_path(context)) if recording is None else options.sensors
+    if (recording is None) == (sensors is None) or (recording is None) != (options.record is not None):
+        raise UsageError(
+            "name a RECORDING to play, or --record FILE.mcap to keep what the [source] of --sensors FILE (or --config FILE) sends"
+        )
+    of_recordings = [name for name in ("use", "calibration", "topic") if getattr(options, name) is not None]
+    if recording is None and of_recordings:
+        raise UsageError(
+            f"--{of_recordings[0]} says how a RECORDING is read; the [source] and [topics] of {sensors} say it of sensors"
+        )
+    from fleetmap.console import plain_console
+    from fleetmap.foxglove import require_foxglove, viewer_address
+
+    at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
+    if at is not None:
+        require_foxglove("--foxglove")
+    from mapserver import BuildOptions
+    from mapserver.drafting.sensor_subset import named_sensor_set
+    from mapserver.live import LiveRequest, run_live
+
+    use = None if options.use is None else named_sensor_set(options.use)
+    asked = options.asked(context) | {"config": config_path(context), "use": use}
+    site, store, speed, server, record = (asked.pop(name) for name in ("site", "store", "speed", "server", "record"))
+    for name in ("foxglove", "insecure", "sensors"):
+        asked.pop(name)
+    build, is_stopped = BuildOptions(**asked), _stopping()
+    with (
+        _foxglove(at, site) as foxglove,
+        _played(recording, build, speed)
+        if recording is not None
+        else _driven(context.obj.read_config(sensors)[0], record, build) as (drive, settings),
+        _bus(server, store) as bus,
+    ):
+        request = LiveRequest(site, store, settings, build)
+        viewer = None if foxglove is None else _viewer(foxglove, drive)
+        tell = _teller(bus, viewer)
+        see = None if viewer is None else viewer.see
+        result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
+    typer.echo(result.figures.words())
+    typer.echo(result.built.sentence)
+
+
+@contextmanager
+def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[tuple[Drive, SurveySettings]]":
+    """A recording, and the settings that suit its sensors."""
+    from mapserver.config import survey_settings
+    from mapserver.live import RecordedDrive
+
+    with build.reading.open(recording) as (opened, indices):
+        settings = survey_settings(build.config, opened.sensor_set)
+        yield RecordedDrive(recording, opened, indices, build.frames, speed), settings
+
+
+@contextmanager
+def _driven(given: "MapserverConfig", record: Path, build: "BuildOptions") -> "Iterator[tuple[Drive, SurveySettings]]":
+    """The sensors that a configuration file names, and the settings that suit them; errors of `open_source`."""
+    from fleetmap.sensors.samples import SensorSet
+    from fleetmap.sources.source import open_source
+    from mapserver.config import survey_settings
+    from mapserver.live import SensorDrive
+
+    drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
+    kinds = {
+        (2, True): SensorSet.STEREO_INERTIAL,
+        (2, False): SensorSet.STEREO,
+        (1, True): SensorSet.MONO_INERTIAL,
+        (1, False): SensorSet.MONO,
+    }
+    kind = kinds[len(drive.calibration.cameras), drive.calibration.imu is not None]
+    yield drive, survey_settings(build.config, SensorSet.RGBD if drive.has_depth else kind)
+
+
+def _stopping() -> Callable[[], bool]:
+    """Whether Ctrl-C or SIGTERM has ended the drive; a second one ends the build too."""
+    import signal
+
+    stopped = False
+
+    def stop(*_: object) -> None:
+        nonlocal stopped
+        stopped = True
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return lambda: stopped
+
+
+def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
+    from fleetmap.bus import ZenohBus, check_endpoint, has_tls
+
+    if server is None:
+        return nullcontext(None)
+    if not has_tls(check_endpoint(server)):
+        return ZenohBus.connect(server)
+    from mapserver.store import MapStore
+    from mapserver.trust.enrolment import RobotRegister
+
+    with MapStore.open(store) as maps:
+        tls = RobotRegister(maps).survey_tls()
+    return ZenohBus.connect(server, tls=tls)
+
+
+def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[FoxgloveServer | None]":
+    if at is None:
+        return nullcontext(None)
+    from fleetmap.foxglove.server import FoxgloveServer
+
+    server = FoxgloveServer(at, site)
+    typer.echo(f"foxglove: {server.url}")
+    return server
+
+
+def _viewer(server: "FoxgloveServer", drive: "Drive") -> "LiveViewer":
+    from mapserver.live.live_viewer import LiveViewer
+
+    return LiveViewer(server, drive)
+
+
+def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":
+    from fleetmap.errors import LinkError
+    from fleetmap.live_survey import live_key
+    from fleetmap.messages import encode_message
+
+    def tell(state: "LiveSurveyState") -> None:
+        if bus is not None:
+            with suppress(LinkError):  # a survey goes on without those who look at it
+                bus.publish(live_key(state.site), encode_message(state), may_drop=True)
+        if viewer is not None:
+            viewer.tell(state)
+
+    return tell

@@ -1,0 +1,89 @@
+"""Configuration file of `mapserver`: what is common to all commands, a section for each command, and the settings of maps, gate and fleet.
+
+A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory, as on the command
+line.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fleetmap.cli_options import Commands, Options, command_defaults, file_type
+from fleetmap.config import Section, over, read_given, refuse_internal
+from fleetmap.sensors.samples import SensorSet
+from fleetmap.sensors.source_settings import SourceSection, Topics
+from mapserver.fleet.alerts import AlertSettings
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
+from mapserver.quality.gate import GateSettings
+from mapserver.survey.settings import SurveySettings
+
+_PRESETS = Path(__file__).parent / "presets"
+
+TIERS = {
+    "user": {
+        "": "site store",
+        "source": "kind sensors calibration endpoint recording device",
+        "topics": "*",
+        "alerts": "*",
+    },
+    "tuning": {
+        "source": "domain keys speed width_px height_px rate_hz delay_s",
+        "gate": "*",
+        "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes replay_bytes",
+        "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
+        "resurvey": "recent_days before_days min_failures rising_ratio fading",
+        "survey": "seed occupancy_grid surfel_map",
+        "survey.orb": "extractor count",
+        "survey.stereo": "min_depth_m depth_sigma_px",
+        "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",
+        "survey.segments": "*",
+        "survey.loops": "top min_gap_keyframes repeats_every_m",
+        "survey.noise": "disparity_sigma_px",
+        "survey.sessions": "fade_probability min_confirmations",
+        "survey.budget": "*",
+        "survey.odometry.filter": "use_wheels",
+    },
+}
+
+
+class MapserverConfig(Section, frozen=True):
+    """The file without the sections of commands. source: the sensors of a survey robot, for `live`; topics: of recordings too."""
+
+    site: str | None = None
+    store: str | None = None
+    source: SourceSection = SourceSection()
+    topics: Topics = Topics()
+    survey: SurveySettings = SurveySettings()
+    gate: GateSettings = GateSettings()
+    ingest: IngestSettings = IngestSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
+    alerts: AlertSettings = AlertSettings()
+
+
+def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig, Options]:
+    """Settings of the file at `path` and the options that it sets, the defaults without one.
+
+    UsageError as `load_toml`, and for keys that are internal constants.
+    """
+    if path is None:
+        return MapserverConfig(), {}
+    given = read_given(path, file_type(MapserverConfig, commands))
+    refuse_internal(path, given, MapserverConfig(), TIERS)
+    settings = {key: given[key] for key in MapserverConfig.__struct_fields__ if key in given}
+    return msgspec.convert(settings, MapserverConfig), command_defaults(given, commands)
+
+
+def survey_settings(path: Path | None, sensor_set: SensorSet) -> SurveySettings:
+    """Settings of a survey with these sensors: the preset of the sensor set, and over it the [survey] of the file at `path`."""
+    given: dict[str, Any] = {} if path is None else msgspec.toml.decode(path.read_bytes()).get("survey", {})
+    return msgspec.convert(over(preset(sensor_set), given), SurveySettings)
+
+
+def preset(sensor_set: SensorSet) -> dict[str, Any]:
+    """The settings of [survey] in which this sensor set differs from the defaults."""
+    content: dict[str, Any] = msgspec.toml.decode((_PRESETS / f"{sensor_set.value}.toml").read_bytes())
+    return content

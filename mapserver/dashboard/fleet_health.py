@@ -1,0 +1,205 @@
+"""Fleet health for the pages: rates with their intervals, failures, versions on trial."""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from scipy.special import bdtr
+
+from fleetmap.errors import RecordingError
+from fleetmap.failure_summary import FailureSummary, decode_summary
+from fleetmap.messages import CameraNote
+from mapserver.dashboard.fleet_parts import Trial, trial_of
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
+from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings, TileConcern
+from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore, TraceRow
+
+_log = logging.getLogger(__name__)
+DAY_H, WEEK_H = 24, 7 * 24
+DAYS_SHOWN = 14
+FAILURES_SHOWN = 50
+_CACHED_NS = 5_000_000_000
+_ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
+_SIGNIFICANCE = 0.05
+_PLACES = 5000
+
+
+@dataclass(frozen=True, slots=True)
+class SiteHealth:
+    """A site's figures. day: the last 24 h; week: the 7 days before; days: rates of 24 h each, oldest first, the last ends now.
+
+    robots: each one's figures of the last 24 h. trend: how day compares with week, in words. areas: the last 7 days beside the 7 before
+    them by named area, or by tile where has_areas says that none is named; week_since_ns: when those 7 days began.
+    """
+
+    day: Kpis
+    week: Kpis
+    trend: str
+    days: tuple[Rate, ...]
+    robots: Mapping[str, Kpis]
+    trials: tuple[Trial, ...]
+    resurvey: tuple[TileConcern, ...]
+    areas: tuple[AreaTrend, ...]
+    has_areas: bool
+    week_since_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class FilterChoices:
+    """Filters of the failures: keys with any counts."""
+
+    robots: list[str]
+    versions: list[str]
+    tiles: list[str]
+    areas: list[str]
+    causes: list[str]
+
+
+class HealthData:
+    """Reads fleet health from an open store. Thread-safe; errors are the store's."""
+
+    def __init__(
+        self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int]
+    ) -> None:
+        self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
+        self._lock = threading.Lock()
+        self._cached: dict[str, tuple[int, SiteHealth]] = {}
+
+    def site(self, site: str) -> SiteHealth:
+        """A site's figures, a few seconds old at most, computed once for all open pages."""
+        with self._lock:
+            cached = self._cached.get(site)
+            if cached is not None and self._clock_ns() - cached[0] < _CACHED_NS:
+                return cached[1]
+            found = self._site(site)
+            self._cached[site] = (self._clock_ns(), found)
+        return found
+
+    def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
+        """Failures, latest arrival first; one more than is shown if there are more."""
+        return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
+
+    def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
+        """Where a robot was and what it said of itself, thinned, oldest first."""
+        found = self._store.fleet.trace(site, robot, since_hour=hour_of(since_ns))
+        return [row for row in found if since_ns <= row.heard_ns < until_ns]
+
+    def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:
+        """A site's figures of whole hours: those that both ends lie in, too."""
+        first = 0 if since_ns is None else hour_of(since_ns)
+        end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
+        return kpis(_sum(self._store.fleet.hours(site, "site", since_hour=first, until_hour=end), first, end))
+
+    def places(self, site: str, since_ns: int | None = None, until_ns: int | None = None) -> list[tuple[float, float]]:
+        """Where failures of a time began; without one, of the days that are shown."""
+        if since_ns is None and until_ns is None:
+            since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
+        wanted = FailureFilter(site=site, since_ns=since_ns, until_ns=until_ns)
+        found = self._store.fleet.failures(wanted, limit=_PLACES)
+        return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
+
+    def failure(self, number: int) -> FailureDetail:
+        return self._store.fleet.failure(number)
+
+    def cameras(self, site: str) -> dict[str, CameraNote]:
+        """The robots' cameras as the newest failure report of each tells it; robots without one are left out."""
+        newest: dict[str, int] = {}
+        for row in self._store.fleet.failures(FailureFilter(site=site), limit=_PLACES):
+            newest.setdefault(row.robot, row.number)
+        told = {robot: self._store.fleet.failure(number).report.camera for robot, number in newest.items()}
+        return {robot: camera for robot, camera in told.items() if camera is not None}
+
+    def replay(self, number: int) -> FailureSummary | None:
+        """What the robot said in the seconds around a failure; None without a recording, and for one of another fleetmap."""
+        found = self._store.fleet.replay_summary(number)
+        if found is None:
+            return None
+        try:
+            return decode_summary(found)
+        except RecordingError as error:
+            _log.warning("failure %d is shown without its recording: %s", number, error)
+            return None
+
+    def choices(self, site: str) -> FilterChoices:
+        """Filters of the site's failures."""
+
+        def keys(axis: str) -> list[str]:
+            found = self._store.fleet.counters(site, axis)
+            return [key for (_, key), counts in found.items() if counts.failures or counts.suspected]
+
+        def numbers_first(key: str) -> tuple[int, str]:
+            return (int(key), "") if key.isdecimal() else (1 << 40, key)
+
+        return FilterChoices(
+            keys("robot"),
+            sorted(keys("version"), key=numbers_first),
+            keys("tile"),
+            self._store.areas(site).names,
+            keys("cause"),
+        )
+
+    def _site(self, site: str) -> SiteHealth:
+        now_ns = self._clock_ns()
+        next_hour = hour_of(now_ns) + 1
+        hours = self._store.fleet.hours(site, "site", since_hour=next_hour - DAY_H * DAYS_SHOWN)
+        days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
+        week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
+        robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
+        has_areas = bool(self._store.areas(site))
+        return SiteHealth(
+            kpis(days[-1]),
+            kpis(week),
+            trend_words(days[-1], week),
+            tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
+            {robot: kpis(counts) for (_, robot), counts in robots.items()},
+            self._trials(site, now_ns),
+            tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
+            tuple(self._area_trends(site, "area" if has_areas else "tile", next_hour)),
+            has_areas,
+            (next_hour - WEEK_H) * HOUR_NS,
+        )
+
+    def _area_trends(self, site: str, axis: str, next_hour: int) -> list[AreaTrend]:
+        def week(end: int) -> dict[str, Counters]:
+            found = self._store.fleet.counters(site, axis, since_hour=end - WEEK_H, until_hour=end)
+            return {key: counts for (_, key), counts in found.items()}
+
+        return area_trends(week(next_hour), week(next_hour - WEEK_H))
+
+    def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
+        rows = self._store.canaries(site)
+        recent = [row for row in rows if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS][:3]
+        return tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in recent)
+
+
+def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:
+    total, first = Counters(), hours.get(since, Counters())
+    for hour, counts in hours.items():
+        if since <= hour < until:
+            total.add(counts)
+    total.continued = first.continued
+    return total
+
+
+def trend_words(day: Counters, week: Counters) -> str:
+    """How a day's failures compare with the week's before, as far as the counts can tell.
+
+    Given all failures of both, those of the day are binomial with the day's share of the driving if nothing changed (the
+    conditional test of two Poisson rates, Przyborowski and Wilenski 1940; twice the smaller tail).
+    """
+    if day.robot_days <= 0 or week.robot_days <= 0:
+        return "nothing to compare with yet"
+    total = day.position_failures + week.position_failures
+    if total == 0:
+        return "none in the week before either"
+    share = day.robot_days / (day.robot_days + week.robot_days)
+    if 2 * (1 - float(bdtr(day.position_failures - 1, total, share)) if day.position_failures else 1.0) < _SIGNIFICANCE:
+        return "more than in the week before"
+    if 2 * float(bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
+        return "fewer than in the week before"
+    return "no clear change from the week before"

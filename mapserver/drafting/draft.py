@@ -1,0 +1,390 @@
+"""A build: surveys recordings, joins them to the site's map, stores the draft, writes report and pictures."""
+
+import resource
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import Console
+
+from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
+from fleetmap.config import to_dict
+from fleetmap.console import plain_console
+from fleetmap.encoding import to_json, to_plain
+from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.mapformat import CameraEntry, Tile
+from fleetmap.recordings import OpenOptions, Topics
+from fleetmap.recordings.tum import write_tum
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import SensorSet
+from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
+from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
+from mapserver.drafting.layers import covered_requests, grid_layer, layer_sessions, surfel_layer
+from mapserver.drafting.mapped_images import MappedImageStore
+from mapserver.drafting.progress import ProgressView, StageTimes
+from mapserver.drafting.report import (
+    Accuracy,
+    BuildCost,
+    BuildReport,
+    accuracy,
+    library_versions,
+    loop_places,
+    make_report,
+    report_details,
+    sentence,
+    write_file,
+)
+from mapserver.drafting.survey_recordings import (
+    Admission,
+    OpenRecordings,
+    RecordingOptions,
+    Surveyed,
+    admit_recordings,
+    joined_truth,
+    map_trajectories,
+    read_zones,
+    say_left_out,
+    survey_all,
+    survey_recording,
+)
+from mapserver.drafting.trajectory import OtherTrajectory
+from mapserver.drafting.worker import (
+    open_executor,
+    open_side_thread,
+    single_threaded_libraries,
+)
+from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
+from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
+from mapserver.store.archive import decode_archive, encode_archive
+from mapserver.surfels.surfel_map import Surfels, known_surfels
+from mapserver.survey.executor import Executor
+from mapserver.survey.finish.map_transform import transform_map
+from mapserver.survey.loops.loops import Loops
+from mapserver.survey.loops.zones import Zones
+from mapserver.survey.merge.multi_session import Joined, Joining, Session
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.tiles.landmark_budget import choose_landmarks
+from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.trust.signing import check_base
+
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """Choices of a build. Files that are not named are not written.
+
+    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory: another system's poses to begin
+    with. trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
+    looked for in the draft.
+    threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
+    section of the file `config` over it. job: its number, for the draft.
+    look_at: told which recordings are worked on.
+    """
+
+    frames: str = "::"
+    calibration: Path | None = None
+    topics: Topics = field(default_factory=Topics)
+    zones: Path | None = None
+    report: Path | None = None
+    trajectory_out: Path | None = None
+    picture: Path | None = None
+    frame_from_ground_truth: bool = False
+    use: SensorSet | None = None
+    trajectory: OtherTrajectory | None = None
+    replay: tuple[Path, ...] = ()
+    actor: Actor = NOBODY
+    threads: int | None = None
+    scheduler: str | None = None
+    job: int | None = None
+    config: Path | None = None
+    settings: SurveySettings | None = None
+    look_at: Callable[[Sequence[Path]], None] = lambda _: None
+
+    @property
+    def reading(self) -> RecordingOptions:
+        """How the recordings are read."""
+        return RecordingOptions(self.frames, OpenOptions(self.calibration, self.topics), self.use, self.trajectory)
+
+
+@dataclass(frozen=True, slots=True)
+class BuildRequest:
+    """Recordings that become a draft of a site in a store."""
+
+    recordings: tuple[Path, ...]
+    site: str
+    store: Path
+    options: BuildOptions = BuildOptions()
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One build under way, with what all of its steps need."""
+
+    request: BuildRequest
+    reading: OpenRecordings
+    settings: SurveySettings
+    zones: Zones
+    unusable: dict[Path, str] | None
+    console: Console
+    times: StageTimes
+    started_s: float
+    images: MappedImageStore
+
+    def tools(self, executor: Executor, view: ProgressView, told: JobProgress | None = None) -> SurveyTools:
+        """With progress that is shown and timed, and told to those who look at the job."""
+
+        def progress(stage: str, done: int, total: int) -> None:
+            self.times(stage, done, total)
+            view(stage, done, total)
+            if told is not None:
+                told(stage, done, total)
+
+        return SurveyTools(progress, self.images, executor)
+
+
+@dataclass(frozen=True)
+class Built:
+    """The surveys and their outcomes: the map in its final frame, its accuracy, and whether it is the site's first."""
+
+    surveyed: list[Surveyed]
+    joined: Joined
+    accuracy: Accuracy
+    is_first: bool
+
+    @property
+    def taken(self) -> list[Surveyed]:
+        """The recordings that found their place in the map."""
+        return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A stored draft: its version, a sentence about it, its report, and by content hash why recordings were left out."""
+
+    version: int
+    sentence: str
+    report: dict[str, Any]
+    left_out: dict[str, str]
+
+
+def build_draft(
+    request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, recorded: bool = False
+) -> tuple[Draft, Built]:
+    """Builds a draft; raises FleetmapErrors, before the survey where possible.
+
+    With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken. recorded: as
+    a job of the store.
+    """
+    options, started_s = request.options, time.perf_counter()
+    if (given := options.trajectory) is not None and len(request.recordings) > 1:
+        raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
+    zones = read_zones(options.zones)
+    times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
+    folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
+    with (
+        single_threaded_libraries(),
+        OpenRecordings(options.reading, folder) as reading,
+        MappedImageStore(folder) as images,
+    ):
+        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
+        admitted = _admitted(run)
+        with (
+            MapStore.open(request.store, create=True) as maps,
+            recorded_job(maps, request.site, "build") if recorded else nullcontext(Job(number=options.job)) as job,
+        ):
+            parent = _parent(request, maps)
+            told = JobProgress(maps, job.number)
+            built = _survey(run, admitted, None if parent is None else parent.survey, told)
+            draft = _keep(run, built, parent, maps)
+            draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
+            job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
+            return draft, built
+
+
+def _admitted(run: _Run) -> dict[Path, Admission]:
+    request, options = run.request, run.request.options
+    run.times.begin("examination")
+    with ProgressView(run.console) as view, open_executor(options.threads, None) as executor:
+        return admit_recordings(
+            request.recordings,
+            run.reading,
+            run.console,
+            needs_truth=options.frame_from_ground_truth,
+            unusable=run.unusable,
+            executor=executor,
+            progress=view,
+            look_at=options.look_at,
+        )
+
+
+def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
+    """The site's current version, to build on; None for a site without one."""
+    site = request.site
+    if site not in {info.site for info in maps.sites()} or (current := maps.current(site)) is None:
+        return None
+    if request.options.frame_from_ground_truth:
+        raise UsageError(
+            f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
+            "or name another --site"
+        )
+    check_base(maps, current)
+    archive = maps.archive(site, current.version)
+    if archive is None:
+        raise StoreError(
+            f"version {current.version} of site {site} has no archive to build on; survey the site anew under another name"
+        )
+    return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
+
+
+def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, told: JobProgress) -> Built:
+    """Surveys all recordings and joins them to the current map."""
+    options, settings = run.request.options, run.settings
+    with (
+        ProgressView(run.console) as view,
+        open_executor(options.threads, options.scheduler) as executor,
+    ):
+        survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
+        tools = run.tools(executor, view, told)
+
+        pinhole, joining = None if base is None else base.camera, Joining(base, settings)
+        with open_side_thread(options.threads) as beside:
+
+            def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+                options.look_at([path])
+                done = survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
+                beside(partial(joining.add, Session(done.survey, done.map_from_survey)))
+                return done
+
+            surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
+            options.look_at(list(admitted))
+            tools.progress("joining", 0, 1)
+        joined = joining.finish()
+    run.times.begin("storing")
+    say_left_out(run.console, run.request.site, surveyed, joined)
+    found = accuracy(joined.map, joined_truth(surveyed, joined))
+    if options.frame_from_ground_truth:
+        if found.rigid is None:
+            raise RecordingError(
+                f"{run.request.recordings[0]}: too few estimated frames have a ground truth; build without "
+                "--frame-from-ground-truth"
+            )
+        joined = replace(joined, map=transform_map(joined.map, found.rigid.frame_from_estimate))
+    return Built(surveyed, joined, found, is_first=base is None)
+
+
+def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
+    """Cuts the map into tiles, measures them, stores the draft and writes the files that were asked for."""
+    site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
+    wanted = None if parent is None else parent.wanted_ids(survey_map)
+    for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
+    tiles = tiles_from_survey(survey_map, chosen=for_robots)
+    run.times.begin("grid")
+    sessions = layer_sessions(built.taken, built.joined)
+    grid, grid_said = grid_layer(run.settings, sessions, {} if parent is None else parent.grid)
+    run.times.begin("surfels")
+    known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
+    surfels, surfels_said = surfel_layer(run.settings, sessions, known)
+    run.times.begin("examining")
+    evidence = _evidence(run, built, tiles, parent)
+    run.times.begin("storing")
+    archive = encode_archive(survey_map)
+    cost = BuildCost(
+        seconds=time.perf_counter() - run.started_s,
+        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
+    )
+    report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
+    asked = covered_requests(maps, site, built.joined)
+    report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked)
+    details = DraftDetails(
+        created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        tile_size_m=TILE_SIZE_M,
+        camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
+        recordings=tuple(s.entry for s in built.taken),
+        configuration=_configuration(run, parent),
+        libraries=library_versions(),
+        # A robot downloads the manifest: what it says about the build is short.
+        report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
+        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None))},
+    )
+    job = run.request.options.job
+    content = DraftContent(
+        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive, grid=grid, surfels=surfels,
+        evidence=evidence, job=job,
+    )  # fmt: skip
+    version = maps.save(site, content, actor=run.request.options.actor).version
+    report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
+    run.times.begin("writing")
+    words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)
+    draft = Draft(
+        version,
+        maps.areas(site).name_tiles(words, TILE_SIZE_M),
+        to_plain(report),
+        {s.entry.sha256: o.reason for s, o in zip(built.surveyed, built.joined.outcomes, strict=True) if not o.joined},
+    )
+    _write_files(run, built, draft)
+    return draft
+
+
+def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
+    options, camera = run.request.options, built.joined.map.camera
+    replayed = []
+    if before is not None:
+        reading = options.frames, options.reading.opening, options.use
+        replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
+    trajectories = map_trajectories(built.joined)
+    sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
+    drafted = DraftMap(tiles, default_vocabulary(), camera)
+    with open_executor(options.threads, None) as executor:
+        evidence = examine_draft(drafted, before, sessions, replayed, executor)
+    known = [] if before is None else before.calibrations
+    return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
+
+
+def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
+    """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
+    options = run.request.options
+    kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
+    given: dict[str, Any] = {} if options.trajectory is None else {"trajectory": options.trajectory.file.name}
+    if parent is not None and (trusted := parent.manifest.configuration.get(TRUSTED_KEY)):
+        given[TRUSTED_KEY] = trusted
+    topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
+    always = {
+        "frames": options.frames,
+        "frame_from_ground_truth": options.frame_from_ground_truth or kept,
+        "own_calibration": options.calibration is not None,
+        "use": None if options.use is None else options.use.value,
+        "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
+        "survey": to_dict(run.settings),
+    }
+    return given | topics | always
+
+
+def picture_png(site: str, draft: Draft, built: Built) -> bytes:
+    """The map from above as a PNG."""
+    from mapserver.drafting.plots import draw_survey
+
+    # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
+    loops = built.taken[0].survey.loops if built.is_first and len(built.taken) == 1 else Loops()
+    report = msgspec.convert(draft.report, BuildReport)
+    return draw_survey(f"{site}, version {draft.version}", built.joined.map, loops, built.accuracy, report)
+
+
+def _write_files(run: _Run, built: Built, draft: Draft) -> None:
+    options, site = run.request.options, run.request.site
+    if options.trajectory_out is not None:
+        write_tum(options.trajectory_out, built.joined.map.trajectory)
+    if options.picture is not None:
+        write_file(options.picture, picture_png(site, draft, built))
+    if options.report is not None:
+        full: dict[str, Any] = {"site": site, "version": draft.version}
+        full = draft.report | full | report_details(built.taken, built.joined, built.accuracy, run.times.seconds)
+        write_file(options.report, to_json(full, indent=2) + b"\n")

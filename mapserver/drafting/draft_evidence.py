@@ -1,0 +1,215 @@
+"""Evidence about a draft: frames read from recordings, relocalized in the tiles as robots get them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary
+from fleetmap.errors import RecordingError
+from fleetmap.features.settings import OrbSettings
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from fleetmap.sensors.samples import SensorSet, Trajectory
+from fleetmap.version_grid import Tiles as Grid
+from fleetmap.version_grid import known_grid
+from mapserver.drafting.sensor_subset import reduced
+from mapserver.quality.directions import tile_directions
+from mapserver.quality.evidence import Probes, examine, trajectory_breaks
+from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
+from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread, starts_without_prior
+from mapserver.store import MapStore
+from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.merge.initial_history import history_of
+from mapserver.survey.pipeline import Survey
+from mapserver.survey.survey_map import SurveyMap
+
+PROBES = 40  # of each kind: one wrong or missing frame weighs 2.5 %
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """A frame of a recording that the build did not use: its number among the selected ones, its camera and what that saw."""
+
+    number: int
+    camera: StereoCamera
+    body_from_cam: Array
+    features: FrameFeatures
+
+    def probe(self, map_from_body: Array) -> Probe:
+        """It as a probe; map_from_body (F, 4, 4) of all selected frames."""
+        return Probe(self.camera, self.features, map_from_body[self.number] @ self.body_from_cam)
+
+
+class JudgedSession(NamedTuple):
+    """A recording in the map: where its frames are in `map` now, frames that the build left out, and its survey."""
+
+    trajectory: Trajectory
+    held_out: Sequence[HeldOut]
+    survey: Survey
+
+
+def held_out_of(
+    recording: Recording,
+    selected: Sequence[int],
+    rectifier: Rectifier,
+    survey: Survey,
+    orb: OrbSettings,
+) -> list[HeldOut]:
+    """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
+    keyframes = [k.frame_index for k in survey.odometry.keyframes]
+    numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
+    return _read(recording, selected, numbers, rectifier, orb)
+
+
+def _read(
+    recording: Recording,
+    selected: Sequence[int],
+    numbers: Sequence[int],
+    rectifier: Rectifier,
+    orb: OrbSettings,
+) -> list[HeldOut]:
+    found = []
+    for number in numbers:
+        try:
+            frame = rectifier.rectify(recording.read_frame(int(selected[number])))
+        except RecordingError:
+            continue
+        features = probe_features(frame, rectifier.camera, orb)
+        found.append(HeldOut(number, rectifier.camera, rectifier.body_from_cam, features))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """The version that a draft is built on: its manifest, survey, tiles and grid, and the calibrations judged up to it."""
+
+    manifest: Manifest
+    survey: SurveyMap
+    tiles: list[Tile]
+    calibrations: list[RigEvidence]
+    grid: Grid = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, maps: MapStore, manifest: Manifest, survey: SurveyMap) -> "Before":
+        """The version of this manifest and archive, with its tiles from the store."""
+        evidence = maps.evidence(manifest.site, manifest.version)
+        known = () if evidence is None else evidence.calibrations or ()
+        judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
+        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
+        return cls(manifest, survey, tiles, judged, known_grid(manifest, maps.blob))
+
+    def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:
+        """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
+
+        The new ones compete with the published ones; what else the archive knows would only take the place of its like.
+        """
+        new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(self.survey).next_landmark_id]
+        return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in self.tiles)])).astype(np.uint32)
+
+    def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
+        """(F, 4, 4) map_from_body of a recording's frames when this version was made of it, and which (F,) may be offered.
+
+        Keyframes are left out; None where the version was made without it.
+        """
+        start = 0
+        for known in self.manifest.recordings:
+            if known.sha256 == entry.sha256 and known.frames == entry.frames:
+                part = slice(start, start + known.frames)
+                stamps_ns = self.survey.trajectory.stamps_ns[part]
+                free = self.survey.trajectory_estimated[part] & ~np.isin(stamps_ns, self.survey.keyframe_stamps_ns)
+                return self.survey.trajectory.frame_from_body[part], free
+            start += known.frames
+        return None
+
+
+def replayed_probes(
+    paths: Sequence[Path],
+    before: Before,
+    frames: str,
+    opening: OpenOptions,
+    use: SensorSet | None,
+    seen_by: tuple[StereoCamera, OrbSettings],
+) -> list[Probe]:
+    """Frames of earlier recordings where the version that was made of them says they are; none of recordings it knows not.
+
+    seen_by: the camera to which they are resampled, and the survey's features.
+    """
+    probes: list[Probe] = []
+    pinhole, orb = seen_by
+    for path in paths:
+        with open_recording(path, opening) as opened:
+            recording = reduced(opened, use)
+            recording, selected = recording.readable(FrameSelection.parse(frames).apply(recording))
+            entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
+            known = before.trajectory_of(entry)
+            if known is None:
+                continue
+            has_depth = recording.sensor_set is SensorSet.RGBD
+            rectifier = Rectifier(recording.calibration, has_depth=has_depth, pinhole=pinhole)
+            map_from_body, free = known
+            numbers = spread(np.flatnonzero(free), PROBES // len(paths))
+            probes += [x.probe(map_from_body) for x in _read(recording, selected.tolist(), numbers, rectifier, orb)]
+    return probes
+
+
+class DraftMap(NamedTuple):
+    """What robots would get of a draft; camera: that of the map."""
+
+    tiles: Sequence[Tile]
+    vocabulary: Vocabulary
+    camera: StereoCamera
+
+    def view(self) -> MapView:
+        """It as robots see it."""
+        return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
+
+
+def examine_draft(
+    drafted: DraftMap,
+    before: Before | None,
+    sessions: Sequence[JudgedSession],
+    replayed: Sequence[Probe],
+    executor: Executor = SERIAL,
+) -> Evidence:
+    """The findings of probes in the tiles as they are stored; `sessions` are the map's recordings."""
+    held_out = [
+        x.probe(session.trajectory.frame_from_body) for session in sessions for x in session.held_out[:: len(sessions)]
+    ]
+    last = [] if before is None else probes_of_map(before.survey, PROBES)
+    stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
+    drafted = drafted._replace(tiles=stored)
+    probes = Probes(held_out, replayed, last)
+    current = None if before is None else DraftMap(before.tiles, drafted.vocabulary, before.survey.camera).view()
+    draft = drafted.view()
+    tasks: list[Callable[[], Any]] = [
+        lambda: starts_without_prior(draft, probes.frames),
+        lambda: examine(draft, current, probes, _breaks(sessions)),
+    ]
+    starts, evidence = executor.map(lambda _, task: task(), None, tasks)
+    found: Evidence = msgspec.structs.replace(evidence, directions=tile_directions(stored), starts=starts)
+    return found
+
+
+def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
+    """All recordings together; a single camera's odometry knows no metres to compare with."""
+    found = []
+    for trajectory, _, survey in sessions:
+        if survey.state.camera.baseline_m > 0:
+            guess = survey.odometry
+            odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))
+            found.append(trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry))
+    known = [breaks for breaks in found if breaks is not None]
+    if not known:
+        return None
+    return TrajectoryBreaks(
+        sum(b.stretches for b in known), sum(b.breaks for b in known), max(b.worst_m for b in known)
+    )

@@ -1,0 +1,282 @@
+"""The report of a build. Pure; the keys of `BuildReport` are stable, docs/reports.md lists their meanings."""
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from fleetmap.encoding import to_plain
+from fleetmap.errors import RecordingError, disk_errors
+from fleetmap.geometry import Array
+from fleetmap.sensors.samples import Trajectory
+from fleetmap.version_grid import GridReport
+from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
+from mapserver.quality.directions import one_way_words
+from mapserver.quality.figures import Evidence, Starts, TileDirections
+from mapserver.quality.probes import lookalike_words
+from mapserver.surfels.surfel_map import SurfelReport
+from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
+from mapserver.survey.merge.multi_session import Joined
+from mapserver.survey.survey_map import SurveyMap
+
+if TYPE_CHECKING:
+    from mapserver.drafting.survey_recordings import Surveyed
+
+MAX_REFUSED = 300  # loops of a build, the most alike first: they are what could have made a wrong map
+MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
+
+_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
+
+
+class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The stable keys.
+
+    recordings: their names. duration_s: from the first to the last selected frame. seconds: wall time from opening the recording until the
+    map is ready to be stored. realtime_factor: duration_s / seconds, above 1 faster than recorded. path_m: length of the estimated
+    trajectory of the selected frames. map_bytes: what a robot downloads for the whole site (manifest and tiles), vocabulary apart; None
+    until it is stored. loops: counts of candidates and their fates. ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every
+    selected frame that has an estimate and a known truth, after one rigid (similarity) alignment; evaluated_share: their share of the
+    selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
+    scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
+    with that of the process beside it, in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was
+    corrected. corrections: of the calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the
+    surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that
+    is in the map.
+    directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
+    is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell. grid: that of planners,
+    surfels: the map that renders; None without one. surveyed_requests: by id of a person's request the share of its places that these
+    recordings drove past.
+    """
+
+    recordings: list[str]
+    duration_s: float
+    seconds: float
+    realtime_factor: float
+    path_m: float
+    keyframes: int
+    landmarks: int
+    map_bytes: int | None
+    loops: dict[str, int]
+    ate_rmse_m: float | None
+    ate_sim3_rmse_m: float | None
+    evaluated_share: float | None
+    scale: str
+    scale_error: float | None
+    peak_rss_mb: float
+    findings: dict[str, list[str]]
+    corrections: dict[str, dict[str, float]] = {}
+    culled: dict[str, int]
+    sessions: list[dict[str, Any]]
+    joins: dict[str, str]
+    directions: list[TileDirections]
+    starts: Starts | None = None
+    lookalike_recall: float | None = None
+    grid: GridReport | None = None
+    surfels: SurfelReport | None = None
+    surveyed_requests: dict[str, float] = {}
+
+
+class Accuracy(msgspec.Struct, frozen=True):
+    """A survey against ground truth; all None without one, or where too few stamps have both (see MIN_MATCHED)."""
+
+    rigid: AteResult | None = None
+    similarity: AteResult | None = None
+    evaluated_share: float | None = None
+
+
+def estimated_trajectory(survey_map: SurveyMap) -> Trajectory:
+    """The selected frames that something measured ties to the map."""
+    chosen = survey_map.trajectory_estimated
+    return Trajectory(survey_map.trajectory.stamps_ns[chosen], survey_map.trajectory.frame_from_body[chosen])
+
+
+def accuracy(survey_map: SurveyMap, truth: Trajectory | None) -> Accuracy:
+    """Errors of all estimated frames at which the truth is known; guesses between them are left out and counted."""
+    if truth is None:
+        return Accuracy()
+    estimate, frames = estimated_trajectory(survey_map), len(survey_map.trajectory)
+    matched = len(paired(estimate, truth)[0])
+    if matched < MIN_MATCHED:
+        return Accuracy(evaluated_share=matched / max(frames, 1))
+    rigid = absolute_trajectory_error(estimate, truth, frames=frames)
+    similarity = absolute_trajectory_error(estimate, truth, with_scale=True, frames=frames)
+    return Accuracy(rigid, similarity, rigid.evaluated_share)
+
+
+def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
+    """Raises RecordingError unless enough of the stamps (F,) have a truth to place a survey in its frame."""
+    if truth is None:
+        raise RecordingError(f"{what} carries no ground truth; build it without --frame-from-ground-truth")
+    known = sum(truth.at(int(stamp)) is not None for stamp in stamps_ns)
+    if known < MIN_MATCHED:
+        raise RecordingError(
+            f"{what}: {known} of {len(stamps_ns)} selected frames have a ground truth, {MIN_MATCHED} are needed; "
+            "select others with --frames or build without --frame-from-ground-truth"
+        )
+
+
+def path_length_m(trajectory: Trajectory) -> float:
+    """Metres along the positions."""
+    return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
+
+
+class BuildCost(msgspec.Struct, frozen=True):
+    """What a build cost: wall seconds, most memory in 10^6 bytes."""
+
+    seconds: float
+    peak_rss_mb: float
+
+
+def make_report(
+    recordings: "Sequence[Surveyed]", joined: Joined, found: Accuracy, cost: BuildCost, evidence: Evidence
+) -> BuildReport:
+    """The report of surveyed recordings, map_bytes still unknown."""
+    survey_map = joined.map
+    taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
+    duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
+    loops = [s.survey.loops.counts() for s in taken]
+    culled = [asdict(s.survey.culled) for s in taken]
+    return BuildReport(
+        recordings=[s.entry.name for s in taken],
+        duration_s=round(duration_s, 6),
+        seconds=round(cost.seconds, 3),
+        realtime_factor=round(duration_s / max(cost.seconds, 1e-9), 4),
+        path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
+        keyframes=len(survey_map.keyframe_stamps_ns),
+        landmarks=len(survey_map.landmark_ids),
+        map_bytes=None,
+        loops={key: sum(count[key] for count in loops) for key in loops[0]},
+        ate_rmse_m=None if found.rigid is None else found.rigid.rmse_m,
+        ate_sim3_rmse_m=None if found.similarity is None else found.similarity.rmse_m,
+        evaluated_share=found.evaluated_share,
+        scale="metric" if survey_map.scale_known else "unknown",
+        scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
+        peak_rss_mb=round(cost.peak_rss_mb, 1),
+        culled={key: sum(count[key] for count in culled) for key in culled[0]},
+        findings={s.entry.name: s.remarks() for s in recordings},
+        corrections={s.entry.name: s.corrections for s in taken if s.corrections},
+        sessions=sessions_report([s.entry.name for s in recordings], joined),
+        joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},
+        directions=evidence.directions or [],
+        starts=evidence.starts,
+        lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
+    )
+
+
+def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
+    """What became of every recording, in their order."""
+    return [
+        {"recording": names[o.number], "joined": o.joined, "verdict": o.verdict.value, "reason": o.reason}
+        | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
+        | ({} if o.counts is None else asdict(o.counts))
+        for o in joined.outcomes
+    ]
+
+
+def report_details(
+    surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy, stage_s: dict[str, float]
+) -> dict[str, Any]:
+    """Keys of the full report beside the stable ones, which help to understand those; they may change.
+
+    loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
+    and decoding images are part of odometry. frames_seen_in_map: frames that points of the map place; odometry or the IMU carries the
+    others. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    components of each survey, of which the kept one is in the map.
+    """
+    survey_map, first = joined.map, surveyed[0]
+    return {
+        "format": first.format,
+        "sensor_set": first.sensor_set.value,
+        "inertial": all(s.survey.odometry.inertial for s in surveyed),
+        "losses": [{"what": issue.what, "detail": issue.detail} for s in surveyed for issue in s.issues],
+        "frames": len(survey_map.trajectory),
+        "estimated_frames": int(survey_map.trajectory_estimated.sum()),
+        "frames_seen_in_map": sum(int(s.survey.seen.sum()) for s in surveyed),
+        "observations": len(survey_map.obs_landmark),
+        "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
+        "ate_max_m": None if found.rigid is None else found.rigid.max_m,
+        "sim3_scale": None if found.similarity is None else found.similarity.scale,
+        "pair_turn": [to_plain(s.survey.stereo_yaw) for s in surveyed],
+        "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
+        "parts": [to_plain(s.survey.components) for s in surveyed],
+        "loop_records": [
+            {"recording": s.entry.name} | record for s in surveyed for record in to_plain(s.survey.loops.records)
+        ],
+    }
+
+
+def sentence(site: str, version: int, parent: int | None, report: BuildReport, store: Path) -> str:
+    """A draft stored in the folder `store`, in words; parent: the version that it was built on."""
+    ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
+    sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
+    built_on = "" if parent is None else f" on version {parent}"
+    left = [s["recording"] for s in report.sessions if not s["joined"]]
+    left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
+    one_way = one_way_words(report.directions)
+    warned = "".join(f"; {words}" for words in (one_way, lookalike_words(report.starts)) if words)
+    if report.scale == "unknown":
+        return (
+            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
+            "unknown, so it can be inspected but not published"
+        )
+    return (
+        f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
+        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with "
+        f"`mapserver publish --site {site} --store {shlex.quote(str(store))}`"
+    )
+
+
+def loop_places(taken: "Sequence[Surveyed]", joined: Joined) -> list[dict[str, Any]]:
+    """Loops of the recordings that are in the map, accepted ones and the refused ones that looked most alike.
+
+    Of each the recording, both ends (x, y) in `map`, verdict, reason and score.
+    """
+    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
+    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
+    accepted: list[dict[str, Any]] = []
+    refused: list[dict[str, Any]] = []
+    for recording, map_from_body in zip(taken, parts, strict=True):
+        survey = recording.survey
+        frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
+        # Records keep the numbers of keyframes from before components were left out: then their places are unknown.
+        for record in survey.loops.records if all(c.kept for c in survey.components) else ():
+            place = _place(recording.entry.name, record, map_from_body[:, :2, 3], frames)
+            (accepted if record.verdict is LoopVerdict.ACCEPTED else refused).append(place)
+    refused.sort(key=lambda place: (-place["score"], place["recording"], place["from_map_m"], place["to_map_m"]))
+    return accepted + refused[:MAX_REFUSED]
+
+
+def _place(name: str, record: LoopRecord, places_map: Array, frames: list[int]) -> dict[str, Any]:
+    start_m, end_m = (
+        [round(float(value), 3) for value in places_map[frames[number]]] for number in (record.i, record.j)
+    )
+    return {
+        "recording": name,
+        "from_map_m": start_m,
+        "to_map_m": end_m,
+        "verdict": record.verdict.value,
+        "reason": record.reason,
+        "score": round(record.score, 4),
+    }
+
+
+def library_versions() -> dict[str, str]:
+    """Of what a map depends on besides settings."""
+    versions = {}
+    for name in _LIBRARIES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:  # a source tree that is not installed, or a library by another name
+            versions[name] = "not installed as a package"
+    return versions
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Writes a result of a build; StoreError where the disk refuses."""
+    with disk_errors(f"{path} cannot be written", "the draft is stored all the same"):
+        path.write_bytes(data)

@@ -1,0 +1,386 @@
+"""Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Protocol, Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from fleetmap.config import Section, load_toml
+from fleetmap.errors import FleetmapError, RecordingError, SurveyError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import RecordingEntry
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
+from mapserver.calibration import CalibrationParameter
+from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
+from mapserver.doctor.run_checks import frames_to_check
+from mapserver.drafting.admission import SAMPLED_FRAMES, TURN_FRAMES, checked
+from mapserver.drafting.draft_evidence import HeldOut, held_out_of
+from mapserver.drafting.mapped_images import KeptFrames
+from mapserver.drafting.report import check_truth
+from mapserver.drafting.sensor_subset import reduced
+from mapserver.drafting.trajectory import OtherTrajectory, given_poses, with_depths
+from mapserver.drafting.worker import read_ahead
+from mapserver.quality.figures import RigEvidence
+from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
+from mapserver.survey.finish.map_transform import scaled, scaled_state
+from mapserver.survey.loops.zones import Zones, zones_of
+from mapserver.survey.merge.multi_session import Joined, chained
+from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.survey_inputs import Progress, SurveyConfig, SurveyInputs, SurveyTools, no_progress
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Surveyed:
+    """One recording and its survey.
+
+    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements. calibration: what it says of
+    the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
+    """
+
+    entry: RecordingEntry
+    format: str
+    sensor_set: SensorSet
+    issues: tuple[DataIssue, ...]
+    truth: Trajectory | None
+    survey: Survey
+    map_from_survey: Array | None
+    findings: tuple[str, ...]
+    calibration: RigEvidence
+    corrections: dict[str, float]
+    held_out: list[HeldOut]
+
+    def remarks(self) -> list[str]:
+        """What was wanting in the recording, what was corrected and what was left out, in words."""
+        yaw = self.survey.stereo_yaw
+        turned = [
+            f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, as the adjusted survey says"
+        ]
+        apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
+        whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with what comes before: {c.refused}" for c in apart]
+        left_out = [component.remark() for component in self.survey.components if not component.kept]
+        return [*self.findings, *(turned if yaw.corrected else ()), *whole, *left_out]
+
+    def evidence(self) -> RigEvidence:
+        """What is known of its calibration: the pair is doubted where the survey's disparities deny the angle that the doctor let pass."""
+        yaw, limit = self.survey.stereo_yaw, TOLERANCES[CalibrationParameter.PAIR_YAW]
+        angle_rad = abs(yaw.correction_px) / self.survey.state.camera.focal_px
+        if angle_rad <= limit.warn_above + SURE_SIGMAS * limit.floor:
+            return self.calibration
+        words = f"the survey's disparities are {-yaw.shift_px:+.2f} px from what its motion says, which the doctor did not find"
+        return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
+
+    given: its initial trajectory, None for our own odometry.
+    """
+
+    statements: tuple[str, ...]
+    rig: RigCalibration
+    calibration: RigEvidence
+    corrections: dict[str, float]
+    given: Trajectory | None = None
+    leaves_wheels_out: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingOptions:
+    """How recordings are read: frames A:B:C, how they are opened, only the sensors of a poorer set, and the initial trajectory, our own
+    odometry for None.
+    """
+
+    frames: str = "::"
+    opening: OpenOptions = field(default_factory=OpenOptions)
+    use: SensorSet | None = None
+    trajectory: OtherTrajectory | None = None
+
+    def opened(self, path: Path) -> tuple[Recording, NDArray[np.int64]]:
+        """The recording at `path`, to be closed, and the indices of its selected frames."""
+        whole = open_recording(path, self.opening)
+        try:
+            recording = reduced(whole, self.use)
+            chosen, indices = with_depths(
+                recording, FrameSelection.parse(self.frames).apply(recording), self.trajectory
+            )
+            return chosen.readable(indices)
+        except FleetmapError:
+            whole.close()
+            raise
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+        """The recording at `path` while the block lasts, and the indices of its selected frames."""
+        recording, indices = self.opened(path)
+        with recording:
+            yield recording, indices
+
+
+class Reading(Protocol):
+    """How recordings are opened: `RecordingOptions` anew each time, `OpenRecordings` once."""
+
+    @property
+    def trajectory(self) -> OtherTrajectory | None:
+        """See RecordingOptions."""
+
+    def open(self, path: Path) -> AbstractContextManager[tuple[Recording, NDArray[np.int64]]]:
+        """See RecordingOptions."""
+
+
+class OpenRecordings:
+    """Recordings opened as `options` say. The one used last stays open; frames that its first use decoded are decoded once.
+
+    folder: takes their temporary file.
+    """
+
+    def __init__(self, options: RecordingOptions, folder: Path) -> None:
+        self._options, self._folder = options, folder
+        self._path: Path | None = None
+        self._opened: tuple[Recording, NDArray[np.int64]]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._path is not None:
+            self._opened[0].close()
+            self._path = None
+
+    @property
+    def trajectory(self) -> OtherTrajectory | None:
+        return self._options.trajectory
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
+        if path != self._path:
+            self.__exit__()
+            recording, indices = self._options.opened(path)
+            self._opened = replace(recording, frames=KeptFrames(recording.frames, self._folder)), indices
+            self._path = path
+        yield self._opened
+        frames = self._opened[0].frames
+        assert isinstance(frames, KeptFrames)
+        frames.keeps = False
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedParts:
+    """The selected frames (F,) of a recording as FrameParts: each part reads files of its own, and carries nothing of the others."""
+
+    recording: Recording
+    indices: NDArray[np.int64]
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        return self.recording.frame_stamps_ns[self.indices]
+
+    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
+        part = self.recording.part(self.indices[first:end])
+        return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    recording: Recording
+
+    def __iter__(self) -> Iterator[CameraFrame]:
+        with self.recording as recording:
+            for index in range(len(recording)):
+                yield recording.read_frame(index)
+
+
+def survey_inputs_of(
+    recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
+) -> SurveyInputs:
+    """The selected frames (F,) of a recording, read ahead, and its samples."""
+    frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
+    samples = recording.imu, recording.calibration, rectifier, recording.wheel
+    parts = RecordedParts(recording, indices)
+    return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)
+
+
+def admit_recordings(
+    paths: Sequence[Path],
+    options: Reading,
+    console: Console,
+    *,
+    needs_truth: bool,
+    unusable: dict[Path, str] | None = None,
+    executor: Executor = SERIAL,
+    progress: Progress = no_progress,
+    look_at: Callable[[Sequence[Path]], None] = lambda _: None,
+) -> dict[Path, Admission]:
+    """Checks all recordings, so that a hopeless one is refused before the work begins.
+
+    unusable: takes those that are refused, with the reason; without it, or where all are, that is an error. look_at: told each path.
+    """
+    admitted: dict[Path, Admission] = {}
+    for path in paths:
+        look_at([path])
+        with _noting(path, unusable):
+            admitted[path] = _admission(path, options, console, needs_truth, executor, progress)
+    if not admitted:
+        raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
+    return admitted
+
+
+@contextmanager
+def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
+    """Notes in `unusable` why the block fails for a recording; raises where there is none, and what is no fault of the recording."""
+    try:
+        yield
+    except (RecordingError, SurveyError) as error:
+        if unusable is None:
+            raise
+        unusable[path] = str(error)
+    except (FleetmapError, OSError):
+        raise
+    except Exception as error:
+        if unusable is None:
+            raise
+        _log.exception("%s", path)
+        unusable[path] = (
+            f"{path}: {type(error).__name__}: {str(error)[:200]}; a fault of the program, report it with the log"
+        )
+
+
+def _admission(
+    path: Path,
+    options: Reading,
+    console: Console,
+    needs_truth: bool,
+    executor: Executor,
+    progress: Progress,
+) -> Admission:
+    with options.open(path) as (recording, indices):
+        for issue in recording.issues:
+            console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
+        if needs_truth:
+            check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
+        other = options.trajectory
+        total, done = frames_to_check(recording, SAMPLED_FRAMES, TURN_FRAMES), count(1)
+        result = checked(recording, lambda: progress("examination", min(next(done), total), total), executor)
+        for remark in result.remarks():
+            console.print(f"{recording.name}: {remark}", markup=False)
+        statements, found = tuple(result.statements()), result.calibration
+        wheels = result.leaves_wheels_out
+        admission = Admission(statements, result.rig, found, result.corrections, leaves_wheels_out=wheels)
+        if other is None:
+            return admission
+        given = given_poses(replace(recording, calibration=result.rig), indices, other)
+        console.print(f"{recording.name}: {given.words}", markup=False)
+        return replace(admission, statements=(*admission.statements, given.words), given=given.trajectory)
+
+
+def survey_recording(
+    path: Path,
+    admission: Admission,
+    reading: Reading,
+    pinhole: StereoCamera | None,
+    options: SurveyConfig,
+    tools: SurveyTools,
+) -> Surveyed:
+    """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
+    with reading.open(path) as (opened, indices):
+        recording = replace(opened, calibration=admission.rig)
+        if admission.leaves_wheels_out:
+            recording = replace(recording, wheel=())
+        rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
+        done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), options, tools)
+        done, map_from_survey = _aligned(done, recording)
+        return Surveyed(
+            entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
+            format=recording.format,
+            sensor_set=recording.sensor_set,
+            issues=recording.issues,
+            truth=recording.ground_truth,
+            survey=done,
+            map_from_survey=map_from_survey,
+            findings=admission.statements,
+            calibration=admission.calibration,
+            corrections=admission.corrections,
+            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
+        )
+
+
+def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
+    """The survey, in metres where its priors give a scale that was unknown, and map_from_survey (4, 4) by them, None without any."""
+    priors, base_from_body = recording.priors, recording.calibration.base_from_body
+    if done.map.scale_known:
+        return done, map_from_survey_by_priors(done.map, priors, base_from_body)
+    aligned = aligned_by_priors(done.map, priors, base_from_body)
+    if aligned is None:
+        return done, None
+    in_metres = replace(done, map=scaled(done.map, aligned.scale), state=scaled_state(done.state, aligned.scale))
+    return in_metres, aligned.map_from_survey
+
+
+def survey_all(
+    paths: Sequence[Path],
+    survey_one: Callable[[Path, StereoCamera | None], Surveyed],
+    pinhole: StereoCamera | None,
+    unusable: dict[Path, str] | None = None,
+) -> list[Surveyed]:
+    """Surveys of all recordings, resampled to one camera: `pinhole`, or that of the first one.
+
+    unusable: takes those that cannot be surveyed, with the reason; without it, or where none can be, that is an error.
+    """
+    done: list[Surveyed] = []
+    for path in paths:
+        with _noting(path, unusable):
+            done.append(survey_one(path, pinhole))
+            pinhole = pinhole or done[0].survey.state.camera
+    if not done:
+        raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")
+    return done
+
+
+def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: Joined) -> None:
+    """Names the recordings that could not be joined; raises SurveyError where none could."""
+    left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
+    for recording, outcome in left:
+        console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
+    if len(left) == len(surveyed):
+        reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
+        raise SurveyError(
+            f"nothing could be joined to the current version of site {site} ({reasons}); drive through places that are "
+            "in the map, pass its docks, or survey the area as another --site"
+        )
+
+
+def joined_truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
+    """The truth of the joined recordings on one clock, None where one of them has none."""
+    truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
+    known = [truth for truth in truths if truth is not None]
+    return chained(known, joined.trajectories) if len(known) == len(truths) else None
+
+
+def map_trajectories(joined: Joined) -> list[Trajectory]:
+    """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
+    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
+    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
+    return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
+
+
+class _ZonesFile(Section, frozen=True):
+    zones: dict[str, object]
+
+
+def read_zones(path: Path | None) -> Zones:
+    """Zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError for anything else. None has no zones."""
+    return Zones() if path is None else zones_of(load_toml(path, _ZonesFile).zones, str(path))

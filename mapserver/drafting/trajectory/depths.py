@@ -1,0 +1,212 @@
+"""Depths that DROID-SLAM keeps beside its poses, as depth images of a single camera's recording."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.recordings import Recording
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
+from mapserver.drafting.trajectory.formats import array_in, read_poses
+from mapserver.drafting.trajectory.given import OtherTrajectory, check_span, stamps_on_clock
+from mapserver.drafting.trajectory.readings import NEAR_NS
+
+if TYPE_CHECKING:
+    import hashlib
+
+    from fleetmap.recordings.images import StoredFrame
+    from fleetmap.recordings.recording import FrameSource
+
+_MOST_SIDE = 8192
+_EDGE_RATIO = 1.25  # between neighbouring depths: what lies between them is neither surface
+_ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay well below
+_NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
+
+
+def with_depths(
+    recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory | None
+) -> tuple[Recording, NDArray[np.int64]]:
+    """A single camera's recording as one with depth, and those of the selected frames that have one: by `disps.npy` beside DROID's poses.
+
+    The same recording and selection where there is no such file or the recording needs none. The scale must be said, as one camera does
+    not show it: UsageError. RecordingError for a file that is not of these poses and this camera.
+    """
+    if other is None or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
+        return recording, indices
+    file = (other.file if other.file.is_dir() else other.file.parent) / "disps.npy"
+    if not (other.file.is_dir() or other.file.suffix == ".npy") or not file.exists():
+        return recording, indices
+    if other.scale is None:
+        raise UsageError(
+            f"{file} holds depths of one camera, which does not show their unit; say the metres in it with --trajectory-scale"
+        )
+    written, camera = read_poses(other.file), recording.calibration.cameras[0]
+    _check(file, len(written.map_from_it), camera)
+    frame_of_row = _frames_at(stamps_on_clock(written, recording, indices, other), recording.frame_stamps_ns)
+    if (frame_of_row >= 0).mean() <= 0.5:
+        raise RecordingError(
+            f"{other.file} belongs to another recording: most of its stamps are at no frame; pass the recording's own"
+        )
+    row_of_frame = np.full(len(recording), -1)
+    row_of_frame[frame_of_row[frame_of_row >= 0]] = np.flatnonzero(frame_of_row >= 0)
+    has_depth = row_of_frame[indices] >= 0
+    check_span(recording.frame_stamps_ns[indices], has_depth, recording, other)
+    words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
+    images = DispImages(file, row_of_frame, camera, other.scale)
+    unused = "; the IMU is not used" if len(recording.imu) else ""
+    seen = replace(
+        recording,
+        sensor_set=SensorSet.RGBD,
+        calibration=replace(recording.calibration, cameras=(camera,), imu=None),
+        imu=ImuSamples.empty(),
+        frames=_DepthFrames(recording.frames, images, np.arange(len(recording)), camera),
+        issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
+    )
+    return seen, indices[has_depth]
+
+
+def _check(file: Path, count: int, camera: CameraCalibration) -> None:
+    """RecordingError unless the file holds one image of inverse depths per pose, each of the camera's shape."""
+    inverse = array_in(file)
+    if (
+        inverse.ndim != 3
+        or inverse.dtype.kind != "f"
+        or not 1 < min(inverse.shape[1:]) <= max(inverse.shape[1:]) <= _MOST_SIDE
+    ):
+        raise RecordingError(
+            f"{file} is of shape {inverse.shape} and type {inverse.dtype}; images of inverse depths (N, height, width) are expected"
+        )
+    if len(inverse) != count:
+        raise RecordingError(f"{file} has {len(inverse)} images for {count} poses; pass those of one run")
+    _pinhole(file, camera, inverse.shape[1:])
+    for number, image in enumerate(inverse):
+        if not (np.isfinite(image).all() and (image >= 0).all()):
+            raise RecordingError(
+                f"{file}: image {number + 1} has values that are no inverse depths: they must be finite and not negative"
+            )
+
+
+def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
+    """(N,) the frame at each moment, -1 for none."""
+    after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
+    return np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
+
+
+def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> Array:
+    """(4,) fx, fy, cx, cy of depth images (height, width): by `intrinsics.npy`, else of the whole picture resized.
+
+    DROID writes them for the network's cells, and the depths there or at eight times that; what fits the centre is taken.
+    """
+    written, (height, width) = file.with_name("intrinsics.npy"), shape
+    if written.exists():
+        cells = np.array(array_in(written), np.float64)
+        if cells.ndim != 2 or cells.shape[1] != 4 or not len(cells) or not (np.isfinite(cells) & (cells > 0)).all():
+            raise RecordingError(f"{written} is of shape {cells.shape}; rows of fx, fy, cx, cy above 0 are expected")
+        fitting = min((cells[0], _NETWORK_STEP * cells[0]), key=lambda pinhole: abs(pinhole[2] - width / 2))
+        if abs(fitting[2] - width / 2) > width / 4 or abs(fitting[3] - height / 2) > height / 4:
+            raise RecordingError(
+                f"{written} has its centre at {cells[0, 2:].tolist()}, outside the images of {file.name}"
+            )
+        return np.asarray(fitting)
+    per_px = np.array([width / camera.width_px, height / camera.height_px])
+    if abs(per_px[0] / per_px[1] - 1) > _ASPECT_WITHIN:
+        raise RecordingError(
+            f"{file} has images of {width}x{height}, the camera {camera.width_px}x{camera.height_px} px; put the run's intrinsics.npy "
+            "beside it, or pass depths of this camera"
+        )
+    return np.concatenate([camera.intrinsics_px[:2] * per_px, (camera.intrinsics_px[2:] + 0.5) * per_px - 0.5])
+
+
+@dataclass(frozen=True)
+class DispImages:
+    """The images in `disps.npy`, one for each pose: rows (F,) of the recording's frames, -1 for none; scale: metres in its unit."""
+
+    file: Path
+    rows: NDArray[np.int64]
+    camera: CameraCalibration
+    scale: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of each."""
+        height, width = self._images.shape[1:]
+        return height, width
+
+    @cached_property
+    def pinhole(self) -> Array:
+        """(4,) fx, fy, cx, cy of their pixels."""
+        return _pinhole(self.file, self.camera, self.shape)
+
+    def inverse(self, frame: int) -> NDArray[np.float32] | None:
+        """(h, w) that of a frame by its number in the recording, 0 where unknown; None for a frame without."""
+        row = int(self.rows[frame])
+        return None if row < 0 else np.array(self._images[row], np.float32)
+
+    @cached_property
+    def _images(self) -> AnyArray:
+        return array_in(self.file)
+
+
+@dataclass(frozen=True)
+class _DepthFrames:
+    """Frames of `source`, whose numbers in `images` are numbers (F,), each with its depth image. What was recorded is hashed alone."""
+
+    source: "FrameSource"
+    images: DispImages
+    numbers: NDArray[np.int64]
+    camera: CameraCalibration
+
+    def stored(self, index: int) -> "StoredFrame":
+        return self.source.stored(index)
+
+    def frame(self, index: int) -> CameraFrame:
+        frame, inverse = self.source.frame(index), self.images.inverse(int(self.numbers[index]))
+        depth_m = np.zeros((self.camera.height_px, self.camera.width_px), np.float32)
+        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m if inverse is None else self._depth_m(inverse))
+
+    def part(self, indices: NDArray[np.int64]) -> "_DepthFrames":
+        return replace(self, source=self.source.part(indices), numbers=self.numbers[indices])
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.source.hash_into(digest)
+
+    def close(self) -> None:
+        self.source.close()
+
+    def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Metres at recorded pixels: inverse depth is linear on planes, and so between neighbours that are of one surface."""
+        x, y = self._places
+        (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
+        high, low = (each(inverse, ones, anchor=(0, 0)) for each in (cv2.dilate, cv2.erode))
+        one_surface = (low > 0) & (high <= _EDGE_RATIO * low)
+        known = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        known[known] = one_surface[y[known].astype(np.int64), x[known].astype(np.int64)]
+        between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        with np.errstate(divide="ignore", over="ignore"):
+            depth_m = np.asarray(np.float32(self.images.scale) / between, np.float32)
+        return np.where(known & np.isfinite(depth_m), depth_m, np.float32(0))
+
+    @cached_property
+    def _places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        x, y = _places(self.camera, self.images.pinhole).astype(np.float32)
+        return x, y
+
+
+def _places(camera: CameraCalibration, pinhole: Array) -> Array:
+    """(2, H, W) for each recorded pixel its place x, y in images of a camera without distortion; -9 for none."""
+    size = camera.height_px, camera.width_px
+    v, u = np.indices(size, np.float64)
+    rays = camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
+    seen = (rays[:, 2] > 0) & np.isfinite(found).all(axis=1)
+    return np.asarray(np.where(seen[:, None], found, -9.0).T.reshape(2, *size))

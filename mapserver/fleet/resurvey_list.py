@@ -1,0 +1,100 @@
+"""The re-survey list of a site, from the store's counters, and a route through the current map."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+from fleetmap.errors import FleetmapError
+from fleetmap.mapformat import TileEntry, decode_tile
+from mapserver.fleet.survey_requests import survey_requests
+from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.fleet_statistics.resurvey_decision import (
+    ResurveySettings,
+    TileConcern,
+    Waypoint,
+    concern_of,
+    concerns,
+    route,
+)
+from mapserver.floor_plan.survey_requests import SurveyRequest
+from mapserver.store import MapStore
+
+
+@dataclass(frozen=True, slots=True)
+class ResurveyList:
+    """Tiles to survey again, the worst first, and a way through them; version: the current one, None without.
+
+    requests: what people asked for; the tiles in which that lies come first.
+    """
+
+    site: str
+    version: int | None
+    tiles: list[TileConcern]
+    route: list[Waypoint]
+    requests: list[SurveyRequest]
+
+
+def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns: int) -> ResurveyList:
+    """The list as of now; raises UsageError for an unknown site."""
+    current = store.current(site)
+    now_hour = hour_of(now_ns)
+    recent_hour = now_hour - round(settings.recent_days * 24)
+    before_hour = recent_hour - round(settings.before_days * 24)
+    recent, before = (
+        {
+            key: counts
+            for (_, key), counts in store.fleet.counters(site, "tile", since_hour=since, until_hour=until).items()
+        }
+        for since, until in ((recent_hour, 1 << 60), (before_hour, recent_hour))
+    )
+    found = concerns(recent, before, settings)
+    requests = survey_requests(store, site)
+    if current is None:
+        return ResurveyList(site, None, found, [], requests)
+    manifest = store.manifest(site, current.version)
+    found = _asked_first(found, _asked(requests, manifest.tile_size_m), recent, before)
+    entries = {f"{tile.x},{tile.y}": tile for tile in manifest.tiles}
+    areas = store.areas(site)
+    found = [replace(concern, name=areas.name_tiles(concern.name, manifest.tile_size_m)) for concern in found]
+    tiles = [concern.tile for concern in found if concern.tile in entries]
+    places = {tile: _place(store, entries[tile], manifest.tile_size_m) for tile in tiles}
+    return ResurveyList(site, current.version, found, route(found, places), requests)
+
+
+def _asked(requests: Sequence[SurveyRequest], size_m: float) -> dict[str, list[str]]:
+    """By tile: who asked for a survey of it, when and why."""
+    found: dict[str, list[str]] = {}
+    for request in requests:
+        day = f"{datetime.fromtimestamp(request.asked_ns / 1e9, UTC):%Y-%m-%d}"
+        why = f": {request.reason}" if request.reason else ""
+        for x, y in request.tiles(size_m):
+            found.setdefault(f"{x},{y}", []).append(f"{request.actor or 'somebody'} asked for it on {day}{why}")
+    return found
+
+
+def _asked_first(
+    found: Sequence[TileConcern],
+    asked: Mapping[str, list[str]],
+    recent: Mapping[str, Counters],
+    before: Mapping[str, Counters],
+) -> list[TileConcern]:
+    """A person's word is a reason of its own, and comes before what was counted."""
+    known = {concern.tile: concern for concern in found}
+    first = [
+        replace(known[tile], reasons=[*words, *known[tile].reasons])
+        if tile in known
+        else concern_of(tile, words, recent.get(tile, Counters()), before.get(tile, Counters()))
+        for tile, words in asked.items()
+    ]
+    return [*first, *(concern for concern in found if concern.tile not in asked)]
+
+
+def _place(store: MapStore, entry: TileEntry, size_m: float) -> tuple[float, float]:
+    """Where the survey stood nearest to the tile's middle, which can be driven to; the middle where it never stood there."""
+    middle = ((entry.x + 0.5) * size_m, (entry.y + 0.5) * size_m)
+    try:
+        stood = decode_tile(store.blob(entry.sha256)).map_from_cam[:, :2, 3]
+    except FleetmapError:
+        return middle  # a damaged tile needs a survey most of all
+    return min(((float(x), float(y)) for x, y in stood), key=lambda place: math.dist(place, middle), default=middle)

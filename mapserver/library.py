@@ -1,0 +1,175 @@
+"""The library: maps built from recordings, and maps of a store as arrays.
+
+    draft = build_map(["drive.mcap"], "maps", "hall")
+    draft.publish()
+    print(open_map("maps", "hall").points_map.shape)
+
+Paths are str or Path everywhere. Errors are FleetmapErrors.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import StateError
+from fleetmap.geometry import Array
+from fleetmap.mapformat import Manifest, Tile, check_name, decode_tile
+from fleetmap.sensors.samples import Trajectory
+from mapserver import releases
+from mapserver.config import survey_settings
+from mapserver.drafting.draft import (
+    BuildOptions,
+    BuildRequest,
+    Built,
+    Draft,
+    build_draft,
+    picture_png,
+)
+from mapserver.drafting.report import write_file
+from mapserver.drafting.sensor_subset import sensor_set_of
+from mapserver.quality.gate import GateSettings
+from mapserver.store import NOBODY, Actor, MapStore
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_map import SurveyMap
+
+__all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
+__all__ += ["open_store", "settings_for"]
+
+
+@dataclass(frozen=True)
+class BuiltMap:
+    """A draft that was built and stored.
+
+    map: keyframes, landmarks and observations as arrays. report: the keys of docs/reports.md. left_out: by content hash, why a
+    recording is not in the map.
+    """
+
+    store: Path
+    site: str
+    draft: Draft
+    built: Built
+
+    @property
+    def version(self) -> int:
+        """Its number in the store."""
+        return self.draft.version
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the build measured."""
+        return self.draft.report
+
+    @property
+    def sentence(self) -> str:
+        """The result in words."""
+        return self.draft.sentence
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """Recordings that could not be joined."""
+        return self.draft.left_out
+
+    @property
+    def map(self) -> SurveyMap:
+        """The survey in the frame `map`."""
+        return self.built.joined.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """map_from_body of every selected frame."""
+        return self.map.trajectory
+
+    def save_picture(self, path: str | Path) -> None:
+        """Draws the map from above as a PNG."""
+        write_file(Path(path), picture_png(self.site, self.draft, self.built))
+
+    def publish(
+        self,
+        *,
+        gate: GateSettings | None = None,
+        trust_calibration: bool = False,
+        force: bool = False,
+        actor: Actor = NOBODY,
+    ) -> None:
+        """Makes it the site's current version; GateRefusedError where it is not good enough by `gate`, unless forced.
+
+        A site's first version is refused where its recordings are too short or too straight to judge the calibration. With
+        trust_calibration the actor, who needs a name and a reason, says that it is right; the manifest keeps that.
+        """
+        with MapStore.open(self.store) as maps:
+            if trust_calibration:
+                releases.trust_calibration(maps, maps.version(self.site, self.version), actor)
+            releases.publish(maps, self.site, self.version, force=force, actor=actor, gate=gate or GateSettings())
+
+
+def build_map(
+    recordings: Sequence[str | Path] | str | Path, store: str | Path, site: str, options: BuildOptions | None = None
+) -> BuiltMap:
+    """Surveys the recordings, joins them to the site's current version, and stores the map as a draft."""
+    options = options or BuildOptions()
+    paths = (recordings,) if isinstance(recordings, str | Path) else recordings
+    request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
+    draft, built = build_draft(request, settings_for(request), recorded=True)
+    return BuiltMap(request.store, site, draft, built)
+
+
+def settings_for(request: BuildRequest) -> SurveySettings:
+    """Settings of the request's survey: its own, or the preset of the first recording's sensors with the [survey] of its file over it."""
+    options = request.options
+    if options.settings is not None:
+        return options.settings
+    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.reading.opening))
+
+
+@dataclass(frozen=True)
+class MapArrays:
+    """A version of a site as robots get it: N landmarks and K places (keyframes), tile by tile.
+
+    landmark_ids (N,), points_map (N, 3), descriptors (N, 32) uint8; place_ids (K,), map_from_cam (K, 4, 4).
+    """
+
+    site: str
+    version: int
+    manifest: Manifest
+    tiles: tuple[Tile, ...]
+    landmark_ids: NDArray[np.uint32]
+    points_map: Array
+    descriptors: NDArray[np.uint8]
+    place_ids: NDArray[np.uint32]
+    map_from_cam: Array
+
+
+def open_store(path: str | Path, *, create: bool = False) -> MapStore:
+    """The map store in a folder; to be closed, or used in a `with` statement."""
+    return MapStore.open(Path(path), create=create)
+
+
+def open_map(store: str | Path, site: str, version: int | None = None) -> MapArrays:
+    """The tiles of a version, the current one by default, decoded and put together."""
+    with open_store(store) as maps:
+        if version is None:
+            current = maps.current(site)
+            if current is None:
+                raise StateError(f"site {site} has no published version; name a draft, or publish one")
+            version = current.version
+        manifest = maps.manifest(site, version)
+        tiles = tuple(decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles)
+    return MapArrays(
+        site=site,
+        version=version,
+        manifest=manifest,
+        tiles=tiles,
+        landmark_ids=_joined([tile.landmark_ids for tile in tiles], np.zeros(0, np.uint32)),
+        points_map=_joined([tile.points_map for tile in tiles], np.zeros((0, 3))),
+        descriptors=_joined([tile.descriptors for tile in tiles], np.zeros((0, 32), np.uint8)),
+        place_ids=_joined([tile.place_ids for tile in tiles], np.zeros(0, np.uint32)),
+        map_from_cam=_joined([tile.map_from_cam for tile in tiles], np.zeros((0, 4, 4))),
+    )
+
+
+def _joined(arrays: Sequence[NDArray[Any]], none: NDArray[Any]) -> NDArray[Any]:
+    return np.concatenate([none, *arrays])

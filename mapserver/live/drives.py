@@ -1,0 +1,245 @@
+"""Where a survey under way comes from: a recording that is played, or the robot's sensors, which are recorded at the same time."""
+
+import threading
+import time
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import FleetmapError, RecordingError, UsageError
+from fleetmap.recordings import Recording, StoredFrame, Topics
+from fleetmap.recordings.images import decode_frame
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import ImuSamples, SensorSet, WheelSample
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.sources.source import Source
+from mapserver.drafting.admission import refuse_hopeless
+from mapserver.drafting.draft import BuildOptions
+from mapserver.drafting.worker import read_ahead
+from mapserver.survey.odometry_pass import SampleFeed
+
+_BEGIN_S = 0.2  # the first frame is due so long after all is ready
+_AHEAD = 8  # decoded frames that wait
+_QUEUE = 40  # frames of sensors that may wait for tracking: two seconds
+_IMU_WAIT_S = 0.05
+_POLL_S = 0.25
+_WARM_UP_FRAMES = 3
+_SILENCE_S = 10.0  # after which a sensor that has said nothing is no sensor
+
+
+class DueFrame(NamedTuple):
+    """A frame with the IMU and wheel samples before it, and when it came on the monotonic clock; None where it was not waited for."""
+
+    frame: RectifiedFrame
+    imu: ImuSamples
+    wheel: list[WheelSample]
+    due_s: float | None
+
+
+class Drive(Protocol):
+    """A survey's frames as they come, speed times as fast as their stamps say. dropped: frames that came too quickly to be taken."""
+
+    name: str
+    calibration: RigCalibration
+    has_depth: bool
+    rectifier: Rectifier
+    speed: float
+
+    @property
+    def dropped(self) -> int:
+        """Frames so far."""
+
+    def check(self) -> list[str]:
+        """What is wanting, in words; RecordingError for what a build would refuse, as far as that shows before the drive."""
+
+    def warm_up(self) -> tuple[RectifiedFrame, ...]:
+        """A few frames to load kernels on, if there are any before it begins."""
+
+    def frames(self) -> Generator[DueFrame | None, None, None]:
+        """Each frame when it is due; None now and then while none comes."""
+
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+        """The recording, and the options with which a build reads the `count` frames of it that were taken."""
+
+
+class RecordedDrive:
+    """A recording, played `speed` times as fast as it was recorded; 0 for as fast as its frames are taken."""
+
+    def __init__(self, path: Path, recording: Recording, indices: NDArray[np.int64], given: str, speed: float) -> None:
+        """given: the `--frames` that chose the indices."""
+        if not (np.isfinite(speed) and speed >= 0):
+            raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")
+        self.name, self.calibration = recording.name, recording.calibration
+        self.has_depth = recording.sensor_set is SensorSet.RGBD
+        self.rectifier = Rectifier(recording.calibration, has_depth=self.has_depth)
+        self._path, self._recording, self._indices, self._given, self.speed = path, recording, indices, given, speed
+
+    @property
+    def dropped(self) -> int:
+        """See Drive: it waits for who takes its frames."""
+        return 0
+
+    def check(self) -> list[str]:
+        """See Drive."""
+        refuse_hopeless(self._recording)
+        return [f"issue: {issue.what}: {issue.detail}" for issue in self._recording.issues]
+
+    def warm_up(self) -> tuple[RectifiedFrame, ...]:
+        """See Drive."""
+        return tuple(self._frame(int(index)) for index in self._indices[:_WARM_UP_FRAMES])
+
+    def frames(self) -> Generator[DueFrame | None, None, None]:
+        """See Drive."""
+        recording, begin_s = self._recording, time.monotonic() + _BEGIN_S
+        feed = SampleFeed(recording.imu, recording.wheel, self.rectifier.imu_minus_cam_s)
+        first_ns = int(recording.frame_stamps_ns[self._indices[0]])
+        for frame in read_ahead((self._frame(int(index)) for index in self._indices), _AHEAD):
+            due_s = None
+            if self.speed:
+                due_s = begin_s + (frame.stamp_ns - first_ns) * 1e-9 / self.speed
+                time.sleep(max(0.0, due_s - time.monotonic()))
+            imu, wheel = feed.until(frame.stamp_ns)
+            yield DueFrame(frame, imu, list(wheel), due_s)
+
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+        """See Drive."""
+        if count == len(self._indices):
+            return self._path, replace(options, frames=self._given)
+        seen = self._indices[: max(count, 1)]
+        step = int(self._indices[1] - self._indices[0]) if len(self._indices) > 1 else 1
+        return self._path, replace(options, frames=f"{int(seen[0])}:{int(seen[-1]) + 1}:{step}")
+
+    def _frame(self, index: int) -> RectifiedFrame:
+        return self.rectifier.rectify(self._recording.read_frame(index))
+
+
+class SensorDrive:
+    """The sensors of a robot. Every sample goes into a recording, which is whole up to the last second whatever happens."""
+
+    def __init__(self, source: Source, path: Path, topics: Topics) -> None:
+        """path: of the MCAP file to write; UsageError where there is one already."""
+        if path.suffix != ".mcap" or path.exists():
+            raise UsageError(f"--record {path}: name a new file that ends in .mcap")
+        self.name, self.calibration, self.has_depth = path.stem, source.calibration, source.has_depth
+        self.rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
+        self._source, self._path, self._topics = source, path, topics
+        self._ended, self._recorded_frames = threading.Event(), 0
+        self._fault: Exception | None = None
+        self.speed = 1.0
+        self._intake = Intake(
+            frames=_QUEUE,
+            imu_minus_cam_s=self.rectifier.imu_minus_cam_s,
+            has_imu=source.calibration.imu is not None,
+            imu_wait_s=_IMU_WAIT_S,
+        )
+
+    @property
+    def dropped(self) -> int:
+        """See Drive."""
+        return self._intake.counts.frames_dropped
+
+    def check(self) -> list[str]:
+        """See Drive: sensors are judged by what they send."""
+        return []
+
+    def warm_up(self) -> tuple[RectifiedFrame, ...]:
+        """See Drive."""
+        return ()
+
+    def frames(self) -> Generator[DueFrame | None, None, None]:
+        """See Drive; RecordingError where the sensors end by a fault, with where the drive is recorded up to there."""
+        feeding = threading.Thread(target=self._feed, name="sensors", daemon=True)
+        writer = McapRecordingWriter(self._path, self.calibration, topics=self._topics, in_place=True)
+        feeding.start()
+        begun_s = time.monotonic()
+        try:
+            while not self._intake.exhausted:
+                bundle = self._take()
+                due_s = time.monotonic()
+                frame = None if bundle.frame is None else self._recorded(writer, bundle)
+                yield None if frame is None else DueFrame(frame, bundle.imu, bundle.wheel, due_s)
+                if due_s - begun_s > _SILENCE_S:
+                    self._refuse_silence()
+            if self._fault is not None:
+                raise self._ended_by(self._fault)
+        finally:
+            self._ended.set()
+            feeding.join(5.0)
+            self._source.close()
+            if self._recorded_frames:
+                writer.close()
+            else:
+                writer.discard()
+
+    def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
+        """See Drive."""
+        if not count:
+            self._refuse_silence()
+            raise RecordingError(
+                f"no frame could be used; look at the sensors with `locclient check`{self._unreadable()}"
+            )
+        return self._path, replace(options, frames="::", calibration=None, topics=self._topics, use=None)
+
+    def _refuse_silence(self) -> None:
+        """RecordingError where cameras or IMU have said nothing, with the topics on which they are expected."""
+        counts, topics = self._intake.counts, self._topics
+        second = topics.depth if self.has_depth else topics.right if len(self.calibration.cameras) > 1 else ""
+        if not counts.frames:
+            images = f"{topics.left} and {second}" if second else topics.left
+            raise RecordingError(
+                f"no frame came from the sensors: images are expected on {images}; look at [source] sensors and [topics] with "
+                f"`locclient check`{self._unreadable()}"
+            )
+        if self.calibration.imu is not None and not counts.imu_samples:
+            raise RecordingError(
+                f"{self._path}: images come, but no sample of the IMU that the calibration has; it is expected on {topics.imu}. Start "
+                "it, correct [topics] imu, or take it out of the calibration file"
+            )
+
+    def _unreadable(self) -> str:
+        count = self._intake.counts.unreadable
+        return f"; {count} messages could not be read ({self._intake.unreadable_why})" if count else ""
+
+    def _feed(self) -> None:
+        try:
+            self._source.run(self._intake, self._ended.wait)
+        except Exception as error:  # whatever it is, the drive must not end as if it were complete
+            self._fault = error
+        finally:
+            self._intake.finish()
+
+    def _take(self) -> SensorBundle:
+        try:
+            return self._intake.take(_POLL_S)
+        except RecordingError as error:
+            raise self._ended_by(error) from error
+
+    def _ended_by(self, fault: Exception) -> RecordingError:
+        reason = str(fault) if isinstance(fault, FleetmapError) else f"{type(fault).__name__}: {fault}"
+        kept = "nothing was recorded before"
+        if self._recorded_frames:
+            kept = f"{self._path} holds the drive up to there, and `mapserver build {self._path}` makes a map of it"
+        return RecordingError(f"the sensors ended the drive: {reason}; {kept}")
+
+    def _recorded(self, writer: McapRecordingWriter, bundle: SensorBundle) -> RectifiedFrame | None:
+        """The frame as tracking takes it; None, and nothing recorded of it, where it cannot be read."""
+        writer.write_imu(bundle.imu)
+        writer.write_wheel(bundle.wheel)
+        writer.write_prior(bundle.priors)
+        assert bundle.frame is not None
+        try:
+            frame = decode_frame(bundle.frame) if isinstance(bundle.frame, StoredFrame) else bundle.frame
+            rectified = self.rectifier.rectify(frame)
+        except FleetmapError as error:
+            self._intake.count_unreadable(str(error))
+            return None
+        writer.write_frame(bundle.frame)
+        self._recorded_frames += 1
+        return rectified

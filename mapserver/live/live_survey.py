@@ -1,0 +1,290 @@
+"""A survey under way: frames are tracked as they come, the map grows beside, everybody may look, and a build ends it."""
+
+import gc
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from rich.console import Console
+
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.errors import FleetmapError
+from fleetmap.geometry import se3_inverse, skew
+from fleetmap.live_survey import LiveSurveyState
+from fleetmap.messages import EstimateMessage, Placement
+from fleetmap.sensors.samples import ImuSamples
+from mapserver.drafting.draft import BuildOptions
+from mapserver.drafting.survey_recordings import read_zones
+from mapserver.library import BuiltMap, build_map
+from mapserver.live.drives import Drive, DueFrame
+from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
+from mapserver.survey.live.live_values import LiveEstimate, LiveRig
+from mapserver.survey.live.tracking import LiveTracking, Tracked
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyConfig
+
+Tell = Callable[[LiveSurveyState], None]
+See = Callable[[Tracked], None]
+
+_TELL_EVERY_S = 0.5
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """A survey to follow. options: of the build at its end."""
+
+    site: str
+    store: Path
+    settings: SurveySettings
+    options: BuildOptions = field(default_factory=BuildOptions)
+
+
+class LiveFigures(NamedTuple):
+    """How the survey kept up: frames and the seconds that they last; 0.5 and 0.99 of the frames were answered within latency_ms, None
+    where they were not played at their own speed; late_frames took longer than the time to the next one. most_behind: keyframes that
+    waited at once; lag_s: the longest time from a keyframe to the map that shows it. dropped: frames that came too quickly to be taken.
+    """
+
+    frames: int
+    seconds: float
+    keyframes: int
+    latency_ms: tuple[float, float] | None
+    late_frames: int
+    most_behind: int
+    lag_s: float
+    dropped: int
+    loops: int
+    parts: int
+    mapping_failed: str
+
+    def words(self) -> str:
+        """A sentence."""
+        failed = self.mapping_failed
+        kept = "played as fast as it went"
+        if self.latency_ms is not None:
+            kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
+        made = f"{self.loops} loops" + (f" in {self.parts} parts that nothing has joined" if self.parts > 1 else "")
+        return (
+            f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
+            f"most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
+        )
+
+
+class LiveResult(NamedTuple):
+    """What the survey saw while it drove, and the draft that was made of it."""
+
+    figures: LiveFigures
+    built: BuiltMap
+
+
+def run_live(
+    request: LiveRequest,
+    drive: Drive,
+    tell: Tell,
+    is_stopped: Callable[[], bool],
+    console: Console,
+    see: See | None = None,
+) -> LiveResult:
+    """Follows a survey to its end, or until it is stopped, and builds the draft of what was seen.
+
+    tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, before the drive
+    where possible.
+    """
+    survey = _Survey(request, drive, tell, see)
+    try:
+        for remark in survey.check():
+            console.print(remark, markup=False)
+        survey.follow(is_stopped)
+        console.print(survey.figures().words(), markup=False)
+        path, options = drive.finish(survey.figures().frames, replace(request.options, settings=request.settings))
+        survey.say("adjusting")
+        built = build_map(path, request.store, request.site, options)
+    except FleetmapError as error:
+        survey.say("failed", words=str(error))
+        raise
+    survey.say("stored", version=built.version, words=built.sentence)
+    return LiveResult(survey.figures(), built)
+
+
+class _Survey:
+    """One survey while it drives, and what can be said of it."""
+
+    def __init__(self, request: LiveRequest, drive: Drive, tell: Tell, see: See | None) -> None:
+        self._request, self._drive, self._tell, self._see = request, drive, tell, see
+        self._stamps_ns: list[int] = []
+        self._most_behind = 0
+        self._latencies_s: list[float] = []
+        self._qualities: list[float] = []  # of each keyframe, the worst since the one before
+        self._worst = 1.0
+        self._sketch = NO_SKETCH
+        self._behind, self._failed, self._lag_s = 0, "", 0.0
+        # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
+        self._scale_known = drive.rectifier.camera.baseline_m > 0
+        rectifier, imu = drive.rectifier, drive.calibration.imu
+        self._rig = LiveRig(
+            rectifier.camera,
+            rectifier.body_from_cam,
+            imu,
+            rectifier.imu_minus_cam_s,
+            drive.has_depth,
+            scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
+        )
+
+    def check(self) -> list[str]:
+        """What is wanting before it begins, in words; FleetmapErrors for what could only be in vain."""
+        remarks, request = self._drive.check(), self._request
+        self._config = SurveyConfig(request.settings, default_vocabulary(), read_zones(request.options.zones))
+        if not self._rig.scale_known:
+            remarks.append(
+                "scale: unknown: one camera without an IMU shows no metres; the draft can be inspected, and published only if docks or "
+                "tags tell them. Record an IMU, a second camera or depths"
+            )
+        return remarks
+
+    def follow(self, is_stopped: Callable[[], bool]) -> None:
+        """Tracks all frames, each when it is due; `check` comes first."""
+        request, drive = self._request, self._drive
+        rectifier = drive.rectifier
+        warm_up = drive.warm_up()
+        scratch = LiveTracking(drive.calibration, rectifier, request.settings)
+        for frame in warm_up:
+            scratch.handle(frame, ImuSamples.empty(), ())
+        del scratch
+        # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
+        with _one_thread(), MappingProcess(self._config, self._rig, warm_up) as mapping:
+            self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
+            mapping.finish()
+            self._look(mapping)
+
+    def _track(self, tracking: LiveTracking, mapping: MappingProcess, is_stopped: Callable[[], bool]) -> None:
+        told_s = 0.0
+        with closing(self._drive.frames()) as frames:
+            for due in frames:
+                if is_stopped():
+                    break
+                if due is not None:
+                    self._take(due, tracking, mapping)
+                self._look(mapping)
+                if time.monotonic() - told_s >= _TELL_EVERY_S:
+                    told_s = time.monotonic()
+                    self.say("tracking")
+
+    def _take(self, due: DueFrame, tracking: LiveTracking, mapping: MappingProcess) -> None:
+        tracked = tracking.handle(due.frame, due.imu, due.wheel)
+        if due.due_s is not None:
+            self._latencies_s.append(time.monotonic() - due.due_s)
+        if self._see is not None:
+            self._see(tracked)
+        self._stamps_ns.append(due.frame.stamp_ns)
+        self._worst = min(self._worst, tracked.quality)
+        if tracked.keyframe is not None:
+            mapping.put(due.frame, tracked.keyframe)
+            self._qualities.append(self._worst)
+            self._worst = 1.0
+
+    def _look(self, mapping: MappingProcess) -> None:
+        self._sketch, self._behind, self._failed = mapping.sketch, mapping.behind, mapping.failed
+        self._most_behind, self._lag_s = max(self._most_behind, self._behind), mapping.longest_lag_s
+
+    def figures(self) -> LiveFigures:
+        """How the survey has kept up until now."""
+        latency = None
+        if self._latencies_s:
+            median, high = np.percentile(self._latencies_s, [50, 99]) * 1e3
+            latency = round(float(median), 2), round(float(high), 2)
+        return LiveFigures(
+            frames=len(self._stamps_ns),
+            seconds=self._seconds(),
+            keyframes=len(self._qualities),
+            latency_ms=latency,
+            late_frames=self._late(),
+            most_behind=self._most_behind,
+            lag_s=round(self._lag_s, 3),
+            dropped=self._drive.dropped,
+            loops=self._sketch.loops,
+            parts=len(self._sketch.parts),
+            mapping_failed=self._failed,
+        )
+
+    def _seconds(self) -> float:
+        return (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0
+
+    def _late(self) -> int:
+        """Frames that were answered later than the time from one to the next, as they came."""
+        if len(self._latencies_s) < 2:
+            return 0
+        latencies_s, stamps_ns = np.array(self._latencies_s), np.array(self._stamps_ns)
+        return int(np.sum(latencies_s > float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed))
+
+    def say(self, phase: str, *, version: int | None = None, words: str = "") -> None:
+        """Tells the state."""
+        figures, sketch = self.figures(), self._sketch
+        qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
+        self._tell(
+            LiveSurveyState(
+                site=self._request.site,
+                recording=self._drive.name[:200],
+                stamp_ns=self._stamps_ns[-1] if self._stamps_ns else 0,
+                phase=phase,
+                seconds=round(figures.seconds, 3),
+                frames=figures.frames,
+                keyframes=figures.keyframes,
+                behind=self._behind,
+                latency_ms=None if figures.latency_ms is None else figures.latency_ms[1],
+                late_frames=figures.late_frames,
+                path_m=sketch.path_m.astype("<f4").tobytes(),
+                quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
+                part=sketch.part.tobytes(),
+                parts=sketch.parts,
+                landmarks_m=sketch.landmarks_m.astype("<f4").tobytes(),
+                loops_m=sketch.loops_m.astype("<f4").tobytes(),
+                loops=sketch.loops,
+                refused=sketch.refused,
+                revisits=list(sketch.revisits),
+                cells=sketch.cells.astype("<f4").tobytes(),
+                missing=sketch.missing,
+                estimate=self._estimate(sketch.estimate),
+                scale_known=self._scale_known,
+                version=version,
+                words=(words or self._failed)[:2000],
+            )
+        )
+
+    def _estimate(self, found: LiveEstimate | None) -> EstimateMessage | None:
+        """As robots say it: of the base, with the odometry's continuous frame in the place of `odom`."""
+        if found is None:
+            return None
+        base_from_body = self._drive.calibration.base_from_body
+        body_from_base = se3_inverse(base_from_body)
+        odom_from_body, placed, cov = found.keyframe.frame_from_body, found.map_from_body, found.cov_rot_trans
+        if placed is not None and cov is not None:
+            lever = np.eye(6)
+            lever[3:, :3] = -skew(placed[:3, :3] @ body_from_base[:3, 3])
+            cov = lever @ cov @ lever.T
+        return EstimateMessage(
+            stamp_ns=self._stamps_ns[found.keyframe.number],
+            status=found.status.value,
+            cause=found.cause.value,
+            map_version=None,
+            odom_from_base=Placement.of(odom_from_body @ body_from_base),
+            map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
+            cov_rot_trans=None if cov is None else tuple(cov.ravel().tolist()),
+        )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        cv2.setNumThreads(before)

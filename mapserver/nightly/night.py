@@ -1,0 +1,313 @@
+"""One night of one site, from the inbox to a current version; the next one continues where this one was interrupted.
+
+The state of the work is read from the store: a version says which recordings it was made of and which job saved it. So nothing is
+built twice and nothing is lost, wherever a night is killed: before its draft is whole there is none; a whole draft is taken to the
+gate by the next night; recordings that a version holds are only put away.
+"""
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
+from fleetmap.log_lines import printable
+from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, Topics
+from mapserver import releases
+from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
+from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, only_one
+from mapserver.library import settings_for
+from mapserver.nightly import inbox as boxes
+from mapserver.nightly.inbox import Recorded
+from mapserver.quality.gate import GateSettings
+from mapserver.store import Actor, MapStore, VersionInfo
+
+JOB = "nightly"
+_MOST_A_NIGHT = 1000  # recordings, and lines about what is left where it is
+_MOST_ENDED = 2
+_ENDED = (
+    "{nights} nights ended while this was read or built: killed, out of memory or out of time, or by a fault of the program; "
+    "try `mapserver doctor` on it, and move it back, alone, to try again"
+)
+_SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config")
+
+
+@dataclass(frozen=True, slots=True)
+class NightRequest:
+    """What `mapserver nightly` was asked for. now_ns: the moment by which recordings have been quiet for `settle_s`, or not."""
+
+    site: str
+    inbox: Path
+    store: Path
+    now_ns: int
+    settle_s: float = 300.0
+    frames: str = "::"
+    calibration: Path | None = None
+    topics: Topics = field(default_factory=Topics)
+    zones: Path | None = None
+    threads: int | None = None
+    scheduler: str | None = None
+    config: Path | None = None
+
+
+@dataclass
+class NightReport:
+    """The report of a night, with the keys that docs/reports.md explains. version: what is current in the end.
+
+    looking_at: names of the recordings that are read or built now. ended: by name, how many nights ended while they looked at it.
+    """
+
+    job: int
+    resumes: list[int] = field(default_factory=list)
+    version: int | None = None
+    published: list[int] = field(default_factory=list)
+    recordings: list[dict[str, Any]] = field(default_factory=list)
+    waiting: list[dict[str, str]] = field(default_factory=list)
+    builds: list[dict[str, Any]] = field(default_factory=list)
+    looking_at: list[str] = field(default_factory=list)
+    ended: dict[str, int] = field(default_factory=dict)
+
+
+def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
+    """Runs the night and returns the sentence that says how it ended.
+
+    Raises BusyError where another night of the site runs, GateRefusedError for a refused draft, and other FleetmapErrors; the job
+    in the store says the same. The current version is the last good one in any case.
+    """
+    site = request.site
+    with MapStore.open(request.store, create=True) as maps, only_one(request.store, site):
+        report = NightReport(maps.begin_job(site, JOB))
+        _resume_killed(maps, site, report)
+        end_interrupted(maps, time.time_ns())
+        try:
+            with held(request.store, report.job):
+                sentence = _Night(request, gate, console, maps, report).run()
+        except KeyboardInterrupt:  # somebody ended it, not what it looked at
+            maps.tell_progress(report.job, [], "looking_at")
+            raise
+        except FleetmapError as error:
+            report.looking_at = []
+            with suppress(StoreError):  # a full disk: the next night finds this one's job running, and ends it
+                report.version = _current(maps, site)
+                kept = "" if report.version is None else f"; version {report.version} stays current"
+                maps.update_job(report.job, "failed", f"{error}{kept}", asdict(report))
+            raise
+        report.version = _current(maps, site)
+        maps.update_job(report.job, "done", sentence, asdict(report))
+        return sentence
+
+
+def last_report(store: Path, site: str) -> dict[str, Any] | None:
+    """What the last night of a site reports, its state and message with it; None where there was none."""
+    with MapStore.open(store) as maps:
+        last = next((job for job in maps.jobs(site) if job.kind == JOB), None)
+    return None if last is None else {"state": last.state, "message": last.message, **last.report}
+
+
+def _has_site(maps: MapStore, site: str) -> bool:
+    return any(info.site == site for info in maps.sites())
+
+
+def _like(names: Sequence[object]) -> str:
+    return f", like {len(names) - 1} more" if len(names) > 1 else ""
+
+
+def _current(maps: MapStore, site: str) -> int | None:
+    info = maps.current(site) if _has_site(maps, site) else None
+    return None if info is None else info.version
+
+
+def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
+    """Ends the jobs of nights that were killed: the lock says that none of them runs. Counts what they looked at."""
+    nights = [job for job in maps.jobs(site) if job.kind == JOB and job.id != report.job]
+    killed = [job for job in nights if job.state == "running" or INTERRUPTED in job.report]
+    report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
+    for job in killed:
+        for name in job.report.get("looking_at", []):
+            report.ended[name] = report.ended.get(name, 0) + 1
+        report.resumes += [job.id, *job.report.get("resumes", [])]
+    maps.update_job(report.job, "running", "", asdict(report))
+    for job in killed:
+        left = {key: value for key, value in job.report.items() if key != INTERRUPTED}
+        maps.update_job(job.id, "failed", f"was interrupted; job {report.job} goes on with it", left)
+
+
+@dataclass(frozen=True, slots=True)
+class _Night:
+    """The steps of a night."""
+
+    _request: NightRequest
+    _gate: GateSettings
+    _console: Console
+    _maps: MapStore
+    _report: NightReport
+
+    def run(self) -> str:
+        here = boxes.arrivals(self._request.inbox, self._request.settle_s, self._request.now_ns)
+        for path, reason in here.bad[:_MOST_A_NIGHT]:
+            self._put_away(path, boxes.BAD, None, reason)
+        recordings = self._identified(here.complete[:_MOST_A_NIGHT])
+        for path, reason in here.waiting:
+            self._wait(path.name, f"not yet: {reason}")
+        left = [*here.complete[_MOST_A_NIGHT:], *(path for path, _ in here.bad[_MOST_A_NIGHT:])]
+        if left:
+            self._wait(left[0].name, f"not yet{_like(left)}: a night takes {_MOST_A_NIGHT} recordings")
+        if here.others:
+            known = ", ".join(FILE_SUFFIXES)
+            words = f"no recording{_like(here.others)}; a recording is a folder, or a file that ends in {known}"
+            self._wait(here.others[0], words)
+        draft = self._left_draft()
+        if draft is not None:
+            recordings = self._publish(draft, recordings)
+        fresh = self._unknown(recordings)
+        if fresh:
+            self._build(fresh)
+        if not self._report.published:
+            return f"site {self._request.site}: nothing new"
+        versions = ", ".join(str(version) for version in self._report.published)
+        return f"site {self._request.site}: version {versions} published, {self._counts()}"
+
+    def _identified(self, paths: tuple[Path, ...]) -> list[Recorded]:
+        """Those that can be read, each once."""
+        found: dict[str, Recorded] = {}
+        for path in paths:
+            name = path.name
+            self._say(f"reading {name}")
+            if not boxes.is_safe_name(name):
+                self._put_away(path, boxes.BAD, None, f"its name {name} is no usable one; name it anew")
+                continue
+            if self._report.ended.get(name, 0) >= _MOST_ENDED:
+                self._put_away(path, boxes.BAD, None, _ENDED.format(nights=self._report.ended[name]))
+                continue
+            self._look_at([path])
+            recorded = boxes.identify(path, OpenOptions(self._request.calibration, self._request.topics))
+            if recorded is None:
+                self._wait(name, "not yet: it changed while it was read")
+            elif isinstance(recorded, str):
+                self._put_away(path, boxes.BAD, None, recorded)
+            elif recorded.sha256 in found:
+                same = found[recorded.sha256].path.name
+                self._put_away(path, boxes.DONE, recorded.sha256, f"the same as {same}")
+            else:
+                found[recorded.sha256] = recorded
+        self._look_at([])
+        return list(found.values())
+
+    def _left_draft(self) -> VersionInfo | None:
+        """The draft that a killed night saved and that is still based on the current version."""
+        site = self._request.site
+        if not _has_site(self._maps, site):
+            return None
+        parent, resumed = _current(self._maps, site), set(self._report.resumes)
+        drafts = [info for info in self._maps.versions(site) if info.state == "draft" and info.job in resumed]
+        return next((info for info in reversed(drafts) if info.parent == parent), None)
+
+    def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
+        """Those that no version was made of; the others are put away."""
+        site = self._request.site
+        known: dict[str, int] = {}
+        if _has_site(self._maps, site):
+            for info in self._maps.versions(site):
+                if info.state != "draft":
+                    entries = self._maps.manifest(site, info.version).recordings
+                    known |= {entry.sha256: info.version for entry in entries}
+        for recorded in recordings:
+            if recorded.sha256 in known:
+                self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {known[recorded.sha256]}")
+        return [recorded for recorded in recordings if recorded.sha256 not in known]
+
+    def _build(self, recordings: list[Recorded]) -> None:
+        request = self._request
+        by_hash = {recorded.sha256: recorded for recorded in recordings}
+        unusable: dict[Path, str] = {}
+        options = BuildOptions(
+            replay=tuple(self._replayed()),
+            actor=self._actor(),
+            job=self._report.job,
+            look_at=self._look_at,
+            **{name: getattr(request, name) for name in _SHARED_WITH_BUILDS},
+        )
+        paths = tuple(recorded.path for recorded in recordings)
+        build = BuildRequest(paths, request.site, request.store, options)
+        try:
+            draft, _ = build_draft(build, settings_for(build), unusable)
+        except (RecordingError, SurveyError) as error:
+            self._put_all_away(recordings, unusable, str(error))
+            raise
+        self._look_at([])
+        self._report.builds.append({"version": draft.version, **draft.report})
+        self._say(draft.sentence)
+        for sha256, reason in draft.left_out.items():
+            recorded = by_hash.pop(sha256)
+            self._put_away(recorded.path, boxes.HELD, sha256, recorded.why(reason))
+        for recorded in [r for r in by_hash.values() if r.path in unusable]:
+            self._put_away(recorded.path, boxes.BAD, recorded.sha256, recorded.why(unusable[recorded.path]))
+        rest = [recorded for recorded in by_hash.values() if recorded.path not in unusable]
+        self._publish(self._maps.version(request.site, draft.version), rest)
+
+    def _put_all_away(self, recordings: list[Recorded], unusable: dict[Path, str], reason: str) -> None:
+        for recorded in recordings:
+            where = boxes.BAD if recorded.path in unusable else boxes.HELD
+            self._put_away(recorded.path, where, recorded.sha256, recorded.why(unusable.get(recorded.path, reason)))
+
+    def _replayed(self) -> list[Path]:
+        """Recordings of the current version that the inbox still has."""
+        current = _current(self._maps, self._request.site)
+        if current is None:
+            return []
+        entries = self._maps.manifest(self._request.site, current).recordings
+        return boxes.kept(self._request.inbox, [entry.sha256 for entry in entries])
+
+    def _publish(self, draft: VersionInfo, recordings: list[Recorded]) -> list[Recorded]:
+        """Takes a draft through the gate and puts away what it was made of; the others are returned."""
+        site, version = self._request.site, draft.version
+        taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
+        own = [recorded for recorded in recordings if recorded.sha256 in taken]
+        try:
+            releases.publish(self._maps, site, version, actor=self._actor(), gate=self._gate)
+        except GateRefusedError as error:
+            for recorded in own:
+                self._put_away(recorded.path, boxes.HELD, recorded.sha256, str(error))
+            raise
+        self._report.published.append(version)
+        self._say(f"site {site}: version {version} is current")
+        for recorded in own:
+            self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {version}")
+        return [recorded for recorded in recordings if recorded.sha256 not in taken]
+
+    def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
+        reason = " ".join(reason.split())  # a refusal has several lines
+        self._say(f"{where}: {path.name}: {reason}")
+        try:
+            boxes.put_away(path, where, sha256, None if where == boxes.DONE else reason)
+        except StoreError as error:
+            self._wait(path.name, f"{error}; {where}: {reason}")
+            return
+        self._report.ended.pop(path.name, None)  # another try, or another recording of this name, begins anew
+        told = {"name": printable(path.name), "reason": printable(reason)}
+        self._report.recordings.append({**told, "sha256": sha256, "fate": where})
+
+    def _wait(self, name: str, reason: str) -> None:
+        """Says why something is left where it is."""
+        self._say(f"{name}: {reason}")
+        if len(self._report.waiting) < _MOST_A_NIGHT:
+            self._report.waiting.append({"name": printable(name), "reason": printable(reason)})
+
+    def _look_at(self, paths: Sequence[Path]) -> None:
+        """Notes what the night looks at, so that the next ones know what ended it."""
+        self._report.looking_at = [path.name for path in paths]
+        self._maps.tell_progress(self._report.job, self._report.looking_at, "looking_at")
+
+    def _counts(self) -> str:
+        fates = [recording["fate"] for recording in self._report.recordings]
+        return ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
+
+    def _say(self, words: str) -> None:
+        self._console.print(printable(words), markup=False, highlight=False)
+
+    def _actor(self) -> Actor:
+        return Actor(JOB, f"nightly job {self._report.job}")

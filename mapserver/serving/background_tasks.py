@@ -1,0 +1,103 @@
+"""Periodic work of the server: announce versions, write counters to the disk, decide canaries."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fleetmap.errors import FleetmapError
+from fleetmap.log_lines import LogLimit
+from mapserver.config import MapserverConfig
+from mapserver.drafting.job_lock import end_interrupted
+from mapserver.fleet.alerts import AlertSettings, active_alerts
+from mapserver.fleet.canary_controller import review
+from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_access import BusGuard
+from mapserver.serving.bus_service import BusService
+from mapserver.serving.webhook import AlertWatch, Webhook
+from mapserver.store import MapStore
+from mapserver.trust import update_lists
+
+_ANNOUNCE_EVERY_S = 1.0
+_LOOK_EVERY_S = 0.2
+_JOBS_EVERY_S = 20.0
+_ADMIT_EVERY_S = 1.0  # what changes meanwhile goes together
+_CONNECTED_EVERY_S = 5.0
+_ALERTS_EVERY_S = 10.0
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class BackgroundTask:
+    """A function that is called every `every_s` seconds."""
+
+    name: str
+    every_s: float
+    act: Callable[[], object]
+    due_s: float = 0.0
+
+
+def server_tasks(
+    store: MapStore, fleet: Fleet, bus_service: BusService, settings: MapserverConfig
+) -> list[BackgroundTask]:
+    """All background tasks of a server."""
+    ingest = settings.ingest
+    return [
+        # Before the announcement: robots take only what the lists admit.
+        BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
+        BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
+        BackgroundTask("keeping reports", ingest.flush_every_s, fleet.flush),
+        BackgroundTask("looking for robots", ingest.presence_every_s, bus_service.look_for_robots),
+        BackgroundTask("removing old reports", ingest.prune_every_s, fleet.prune),
+        BackgroundTask(
+            "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
+        ),
+        BackgroundTask(
+            "looking at canaries", settings.canary.check_every_s, lambda: review(store, settings.canary, time.time_ns())
+        ),
+    ]
+
+
+def alert_tasks(
+    store: MapStore, fleet: Fleet, settings: AlertSettings, webhook: Webhook | None
+) -> list[BackgroundTask]:
+    """Looks for what the webhook should be told; nothing without one."""
+    if webhook is None:
+        return []
+    watch = AlertWatch(lambda: active_alerts(store, fleet, settings, time.time_ns()), webhook.put, time.time_ns)
+    return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, watch.look)]
+
+
+def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:
+    """Those of the bus's door. Apart from the others, because a robot that was stolen must not wait for them."""
+    if guard is None:
+        return []
+
+    def look() -> None:
+        guard.look()
+        fleet.take_copied(guard.copied)
+
+    return [
+        BackgroundTask("admitting robots", _ADMIT_EVERY_S, guard.follow),
+        BackgroundTask("looking at who is connected", _CONNECTED_EVERY_S, look),
+    ]
+
+
+async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
+    """Runs them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
+    refusals = LogLimit(_log)  # a fault that stays would fill the log, once a second
+    while True:
+        for task in tasks:
+            if time.monotonic() < task.due_s:
+                continue
+            try:
+                await asyncio.to_thread(task.act)
+            except FleetmapError as error:
+                # A store that is busy for a moment must not stop the server; robots also ask by themselves.
+                refusals.warning(task.name, "%s failed: %s", task.name, error)
+            except Exception:
+                # A fault in one task must not end the others.
+                _log.exception("%s failed", task.name)
+            task.due_s = time.monotonic() + task.every_s
+        await asyncio.sleep(_LOOK_EVERY_S)

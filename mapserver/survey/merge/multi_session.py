@@ -1,0 +1,147 @@
+"""Several surveys, and the map of a site that has one, become one map. Surveys that cannot be joined are left out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.geometry import Array
+from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.finish.map_transform import transform_map
+from mapserver.survey.merge.membership import JoinEvidence, JoinVerdict, NotJoined
+from mapserver.survey.merge.pipeline import Counts, Extension, extend
+from mapserver.survey.pipeline import Survey
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_map import SurveyMap
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One recording's survey. map_from_survey: where position priors put it, None without any."""
+
+    survey: Survey
+    map_from_survey: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of session `number`: in the map or left out, why, by what evidence; counts where it was joined to something."""
+
+    number: int
+    verdict: JoinVerdict
+    reason: str
+    counts: Counts | None = None
+    evidence: JoinEvidence | None = None
+
+    @property
+    def joined(self) -> bool:
+        """Whether it is in the map."""
+        return self.verdict is JoinVerdict.JOINED
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """The map of all sessions that could be joined, what became of each in their order, and the trajectories of the joined ones.
+
+    estimated: for each trajectory, which of its frames were measured.
+    """
+
+    map: SurveyMap
+    outcomes: tuple[Outcome, ...]
+    trajectories: tuple[Trajectory, ...]
+    estimated: tuple[Mask, ...]
+
+
+class Joining:
+    """One map of `base` (the published one, None on a new site) and all sessions that find their place in it.
+
+    On a new site the first session with position priors begins, the first of all where none has any. Sessions with priors are joined
+    in their order as soon as they are added, which needs none that come later; those without, and what could not be joined at
+    once, are tried when all others are there. The map depends on the order of the sessions, not on when each is added.
+    """
+
+    def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
+        self._settings, self._anchored, self._current = settings, base is not None, base
+        self._sessions: list[Session] = []
+        self._waiting: list[int] = []
+        self._outcomes: dict[int, Outcome] = {}
+        self._found: dict[int, tuple[Trajectory, Mask]] = {}
+        self._has_grown = False
+
+    def add(self, session: Session) -> None:
+        """The next session."""
+        self._sessions.append(session)
+        self._waiting.append(len(self._sessions) - 1)
+        if session.map_from_survey is not None:
+            self._try(self._waiting[-1])
+
+    def finish(self) -> Joined:
+        """The map, and what became of every session."""
+        self._waiting.sort(key=lambda n: self._sessions[n].map_from_survey is None)
+        for number in [n for n in self._waiting if self._sessions[n].map_from_survey is None]:
+            self._try(number)
+        while self._waiting and self._has_grown:
+            self._has_grown = False
+            for number in list(self._waiting):
+                self._try(number)
+        if self._current is None:
+            raise ValueError("no session to begin a map with")
+        order = sorted(self._found)
+        trajectories, estimated = tuple(self._found[n][0] for n in order), tuple(self._found[n][1] for n in order)
+        joined_map = with_trajectories(self._current, trajectories, estimated) if order else self._current
+        outcomes = tuple(self._outcomes[n] for n in sorted(self._outcomes))
+        return Joined(joined_map, outcomes, trajectories, estimated)
+
+    def _try(self, number: int) -> None:
+        session = self._sessions[number]
+        if self._current is None:
+            self._current = _begun(session)
+            outcome = Outcome(number, JoinVerdict.JOINED, "begins the map")
+        else:
+            place, anchored = session.map_from_survey, self._anchored
+            result = extend(self._current, session.survey, self._settings, anchored=anchored, map_from_survey=place)
+            if isinstance(result, NotJoined):
+                self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
+                return
+            self._current, self._has_grown = result.map, True
+            outcome = Outcome(number, JoinVerdict.JOINED, _words(result), result.counts, result.evidence)
+        self._outcomes[number] = outcome
+        self._found[number] = (self._current.trajectory, self._current.trajectory_estimated)
+        self._waiting.remove(number)
+
+
+def _words(result: Extension) -> str:
+    found = result.evidence
+    return f"found in the map: {found.fixes} fixes at {found.places} places, {found.cells_seen} of {found.cells_expected} parts of it seen"
+
+
+def _begun(session: Session) -> SurveyMap:
+    survey_map = session.survey.map
+    return survey_map if session.map_from_survey is None else transform_map(survey_map, session.map_from_survey)
+
+
+def with_trajectories(
+    survey_map: SurveyMap, trajectories: Sequence[Trajectory], estimated: Sequence[Mask]
+) -> SurveyMap:
+    """The map with the frames of all sessions, one after the other."""
+    return replace(
+        survey_map, trajectory=chained(trajectories, trajectories), trajectory_estimated=np.concatenate(estimated)
+    )
+
+
+def chained(trajectories: Sequence[Trajectory], clocks: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory of several: stamps stay where they follow each other, else a later one's are moved behind those before.
+
+    clocks: by how much is decided on these, so that an estimate and its truth are moved alike.
+    """
+    stamps, places, end_ns = [], [], -(2**62)
+    for trajectory, clock in zip(trajectories, clocks, strict=True):
+        behind = end_ns + 1_000_000_000 - int(clock.stamps_ns[0])
+        shift_ns = max(behind, 0) if end_ns > -(2**62) else 0
+        stamps.append(trajectory.stamps_ns + shift_ns)
+        places.append(trajectory.frame_from_body)
+        end_ns = int(clock.stamps_ns[-1]) + shift_ns
+    return Trajectory(np.concatenate(stamps), np.concatenate(places))

@@ -1,0 +1,93 @@
+"""What a build makes of a recording's calibration before it surveys."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import RecordingError
+from fleetmap.recordings import Recording, open_recording
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
+from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.doctor import Finding, Verdict
+from mapserver.doctor.calibration import MeasuredCalibration, findings_of
+from mapserver.doctor.findings import not_judged
+from mapserver.doctor.run_checks import CheckResults
+from mapserver.drafting import admission
+from support.recordings.recording_samples import make_sample, write_euroc
+
+P = CalibrationParameter
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return open_recording(write_euroc(tmp_path_factory.mktemp("admission") / "r", make_sample(3)))
+
+
+def measured(parameter: P, value: float) -> MeasuredCalibration:
+    """Everything known to a hundredth of its useful sigma, one parameter off."""
+    sigmas = np.array([0.01 * RANGES[p].useful_sigma for p in COLUMNS])
+    parameters = tuple(
+        ParameterEstimate(p, value if p is parameter else 0.0, float(s), RANGES[p].unit, True)
+        for p, s in zip(COLUMNS, sigmas, strict=True)
+    )
+    found = CalibrationEstimate(parameters, np.diag(sigmas**2), 40, 4000)
+    return MeasuredCalibration(findings_of(found, 200.0), found)
+
+
+def checked(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, first: MeasuredCalibration, again: MeasuredCalibration
+) -> admission.CheckedRecording:
+    """With a doctor who measures `first`, and `again` after a correction."""
+    monkeypatch.setattr(admission, "run_checks", lambda *_, **__: CheckResults(list(first.findings), None, first))
+    monkeypatch.setattr(admission, "measure_calibration", lambda *_: again)
+    return admission.checked(recording)
+
+
+def test_a_baseline_of_another_rig_is_refused(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    off = measured(P.BASELINE, -0.0476)
+    with pytest.raises(RecordingError, match=r"baseline: -4.76 % from the calibration.*a map of it would be wrong"):
+        checked(recording, monkeypatch, off, off)
+
+
+def test_a_small_error_is_corrected_and_said(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = checked(recording, monkeypatch, measured(P.FOCAL, -0.0196), measured(P.FOCAL, 0.0))
+    given = recording.calibration.cameras[0].intrinsics_px[0]
+    assert found.rig.cameras[0].intrinsics_px[0] == pytest.approx(0.9804 * given)
+    assert found.corrections == {"focal length": -0.0196}
+    assert "corrected: focal length by -1.96 %, as measured" in found.remarks()[-1]
+    assert found.calibration.doubted == {}
+    assert "metric scale" in found.calibration.judged
+
+
+def test_a_correction_that_the_second_look_denies_is_for_a_person(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = checked(recording, monkeypatch, measured(P.PAIR_YAW, 0.003), measured(P.PAIR_YAW, 0.002))
+    assert "after its correction" in found.calibration.doubted["pair geometry"]
+
+
+def test_checks_that_lack_the_same_are_one_remark(recording: Recording) -> None:
+    short, turns = "too short: 5 keyframes, 20 are needed", "drive turns"
+    chance = Finding("pair roll", Verdict.NOT_JUDGED, 0.002, "", f"not judged: +0.115 degrees; {short}", short)
+    unknown = [not_judged(name, "known to 9 % only", short) for name in ("baseline", "focal length")]
+    findings = [unknown[0], not_judged("pair yaw", "known to 1 degrees only", turns), unknown[1], chance]
+    findings += [Finding("gyro axes", Verdict.OK, 0.0, "", ""), Finding("sharpness", Verdict.WARN, 0.3, "", "blurred")]
+    found = admission.CheckedRecording(recording.calibration, findings, admission.rig_evidence("a", []), {})
+    assert found.remarks() == [
+        f"not judged: baseline, focal length: {short}",
+        f"pair yaw: not judged: known to 1 degrees only; {turns}",
+        f"pair roll: not judged: +0.115 degrees; {short}",  # one that was measured keeps its figure
+        "sharpness: blurred",
+    ]
+    assert len(found.statements()) == 5  # a report has each
+
+
+def test_a_good_calibration_is_left_alone(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = measured(P.BASELINE, 0.001)
+    found = checked(recording, monkeypatch, good, good)
+    assert found.rig is recording.calibration
+    assert (found.corrections, found.remarks(), found.calibration.doubted) == ({}, [], {})
+    assert found.statements() == []
+    other = replace(recording.calibration, base_from_body=2 * np.eye(4))
+    assert found.calibration.rig == admission.fingerprint(recording.calibration) != admission.fingerprint(other)

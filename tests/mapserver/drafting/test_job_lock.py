@@ -1,0 +1,102 @@
+"""A job whose process was killed does not stand as running for ever, and one that runs is left alone."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from fleetmap.errors import StoreError
+from mapserver.drafting.job_lock import INTERRUPTED, JobProgress, end_interrupted, recorded_job
+from mapserver.store import MapStore
+from support.storage.map_samples import save_sample_draft
+
+MINUTES_NS = 600 * 10**9
+
+
+def begun_elsewhere(folder: Path) -> int:
+    """Another process that has noted a job and works on it."""
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with MapStore.open(folder) as maps, recorded_job(maps, "lab", "build"):
+            os.write(tell, b"x")
+            signal.pause()
+        os._exit(0)
+    os.read(told, 1)
+    return child
+
+
+def test_a_killed_job_is_ended_and_a_running_one_is_not(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as maps:
+        save_sample_draft(maps)
+    child = begun_elsewhere(tmp_path)
+    later_ns = time.time_ns() + MINUTES_NS
+    with MapStore.open(tmp_path) as maps:
+        assert end_interrupted(maps, later_ns) == []
+        assert [job.state for job in maps.jobs()] == ["running"]
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert end_interrupted(maps, time.time_ns()) == []  # it may not hold its lock yet
+        assert end_interrupted(maps, later_ns) == [1]
+        (job,) = maps.jobs()
+        assert (job.state, job.report) == ("failed", {INTERRUPTED: True})
+        assert "was interrupted" in job.message
+        assert job.finished is not None
+        assert end_interrupted(maps, later_ns) == []
+    assert list(tmp_path.glob("job-*.lock")) == []
+
+
+def test_the_next_job_ends_it_too(tmp_path: Path) -> None:
+    """Without a server, which looks every few seconds."""
+    with MapStore.open(tmp_path, create=True, clock_ns=lambda: time.time_ns() - MINUTES_NS) as maps:
+        save_sample_draft(maps)
+        maps.begin_job("lab", "build")
+    with MapStore.open(tmp_path) as maps:
+        with recorded_job(maps, "lab", "build"):
+            assert [job.state for job in maps.jobs()] == ["running", "failed"]
+        assert [job.state for job in maps.jobs()] == ["done", "failed"]
+    assert list(tmp_path.glob("job-*.lock")) == []
+
+
+def test_a_job_tells_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
+    """At most every two seconds, each stage at once; also for a site without a version."""
+    now_s = [100.0]
+    with MapStore.open(tmp_path, create=True) as maps:
+        with recorded_job(maps, "new", "build") as job:
+            tell = JobProgress(maps, job.number, lambda: now_s[0])
+            told = []
+            for step_s, stage, done in (
+                (0, "odometry", 1),
+                (1, "odometry", 5),
+                (1.5, "odometry", 8),
+                (0.1, "matching", 0),
+            ):
+                now_s[0] += step_s
+                tell(stage, done, 10)
+                told.append(maps.job(1).report["progress"])
+            assert [(one["stage"], one["done"], one["stage_s"]) for one in told] == [
+                ("odometry", 1, 0.0),
+                ("odometry", 1, 0.0),
+                ("odometry", 8, 2.5),
+                ("matching", 0, 0.0),
+            ]
+            assert maps.sites_with_jobs() == ["new"]
+            job.report = {"version": 1}
+        assert maps.job(1).report == {"version": 1}
+        maps.tell_progress(1, {"stage": "late"})
+        assert maps.job(1).report == {"version": 1}
+        JobProgress(maps, None)("odometry", 1, 2)  # a build that no job stands for
+
+
+def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def busy(*_: object) -> None:
+        raise StoreError("the store is busy")
+
+    with MapStore.open(tmp_path, create=True) as maps, recorded_job(maps, "new", "build") as job:
+        monkeypatch.setattr(maps, "tell_progress", busy)
+        JobProgress(maps, job.number)("odometry", 1, 2)
+        job.report = {"version": 1}
+    with MapStore.open(tmp_path) as maps:
+        assert (maps.job(1).state, maps.job(1).report) == ("done", {"version": 1})

@@ -1,0 +1,194 @@
+"""DROID's inverse depths make a single camera's recording one with depth; files that are not of its poses are refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import FleetmapError, RecordingError, UsageError
+from fleetmap.geometry import quat_wxyz_from_rotation, se3, se3_inverse, so3_exp
+from fleetmap.sensors.calibration import CameraCalibration
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from mapserver import BuildOptions, build_map
+from mapserver.drafting.survey_recordings import RecordingOptions
+from mapserver.drafting.trajectory import OtherTrajectory
+from mapserver.drafting.trajectory.depths import DispImages, _DepthFrames
+from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_euroc
+from support.worlds.box_room import out_and_back, points_seen, ride_sample
+
+FRAMES, STEP, CELL_PX = 61, 2, 8
+METRES = 2.5  # in the run's unit of length
+RUN_FROM_MAP = se3(so3_exp(np.array([0.4, -0.3, 0.2])), np.array([3.0, 1.0, 0.5]))
+ROWS, COLUMNS = HEIGHT // CELL_PX, WIDTH // CELL_PX
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return ride_sample(out_and_back(6.0), FRAMES, 0.1)
+
+
+@pytest.fixture(scope="module")
+def recording(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("recordings") / "ride", sample)
+
+
+@pytest.fixture
+def run(sample: Sample, tmp_path: Path) -> Path:
+    """A run's folder: every second frame is a keyframe; depths at an eighth of the resolution, poses in a unit of its own."""
+    v, u = np.indices((ROWS, COLUMNS))
+    pixels = (np.column_stack([u.ravel(), v.ravel()]) + 0.5) * CELL_PX - 0.5
+    rows, inverse = [], []
+    for map_from_body in sample.world_from_body[::STEP]:
+        map_from_cam = map_from_body @ BODY_FROM_CAM0
+        points_cam = (points_seen(map_from_cam, pixels) - map_from_cam[:3, 3]) @ map_from_cam[:3, :3]
+        inverse.append((METRES / points_cam[:, 2]).reshape(ROWS, COLUMNS))
+        cam_from_run = se3_inverse(RUN_FROM_MAP @ map_from_cam)
+        w, x, y, z = quat_wxyz_from_rotation(cam_from_run[:3, :3])
+        rows.append([*cam_from_run[:3, 3] / METRES, x, y, z, w])
+    np.save(tmp_path / "poses.npy", np.array(rows, np.float32))
+    np.save(tmp_path / "tstamps.npy", np.arange(0, FRAMES, STEP, np.float64))
+    np.save(tmp_path / "disps.npy", np.array(inverse, np.float32))
+    return tmp_path
+
+
+def options(run: Path, scale: float | None = METRES, use: SensorSet = SensorSet.MONO) -> RecordingOptions:
+    return RecordingOptions(use=use, trajectory=OtherTrajectory(run, scale=scale))
+
+
+@pytest.mark.parametrize("use", [SensorSet.MONO, SensorSet.MONO_INERTIAL])
+@pytest.mark.parametrize("intrinsics", [False, True])
+def test_depths_are_those_of_the_recorded_pixels(
+    sample: Sample, recording: Path, run: Path, use: SensorSet, intrinsics: bool
+) -> None:
+    if intrinsics:
+        cells = [200 / CELL_PX, 200 / CELL_PX, WIDTH / CELL_PX / 2 - 0.5, HEIGHT / CELL_PX / 2 - 0.5]
+        np.save(run / "intrinsics.npy", np.tile(np.array(cells, np.float32), (len(range(0, FRAMES, STEP)), 1)))
+    with options(run, use=use).open(recording) as (opened, indices):
+        assert opened.sensor_set is SensorSet.RGBD
+        assert indices.tolist() == list(range(0, FRAMES, STEP))
+        assert "30 of 61 frames have none in disps.npy" in opened.issues[-1].detail
+        depth_m, without = opened.read_frame(20).depth_m, opened.read_frame(21).depth_m
+        part_m = opened.part(indices[10:12]).read_frame(0).depth_m
+        digest = opened.content_hash()
+    assert depth_m is not None
+    assert without is not None
+    assert not without.any()
+    np.testing.assert_array_equal(part_m, depth_m)
+    with RecordingOptions(use=use).open(recording) as (plain, _):
+        assert digest == plain.content_hash()
+    v, u = np.nonzero(depth_m)
+    assert len(v) > 0.85 * WIDTH * HEIGHT
+    map_from_cam = sample.world_from_body[20] @ BODY_FROM_CAM0
+    seen = (points_seen(map_from_cam, np.column_stack([u, v])) - map_from_cam[:3, 3]) @ map_from_cam[:3, :3]
+    off = np.abs(depth_m[v, u] / seen[:, 2] - 1)
+    assert np.percentile(off, 95) < 0.01
+    assert off.max() < 0.15  # at the room's edges
+
+
+def test_between_two_surfaces_no_depth_is_made_up(recording: Path, run: Path) -> None:
+    inverse = np.full((len(range(0, FRAMES, STEP)), ROWS, COLUMNS), 1.0, np.float32)
+    inverse[:, :, COLUMNS // 2 :] = 0.5
+    inverse[:, 3, 3] = 0.0
+    np.save(run / "disps.npy", inverse)
+    with options(run).open(recording) as (opened, _):
+        depth_m = opened.read_frame(0).depth_m
+    assert depth_m is not None
+    np.testing.assert_allclose(np.unique(depth_m), [0.0, METRES, 2 * METRES], rtol=1e-5)
+    assert not depth_m[28, 28]
+
+
+@pytest.mark.parametrize(("width", "height"), [(94, 60), (512, 320)])
+def test_a_lens_bends_the_recorded_pixels_alone(tmp_path: Path, width: int, height: int) -> None:
+    """A slanted plane, whose depths the run wrote for the picture without distortion."""
+    bent = np.array([-0.28, 0.07, 2e-4, 2e-5])
+    camera = CameraCalibration("radial-tangential", 752, 480, np.array([458.0, 457, 367, 248]), bent, np.eye(4))
+    normal, distance_m, per_px = np.array([0.1, 0.2, 1.0]), 4.0, np.array([width / 752, height / 480])
+    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    rays = ((places + 0.5) / per_px - 0.5 - camera.intrinsics_px[2:]) / camera.intrinsics_px[:2]
+    np.save(tmp_path / "disps.npy", ((rays @ normal[:2] + 1.0) * METRES / distance_m)[None].astype(np.float32))
+    picture = CameraFrame(0, np.zeros((480, 752), np.uint8))
+    source, images = (
+        SimpleNamespace(frame=lambda _: picture),
+        DispImages(tmp_path / "disps.npy", np.array([0]), camera, METRES),
+    )
+    depth_m = _DepthFrames(source, images, np.array([0]), camera).frame(0).depth_m
+    assert depth_m is not None
+    v, u = np.nonzero(depth_m)
+    assert len(v) > 0.65 * 480 * 752  # the corners lie outside of a picture without distortion
+    seen = camera.ray_from_pixel(np.column_stack([u, v]).astype(float))
+    np.testing.assert_allclose(depth_m[v, u], distance_m / (seen / seen[:, 2:] @ normal), rtol=1e-3)
+
+
+def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recording: Path, run: Path) -> None:
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
+    done = build_map(recording, run / "maps", "hall", chosen)
+    assert done.report["ate_rmse_m"] < 0.03
+    assert done.report["keyframes"] > 5
+    moved = np.ptp(done.trajectory.positions_m, axis=0).max()
+    assert moved == pytest.approx(np.ptp(np.array(sample.world_from_body)[:, :3, 3], axis=0).max(), rel=0.02)
+    said = [words for words in done.report["findings"]["ride"] if "disps.npy" in words]
+    assert said == ["depth of another system: 30 of 61 frames have none in disps.npy and are left out"]
+    assert any(
+        "poses of the camera" in words and f"scale {METRES}" in words for words in done.report["findings"]["ride"]
+    )
+
+
+def test_depths_of_another_unit_than_the_poses_are_refused(recording: Path, run: Path) -> None:
+    np.save(run / "disps.npy", np.load(run / "disps.npy") / 4)
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
+    with pytest.raises(RecordingError, match="another recording"):
+        build_map(recording, run / "maps", "hall", chosen)
+
+
+def test_without_depths_or_with_other_sensors_nothing_changes(recording: Path, run: Path) -> None:
+    with options(run, None, SensorSet.STEREO).open(recording) as (opened, indices):
+        assert opened.sensor_set is SensorSet.STEREO
+        assert len(indices) == FRAMES
+    (run / "disps.npy").unlink()
+    with options(run, None).open(recording) as (opened, indices):
+        assert opened.sensor_set is SensorSet.MONO
+        assert len(indices) == FRAMES
+
+
+def spoil(change: Callable[[np.ndarray], np.ndarray], name: str = "disps.npy") -> Callable[[Path], None]:
+    return lambda run: np.save(run / name, change(np.load(run / name)), allow_pickle=True)
+
+
+def put(value: float) -> Callable[[Path], None]:
+    return spoil(lambda array: np.where(np.arange(array.size).reshape(array.shape) == 5000, np.float32(value), array))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (spoil(lambda array: array.astype(object)), r"disps\.npy is no \.npy file of numbers"),
+        (spoil(lambda array: array[:-1]), "30 images for 31 poses"),
+        (spoil(lambda array: array[0]), r"of shape \(30, 40\)"),
+        (spoil(lambda array: array.astype(np.int32)), "type int32"),
+        (spoil(lambda array: np.swapaxes(array, 1, 2)), "images of 30x40, the camera 320x240"),
+        (put(np.nan), "image 5 has values"),
+        (put(-0.1), "image 5 has values"),
+        (put(np.inf), "image 5 has values"),
+        (lambda run: (run / "disps.npy").write_bytes((run / "disps.npy").read_bytes()[:-100]), "no .npy file"),
+        (spoil(lambda array: array + 7200.0, "tstamps.npy"), "another recording"),
+        (lambda run: np.save(run / "intrinsics.npy", np.ones(4)), r"intrinsics\.npy is of shape \(4,\)"),
+        (lambda run: np.save(run / "intrinsics.npy", np.ones((31, 4))), "has its centre at"),
+    ],
+)
+def test_files_that_are_no_depths_are_refused(
+    recording: Path, run: Path, change: Callable[[Path], None], said: str
+) -> None:
+    change(run)
+    with pytest.raises(RecordingError, match=said), options(run).open(recording):
+        pass
+
+
+def test_what_is_not_known_is_asked_for(recording: Path, run: Path) -> None:
+    with pytest.raises(UsageError, match="--trajectory-scale"), options(run, None).open(recording):
+        pass
+    for name in ("poses.npy", "tstamps.npy", "disps.npy"):
+        np.save(run / name, np.load(run / name)[:10])
+    with pytest.raises(FleetmapError, match="spans less than half"), options(run).open(recording):
+        pass
