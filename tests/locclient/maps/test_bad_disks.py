@@ -155,7 +155,7 @@ def test_a_spool_that_cannot_be_made_is_made_once_the_disk_lets_it(tmp_path: Pat
         Outbox(place / "spool.sqlite3", max_bytes=100)
     spool = Outbox(place / "spool.sqlite3", max_bytes=100, is_needed=False)
     assert "cannot be used" in spool.fault
-    with pytest.raises(StoreError, match=r"\[run\] spool"):
+    with pytest.raises(StoreError, match=r"\[run\] outbox"):
         spool.counts()
     place.unlink()
     spool.put(QueuedReport("a", b"a"))

@@ -43,6 +43,20 @@ def alone() -> tuple[bytes, ...]:
     return surveyed_by(SERIAL)
 
 
+def _blas_threads(*_: object) -> list[int]:
+    return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+
+def test_linear_algebra_has_no_threads_beside_those_of_a_survey() -> None:
+    """A program that uses the library may have loaded it with any number of threads, and gets them back."""
+    with threadpool_limits(3, user_api="blas"):
+        with open_executor(2, None) as executor:
+            there = next(iter(executor.map(_blas_threads, 0, [()])))
+        assert there
+        assert set(there) == {1}
+        assert set(_blas_threads()) == {3}
+
+
 def test_threads_make_the_same_map() -> None:
     with open_executor(3, None) as worker:
         assert isinstance(worker, Threads)
@@ -60,20 +74,6 @@ def cluster() -> Iterator[Client]:
 
 def test_a_cluster_makes_the_same_map(cluster: Client) -> None:
     assert surveyed_by(Cluster(cluster)) == alone()
-
-
-def _blas_threads(*_: object) -> list[int]:
-    return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
-
-
-def test_linear_algebra_has_no_threads_beside_those_of_a_survey() -> None:
-    """A program that uses the library may have loaded it with any number of threads, and gets them back."""
-    with threadpool_limits(3, user_api="blas"):
-        with open_executor(2, None) as executor:
-            there = next(iter(executor.map(_blas_threads, 0, [()])))
-        assert there
-        assert set(there) == {1}
-        assert set(_blas_threads()) == {3}
 
 
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

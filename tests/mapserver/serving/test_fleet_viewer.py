@@ -60,6 +60,9 @@ def test_a_site_is_seen_as_it_changes(store: MapStore) -> None:
         for number in range(3):
             assert fleet.take_failure("lab", "r1", failure(number)).refused == ""
         view.look()
+        with FoxgloveClient(server.url, within_s=60.0) as early:  # the server's own thread has sent them all then
+            early.subscribe(["/failures/report"])
+            early.wait_for_one("/failures/report", lambda report: report["id"] == "f2")
         with FoxgloveClient(server.url, within_s=60.0) as viewer:
             viewer.subscribe(["/map", "/failures/report", "/failures/matches", "/robots", "/tf"])
             cloud = viewer.wait_for("/map")[0][1]
