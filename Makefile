@@ -2,7 +2,9 @@
 #
 #   make demo                  survey a simulated warehouse, serve its map, localize the robots of the next day in it
 #   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
-#   make test                  every test
+#   make test                  all tests but the long ones, six minutes on two cores
+#   make test-all              every test: with browser walks, fault sweeps, real recordings, nights and drills
+#   make test-ci               make test, and of the long tests one drive, one fault sweep and one browser walk
 #   make check                 format, lint, types, import contracts
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
@@ -28,7 +30,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test check kernels kernels-server kernels-robot kernels-simulator bench acceptance study conformance clean
+.PHONY: help demo demo-recording test test-ci test-all check kernels kernels-server kernels-robot kernels-simulator bench acceptance study conformance clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -41,9 +43,20 @@ demo: demo-recording $(RUN_STAMP)
 demo-recording:
 	@deploy/demo.sh --check "$(RECORDING)"
 
+# Tests write to folders of their own; of one file they run in one process, so that they share what it made.
+RUN_TESTS = $(BIN)/python -m pytest $(TESTS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+
 test: $(DEV_STAMP)
 	@$(COMPILE) tests
-	$(BIN)/python -m pytest $(TESTS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	$(RUN_TESTS) -m "not long"
+
+test-ci: $(DEV_STAMP)
+	@$(COMPILE) tests
+	$(RUN_TESTS) -m "not long or ci"
+
+test-all: $(DEV_STAMP)
+	@$(COMPILE) tests
+	$(RUN_TESTS)
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .

@@ -1,6 +1,7 @@
-"""What all tests share: the same examples on every run, and no trace in the user's own folders."""
+"""What all tests share: the same examples on every run, two tiers, and no trace in the user's own folders."""
 
 import os
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from hypothesis import settings
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
-# Folders whose files take long: they begin first, so that no process is left with one of them at the end.
-_LONG = ("scenarios", "end_to_end", "examples", "mapserver/dashboard", "mapserver/live", "mapserver/fleet")
+TESTS = Path(__file__).parent
+# No test of `make test` may take longer; those that did are named at its end.
+_MOST_S = 5.0
 
 settings.register_profile("same every time", derandomize=True, deadline=None)
 settings.load_profile("same every time")
@@ -36,8 +38,32 @@ def pytest_xdist_auto_num_workers() -> int:
     return max(2, 3 * len(os.sched_getaffinity(0)) // 2)
 
 
+def entries_of_tier(tier: str) -> list[str]:
+    """Paths and tests of tiers.toml that are `long` or `ci`."""
+    tiers = tomllib.loads((TESTS / "tiers.toml").read_text("utf-8"))
+    return [entry for entries in tiers[tier].values() for entry in entries]
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; the order within a file stays."""
-    root = Path(__file__).parent
-    long = [root / folder for folder in _LONG]
-    items.sort(key=lambda item: not any(folder in item.path.parents for folder in long))
+    """Marks the tiers and puts files with long tests first, so that no process is left with one of them at the end."""
+    entries = {tier: entries_of_tier(tier) for tier in ("long", "ci")}
+    long_files = set()
+    for item in items:
+        name = f"{item.path.relative_to(TESTS).as_posix()}::{item.nodeid.partition('::')[2].partition('[')[0]}"
+        for tier, named in entries.items():
+            if any(name == entry or name.startswith((f"{entry}/", f"{entry}::")) for entry in named):
+                item.add_marker(tier)
+                long_files.add(item.path)
+    items.sort(key=lambda item: item.path not in long_files)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Names the tests that are too slow for `make test`; a figure to act on, no failure, because times depend on the machine."""
+    if "not long" not in config.option.markexpr:
+        return
+    reports = [r for reports in terminalreporter.stats.values() for r in reports if isinstance(r, pytest.TestReport)]
+    slow = sorted(((r.duration, r.nodeid, r.when) for r in reports if r.duration > _MOST_S), reverse=True)
+    if slow:
+        terminalreporter.section(f"above {_MOST_S:.0f} s: shorten them, or add them to tests/tiers.toml")
+        for seconds, name, when in slow:
+            terminalreporter.line(f"{seconds:6.1f} s {when:8} {name}")

@@ -68,7 +68,6 @@ def wait_for(found: Callable[[], bool], process: subprocess.Popen[str]) -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell(tmp_path: Path) -> None:
     """Away from its server, on what its disk holds, the robot goes dark: blind, dark. It is killed. A later life delivers."""
@@ -124,7 +123,6 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
     assert Outbox(spool, max_bytes=10**8).counts()["delivered"] == 1
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts(tmp_path: Path) -> None:
     """`locclient run` in real time, over TLS, on a rig with an IMU and a Kalibr file: no thread dies, nothing stands in a log."""
@@ -161,7 +159,6 @@ def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts
         assert "Traceback" not in log.read_text("utf-8", "replace")
 
 
-@pytest.mark.slow
 def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
     """The daemon on a store's folder, behind rmw_zenoh's router: lifecycle manager, BasicNavigator, behaviour tree."""
     with MapStore.open(tmp_path / "store", create=True) as store:

@@ -13,7 +13,6 @@ from support.recordings.recording_samples import write_euroc
 from support.worlds.box_room import out_and_back, ride_sample
 
 
-@pytest.mark.slow
 def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first has only its own held-out frames to be judged by, the second also the recording and the map of the first.
 

@@ -20,7 +20,7 @@ from mapserver.store import MapStore
 from support.recordings.realdata import real_data
 from support.storage.known_rig import KNOWN_RIG
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.timeout(300)
 
 Report = dict[str, Any]
 

@@ -62,7 +62,6 @@ def robot(folder: Path, endpoint: str, broker: int, http: str) -> Iterator[subpr
             print((folder / "log").read_text("utf-8", "replace")[-4000:])  # what pytest shows of a failure
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_away(tmp_path: Path) -> None:
     with (

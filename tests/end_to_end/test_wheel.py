@@ -18,7 +18,7 @@ from mapserver import Actor, BuildOptions, build_map
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.timeout(600)
 
 
 def run(command: Sequence[str | Path], folder: Path, **settings: str) -> str:

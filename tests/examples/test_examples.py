@@ -20,8 +20,6 @@ from mapserver.store.fleet_queries import FleetBatch
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 MAX_NOTEBOOK_BYTES = 60_000
 
-pytestmark = pytest.mark.slow
-
 
 def run(name: str, folder: Path, *arguments: str | Path) -> str:
     """What an example prints; it must succeed."""

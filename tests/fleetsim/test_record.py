@@ -137,7 +137,6 @@ session.renderer.close()
 """
 
 
-@pytest.mark.slow
 def test_the_same_bytes_on_an_older_machine(tmp_path: Path) -> None:
     """Compiled for a processor without AVX and FMA the pictures are the same to the bit."""
     digests = []

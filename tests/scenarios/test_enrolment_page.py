@@ -21,7 +21,6 @@ from mapserver.store import MapStore
 from support.fleet.contracts_documents import REPOSITORY
 from support.storage.map_samples import save_sample_draft
 
-pytestmark = pytest.mark.slow
 SERVER_IP, ROBOTS_IP = "10.213.77.1", "10.213.77.2"
 ROBOTS = ("tug-7", "tug-8")
 _COMMAND = re.compile(r"`((?:mapserver|locclient) [^`]* [^`]*)`", re.DOTALL)

@@ -235,7 +235,6 @@ def test_arrays_that_no_robot_wrote_reach_no_kernel(carried: Carried, tmp_path: 
         read_failure_file(_changed(carried, tmp_path / "spoiled.mcap", spoiled))
 
 
-@pytest.mark.slow
 def test_arbitrary_arrays_break_nothing(carried: Carried) -> None:
     """In a process whose kernels check their bounds, which are compiled for that once: whatever decodes and passes is played."""
     cache = Path(".pytest_cache/bounds_checked").absolute()

@@ -139,7 +139,6 @@ def test_without_the_bucket_a_guess_arrives(operators: Operators, monkeypatch: p
     assert [bool(operators.sign_in("ada", guess, "x").session) for guess in guesses][-1]
 
 
-@pytest.mark.slow
 def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch: pytest.MonkeyPatch) -> None:
     def took_s(name: str) -> float:
         begun = time.process_time()
@@ -153,7 +152,6 @@ def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch: pytest
     assert min(took_s(f"nobody-{n}") for n in range(3, 5)) < known / 4
 
 
-@pytest.mark.slow
 def test_many_at_once_do_not_wait_for_ever(operators: Operators) -> None:
     answers = []
     threads = [

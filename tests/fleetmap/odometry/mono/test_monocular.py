@@ -69,7 +69,6 @@ def test_the_class_goes_by_the_camera() -> None:
     assert type(both) is Odometry
 
 
-@pytest.mark.slow
 def test_pictures_alone_give_the_way_up_to_scale_and_say_so() -> None:
     estimates, placed = run(None)
     assert not any(e.scale_known or e.inertial for e in estimates)
@@ -81,7 +80,6 @@ def test_pictures_alone_give_the_way_up_to_scale_and_say_so() -> None:
     assert abs(np.log(scale)) > 0.02  # the room's half width is no 5 m: an untold scale is not guessed right
 
 
-@pytest.mark.slow
 def test_an_imu_makes_it_metric() -> None:
     estimates, placed = run(IMU)
     metric = next(e.frame_index for e in estimates if e.scale_known)
