@@ -1,4 +1,4 @@
-"""Benchmarks run seldom: what they import from the packages must be there all the same."""
+"""Benchmarks and studies run seldom: what they import must be there all the same, and every entry of the acceptance file is a program."""
 
 import ast
 import shlex
@@ -8,32 +8,28 @@ from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-PACKAGES = ("fleetmap", "mapserver", "locclient", "fleetsim")
+TESTS = Path(__file__).parents[1]
+PROGRAMS = sorted(path for folder in ("benchmarks", "studies") for path in (TESTS / folder).rglob("*.py"))
+OURS = ("fleetmap", "mapserver", "locclient", "fleetsim", "benchmarks", "studies", "support")
 
 
-@pytest.mark.parametrize(
-    "path", sorted(BENCHMARKS.rglob("*.py")), ids=lambda path: path.relative_to(BENCHMARKS).as_posix()
-)
-def test_a_benchmark_imports_what_exists(path: Path) -> None:
-    froms = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.relative_to(TESTS).as_posix())
+def test_a_program_imports_what_exists(path: Path) -> None:
     missing = []
-    for node in froms:
-        if node.level or node.module is None or node.module.split(".")[0] not in PACKAGES:
-            continue
-        module = import_module(node.module)
-        for alias in node.names:
-            if not hasattr(module, alias.name):
-                try:
-                    import_module(f"{node.module}.{alias.name}")
-                except ModuleNotFoundError:
-                    missing.append(f"{node.module}.{alias.name}")
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] in OURS:
+            module = import_module(node.module)
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    try:
+                        import_module(f"{node.module}.{alias.name}")
+                    except ModuleNotFoundError:
+                        missing.append(f"{node.module}.{alias.name}")
     assert missing == []
 
 
 def test_every_entry_of_the_acceptance_file_names_a_program() -> None:
-    tests = BENCHMARKS.parent
-    entries = tomllib.loads((tests / "acceptance.toml").read_text("utf-8"))
-    programs = [tests.parent / shlex.split(entry["command"])[0] for entry in entries.values()]
+    entries = tomllib.loads((TESTS / "acceptance.toml").read_text("utf-8"))
+    programs = [TESTS.parent / shlex.split(entry["command"])[0] for entry in entries.values()]
     assert [str(path) for path in programs if not path.is_file()] == []
     assert all("--out {out}" in entry["command"] for entry in entries.values())

@@ -9,10 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.common.looks import EVERY_S, LOOK_S, Answer, as_row, curve, looks, map_of, right_at
-from benchmarks.common.place_ranks import BY_WORDS, GROUPINGS, ranks
 from benchmarks.common.recorded_runs import kept_folder, recorded, surveyed
 from benchmarks.robot.bench_real_robots import MAPPED, UNSEEN, mapped
-from fleetmap.relocalization.settings import FixSettings
 from locclient.maps.loaded_map import LoadedMap
 from studies.study import Column, Row, publish, results, table
 from support.recordings.realdata import DATA
@@ -57,16 +55,8 @@ def real(name: str) -> Row:
 
 
 def looked(condition: str, seed: int | None, path: Path, loaded: LoadedMap, frames: str = ":") -> Row:
-    """What all looks of a recording answered, and how soon a right place would be tried."""
-    rows = [as_row(look) for look in looks(path, loaded, frames)]
-    return {"condition": condition, "seed": seed, "looks": rows, "ranks": ranks(path, loaded, frames)}
-
-
-def ranked(rows: Sequence[Row], grouping: str) -> str:
-    """Share of the beginnings of looks at which a right place is among those that are tried, and first of them."""
-    found, tried = [rank for row in rows for rank in row["ranks"][grouping]], FixSettings().top_places
-    among = float(np.mean([rank is not None and rank <= tried for rank in found]))
-    return f"{among:.0%} ({float(np.mean([rank == 1 for rank in found])):.0%})"
+    """What all looks of a recording answered."""
+    return {"condition": condition, "seed": seed, "looks": [as_row(look) for look in looks(path, loaded, frames)]}
 
 
 def answers(rows: Sequence[Row], which: str) -> list[Answer]:
@@ -124,11 +114,7 @@ def main() -> None:
         Column("silent", "TRACKING elsewhere"),
     ]  # fmt: skip
     summaries = table([summary(n, of) for n, of in grouped.items()], shown)
-    voted = [
-        {"grouping": how} | {name: ranked(of, how) for name, of in grouped.items()} for how in (BY_WORDS, *GROUPINGS)
-    ]
-    votes = table(voted, [Column("grouping", "votes of a place"), *(Column(name, name) for name in grouped)])
-    publish("recognition", [summaries, f"A look begins every {EVERY_S} s.", votes], draw(grouped))
+    publish("recognition", [summaries, f"A look begins every {EVERY_S} s."], draw(grouped))
 
 
 if __name__ == "__main__":

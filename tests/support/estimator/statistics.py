@@ -1,7 +1,6 @@
 """Statistics of what an estimator measures on the simulator's pictures.
 
-Measured by `python tests/benchmarks/simulator/measure_statistics.py` on `small-loop` (survey by day; tote by day and night, the next
-day's stock). Figures in the comments are that command's.
+Measured once on rendered pictures of `small-loop`: the survey by day, the tote by day and by night, with the next day's stock.
 """
 
 from typing import NamedTuple
