@@ -24,7 +24,7 @@ from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
-from locclient.robot.sensor_agreement import IMU_REFUSED, WHEELS_REFUSED, WheelAgreement, accelerometer_refused
+from locclient.robot.sensor_agreement import WHEELS_REFUSED, WheelAgreement, accelerometer_refused, imu_refused
 from locclient.robot.speed import SpeedGauge
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
@@ -224,8 +224,9 @@ class Robot:
         found = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
         if not isinstance(perception, SensorPerception):
             return found
-        imu = IMU_REFUSED if perception.odometry.refuses_imu else {}
-        return {**imu, **accelerometer_refused(perception.odometry.accelerometer_fault), **found}
+        odometry = perception.odometry
+        imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
+        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **found}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""

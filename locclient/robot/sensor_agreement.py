@@ -10,11 +10,21 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import WheelSample
 
 _ASK = "record a drive and ask `mapserver doctor`"
-IMU_REFUSED = {Flag.IMU_REFUSED: f"the IMU is left out: it turns otherwise than the images; {_ASK} which axis is wrong"}
 WHEELS_REFUSED = {
     Flag.WHEELS_REFUSED: f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
 }
-"""Flags of RobotHealth with their words: the camera's motion contradicts the sensor, which is not used."""
+"""Flag of RobotHealth with its words: the camera's motion contradicts the sensor, which is not used."""
+
+
+def imu_refused(late_s: float | None) -> dict[Flag, str]:
+    """The flag of an IMU that is used no more, with its words. late_s: of its stamps by the images' turns, None if it is not that."""
+    words = f"it turns otherwise than the images; {_ASK} which axis is wrong"
+    if late_s is not None:
+        when = (
+            f"its stamps are about {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'} by the turns of the images"
+        )
+        words = f"{when}; stamp both by one clock, or {_ASK} for the timeshift_cam_imu to set"
+    return {Flag.IMU_REFUSED: f"the IMU is left out: {words}"}
 
 
 def accelerometer_refused(fault: str) -> dict[Flag, str]:

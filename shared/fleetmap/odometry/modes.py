@@ -98,16 +98,16 @@ class WindowMode(Mode):
     def will_forget(self, frame_index: int) -> bool:
         return frame_index not in self.window.filter.clone_ids[1:]
 
-    def _is_accelerometer_wrong(self, imu: ImuInputs, stamp_ns: int, tracked: Tracked) -> bool:
-        """Shows a frame to the check of the accelerometer; stamp_ns on the IMU's clock."""
-        if imu.accelerometer is None:
-            return False
-        seen = tracked.cam_from_previous
+    def _show(self, imu: ImuInputs, stamp_ns: int, tracked: Tracked) -> bool:
+        """Shows a frame to the checks of the IMU; stamp_ns on its clock, as calibrated. Whether they have found a fault."""
+        seen, samples = tracked.cam_from_previous, imu.samples
         if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE:
             seen = None  # pictures that could hardly be followed accuse no sensor
         moved = None if seen is None else self._rig.body_from_cam @ se3_inverse(seen) @ self._rig.cam_from_body
-        imu.accelerometer.handle(stamp_ns, moved, imu.samples.imu, on_wheels=imu.samples.on_wheels)
-        return bool(imu.accelerometer.fault)
+        imu.clock.handle(stamp_ns, moved, samples.imu)
+        if imu.accelerometer is not None:
+            imu.accelerometer.handle(stamp_ns, moved, samples.imu, on_wheels=samples.on_wheels)
+        return imu.has_fault
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
         window_filter, used = self.window.filter, step.used
@@ -230,7 +230,9 @@ class GyroMode(VisualMode):
         predicted, seen = None if self._turned is None else self._cam_from_previous, tracked.cam_from_previous
         if self._imu.monitor.is_wrong_imu(predicted, seen):
             return VisualMode(self.window, seen).process(frame_index, tracked)
-        return super().process(frame_index, tracked)
+        step = super().process(frame_index, tracked)
+        self._show(self._imu, self.stamp_ns, tracked)
+        return step if self._imu.clock.off_s is None else step._replace(mode=VisualMode(self.window, seen))
 
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
         """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""
@@ -240,6 +242,11 @@ class GyroMode(VisualMode):
         if self._turned is None or rotation_angle_rad(self._turned.T @ body_from_next[:3, :3]) > 2.0 * sigma_rad:
             return free_rad
         return min(sigma_rad, free_rad)
+
+
+def _without_fault(window: SlidingWindow, imu: ImuInputs, motion: Array) -> Mode:
+    """The mode for an IMU with a fault: without one whose clock is wrong, else by its gyro; motion (4, 4): cam_from_previous."""
+    return VisualMode(window, motion) if imu.clock.off_s is not None else GyroMode(window, imu, motion)
 
 
 class StartingMode(GyroMode):
@@ -267,8 +274,8 @@ class StartingMode(GyroMode):
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to stereo-inertial once gravity is known, which redefines `odom`."""
         step = VisualMode.process(self, frame_index, tracked)
-        if self._is_accelerometer_wrong(self._imu, self.stamp_ns, tracked):
-            return step._replace(mode=GyroMode(self.window, self._imu, self._cam_from_previous))
+        if self._show(self._imu, self.stamp_ns, tracked):
+            return step._replace(mode=_without_fault(self.window, self._imu, self._cam_from_previous))
         stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.state.odom_from_body
         if tracked.lost:
             self._trajectory.clear()
@@ -374,7 +381,7 @@ class InertialMode(WindowMode):
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
-        if self._is_accelerometer_wrong(self._imu, self._frame_ns, tracked):
+        if self._show(self._imu, self._frame_ns, tracked):
             return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
         matched = window.matched_body(tracked)
         if matched is not None:
@@ -434,6 +441,6 @@ class InertialMode(WindowMode):
         window = self.window.restarted(state, np.diag([1e-10] * 15), self._frame_ns)
         window.seed(frame_index, tracked)
         self._imu.monitor.begin_again()
-        if self._imu.accelerometer is not None and self._imu.accelerometer.fault:
-            return GyroMode(window, self._imu, motion)
+        if self._imu.has_fault:
+            return _without_fault(window, self._imu, motion)
         return StartingMode(window, self._imu, self._frame_ns, motion)

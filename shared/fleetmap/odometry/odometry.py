@@ -4,7 +4,6 @@ Never touches a file, a socket or a clock.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,8 +13,10 @@ from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.imu_inputs import imu_inputs
 from fleetmap.odometry.modes import Mode, StartingMode, VisualMode
+from fleetmap.odometry.odometry_checks import MAX_OFFSET_SIGMAS
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracker
@@ -45,6 +46,7 @@ class Odometry:
         )
         self._samples = SensorBuffer()
         self._accelerometer = AccelerometerCheck(base_from_body)
+        self._clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
         self._tracker = Tracker(camera, settings.tracker, stereo_settings)
         self._mode = self._first_mode()
         self._frame_index = 0
@@ -79,6 +81,11 @@ class Odometry:
         return self._rig.imu is not None and type(self._mode) is VisualMode
 
     @property
+    def imu_late_s(self) -> float | None:
+        """By how much the stamps of an IMU that is left out for that are late against the calibration; None else."""
+        return self._clock.off_s
+
+    @property
     def accelerometer_fault(self) -> str:
         """Why the accelerometer is not used, by its axes or its unit; empty where it is, or may be."""
         return self._accelerometer.fault
@@ -100,5 +107,5 @@ class Odometry:
         window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
         if self._rig.imu is None:
             return VisualMode(window)
-        inputs = replace(imu_inputs(self._rig, self._rig.imu, self._samples), accelerometer=self._accelerometer)
+        inputs = imu_inputs(self._rig, self._rig.imu, self._samples, self._clock, self._accelerometer)
         return StartingMode(window, inputs)

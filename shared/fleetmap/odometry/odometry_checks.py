@@ -9,7 +9,7 @@ from fleetmap.odometry.tracking import tracker_kernels
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is given up
-_MAX_OFFSET_SIGMAS = 3.0  # a larger time offset cannot be one
+MAX_OFFSET_SIGMAS = 3.0  # a larger time offset cannot be one
 _DIVERGED_M, _MAX_DIVERGED_FRAMES = 0.5, 3  # from the motion of one step by images, for so many frames in a row
 
 
@@ -18,7 +18,7 @@ class DivergenceMonitor:
 
     def __init__(self, offset_sigma_s: float) -> None:
         """offset_sigma_s: of the time between the two clocks before anything was seen."""
-        self._max_offset_s = _MAX_OFFSET_SIGMAS * offset_sigma_s
+        self._max_offset_s = MAX_OFFSET_SIGMAS * offset_sigma_s
         self._disagreements = 0
         self._diverged_frames = 0
 

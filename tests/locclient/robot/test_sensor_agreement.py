@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.geometry import se3
 from fleetmap.sensors.samples import WheelSample
-from locclient.robot.sensor_agreement import WheelAgreement
+from locclient.robot.sensor_agreement import WheelAgreement, imu_refused
 from support.fleet.estimates import estimate
 
 
@@ -51,3 +51,9 @@ def test_wheels_that_agree_again_are_used_again() -> None:
 def test_images_that_cannot_be_followed_accuse_no_wheels(changes: dict[str, Any]) -> None:
     """A starved processor leaves images metres apart; then it is the odometry that is wrong."""
     assert not drive(WheelAgreement(np.eye(4)), 1.5, -1.5, 30.0, **changes)
+
+
+def test_an_imu_that_is_left_out_is_named_with_its_clock() -> None:
+    assert "turns otherwise" in imu_refused(None)["imu_refused"]
+    assert "about 0.10 s late" in imu_refused(0.101)["imu_refused"]
+    assert "about 0.20 s early" in imu_refused(-0.198)["imu_refused"]

@@ -348,7 +348,9 @@ class MonocularOdometry(Odometry):
     def _first_mode(self) -> Mode:
         rig = self._rig
         self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, self._points_in_camera)
-        self._vision = MonocularMode(rig, None if rig.imu is None else imu_inputs(rig, rig.imu, self._samples))
+        self._vision = MonocularMode(
+            rig, None if rig.imu is None else imu_inputs(rig, rig.imu, self._samples, self._clock)
+        )
         return self._vision
 
     def _points_in_camera(self, ids: NDArray[np.int64]) -> Array:
