@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.inertial import preintegrate
+from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
@@ -254,6 +255,8 @@ def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.boo
         if (held is not None and held[k] and held[k + 1]) or (motion.goes_on is not None and not motion.goes_on[k + 1]):
             continue
         start, end = int(state.stamps_ns[k]) + offset_ns, int(state.stamps_ns[k + 1]) + offset_ns
+        if is_pause(motion.imu.stamps_ns, start, end):
+            continue
         biases = motion.gyro_bias_radps[k], motion.accel_bias_mps2[k]
         edges.append((k, k + 1, preintegrate(motion.imu, start, end, *biases, noise)))
     return InertialTerms(motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2, edges, fixed=held)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
+from fleetmap.odometry.sensor_buffer import is_pause
 from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
 from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
@@ -52,16 +53,16 @@ def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[Relat
 
 
 def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
-    """Odometry from and to keyframes that see next to nothing.
+    """Odometry across pauses, which no inertial factor spans, and from and to keyframes that see next to nothing.
 
-    With wheels it adds to the inertial factors; without wheels it adds nothing, and where there are landmarks it is not needed.
+    There it adds to the inertial factors with wheels; without wheels it adds nothing, and where there are landmarks it is not needed.
     """
-    if not odometry.has_wheels:
-        return []
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
+    stamps_ns = (state.stamps_ns + int(state.motion.imu_minus_cam_s * 1e9)).tolist()
     factors = []
     for k, a, b in _neighbours(odometry):
-        if min(seen[k], seen[k + 1]) < MIN_SEEN:
+        is_blind = odometry.has_wheels and min(seen[k], seen[k + 1]) < MIN_SEEN
+        if is_blind or is_pause(state.motion.imu.stamps_ns, stamps_ns[k], stamps_ns[k + 1]):
             i_from_j = se3_inverse(odometry.odom_from_body[a]) @ odometry.odom_from_body[b]
             factors.append(_factor(k, i_from_j, edge_covariance(odometry, a, b)))
     return factors

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import preintegrate
+from fleetmap.odometry.sensor_buffer import is_pause
 from mapserver.survey.bundle.bundle_adjustment import (
     BundleProblem,
     InertialTerms,
@@ -223,8 +224,9 @@ class _Chain:
         velocities[joined] = np.gradient(self.map_from_body[nodes[joined], :3, 3], seconds, axis=0)
         edges = []
         for i, j in pairwise(joined.tolist()):
-            felt = preintegrate(motion.imu, int(stamps_ns[i]), int(stamps_ns[j]), gyro[i], accel[i], self._imu_noise)
-            edges.append((i, j, felt))
+            start_ns, end_ns = int(stamps_ns[i]), int(stamps_ns[j])
+            if not is_pause(motion.imu.stamps_ns, start_ns, end_ns):
+                edges.append((i, j, preintegrate(motion.imu, start_ns, end_ns, gyro[i], accel[i], self._imu_noise)))
         priors = [
             MotionPrior(k, np.concatenate([np.zeros(3), gyro[k], accel[k]]), _BIAS_SIGMAS)
             for k in joined[[0, -1]].tolist()

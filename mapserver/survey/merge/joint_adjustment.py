@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import preintegrate
+from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import (
     BundleProblem,
@@ -184,6 +185,8 @@ def _inertial(
     edges = []
     for k in range(len(stamps_ns) - 1):
         start, end = int(stamps_ns[k]) + offset_ns, int(stamps_ns[k + 1]) + offset_ns
+        if is_pause(motion.imu.stamps_ns, start, end):
+            continue
         summed = preintegrate(motion.imu, start, end, motion.gyro_bias_radps[k], motion.accel_bias_mps2[k], noise)
         edges.append((old + k, old + k + 1, summed))
     none = np.zeros((old, 3))

@@ -16,10 +16,10 @@ from fleetmap.odometry.imu_inputs import ImuInputs
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
 from fleetmap.odometry.odometry_checks import ZeroVelocityDetector
-from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
+from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, is_pause
 from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, Trajectory
+from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
@@ -356,11 +356,11 @@ class InertialMode(WindowMode):
         window, imu = self.window, self._imu
         self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
-        gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
-        if end_ns - window.stamp_ns > (PAUSE_NS if gap_ns > IMU_GAP_NS else INTEGRATED_NS):
+        if is_pause(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns):
             self._is_pause, self.rotation_sigma_rad = True, None
             window.stamp_ns = end_ns
             return
+        gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
         if gap_ns > IMU_GAP_NS and len(window.filter.clone_ids) > 1:
             self._bridge_gap(end_ns)
         else:

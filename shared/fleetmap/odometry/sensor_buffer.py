@@ -8,13 +8,17 @@ from fleetmap.geometry import Array
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry import sensor_kernels
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.samples import ImuSamples, Stamps, WheelSample
+from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, ImuSamples, Stamps, WheelSample
 
 IMU_GAP_NS = 35_000_000  # a longer time without samples is bridged as without an IMU; one of 30 Hz has none
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
-
-
 _LEAST_ROOM = 1024  # samples
+
+
+def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
+    """True if no motion is carried from one moment to another, both on the IMU's clock: samples that are all there carry it longer."""
+    is_missing = sensor_kernels.longest_gap_ns(imu_stamps_ns, start_ns, end_ns) > IMU_GAP_NS
+    return end_ns - start_ns > (PAUSE_NS if is_missing else INTEGRATED_NS)
 
 
 class SensorBuffer:

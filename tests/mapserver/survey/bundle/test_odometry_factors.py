@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3, se3_exp, se3_inverse, skew, so3_exp
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples
+from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges
 from mapserver.survey.keyframes.connected_components import SigmaBetween
 from mapserver.survey.odometry_pass import OdometryPass, continued_covariances
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import adjoint
+from mapserver.survey.settings import SurveySettings
 from support.worlds.corridor_scene import scene
 
 
@@ -41,6 +45,39 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
         assert (sigmas_m < 0.05).all()
     # Without wheels the odometry of sparse pictures knows less than it says, and nothing that the IMU does not.
     assert not blackout_factors(replace(guess, has_wheels=False), state)
+
+
+@pytest.mark.parametrize(("pause_s", "is_pause"), [(9.0, False), (59.0, False), (5 * 3600.0, True)])
+def test_no_inertial_factor_spans_a_pause_which_odometry_bridges(pause_s: float, is_pause: bool) -> None:
+    """A drive cut at speed: the samples before and after are no motion of the hours between. Where all are there they are one."""
+    state = scene(4, 3, drift=0.0).state
+    stamps_ns = state.stamps_ns + np.where(np.arange(4) < 2, 0, int(pause_s * 1e9))
+    sampled_ns = np.arange(stamps_ns[0], stamps_ns[-1] + 1, 10_000_000)
+    if is_pause:
+        sampled_ns = sampled_ns[(sampled_ns <= stamps_ns[1]) | (sampled_ns >= stamps_ns[2])]
+    imu = ImuSamples(sampled_ns, np.zeros((len(sampled_ns), 3)), np.tile([0.0, 0.0, 9.81], (len(sampled_ns), 1)))
+    motion = replace(
+        state.motion,
+        inertial=True,
+        imu=imu,
+        noise=ImuNoise(2e-4, 1e-5, 2e-3, 1e-4),
+        velocities_mps=np.zeros((4, 3)),
+        gyro_bias_radps=np.zeros((4, 3)),
+        accel_bias_mps2=np.zeros((4, 3)),
+    )
+    state = replace(state, stamps_ns=stamps_ns, motion=motion)
+    guess = OdometryPass(
+        [],
+        state.map_from_body,
+        np.tile(1e-4 * np.eye(6), (4, 1, 1)),
+        np.ones(4, bool),
+        [SimpleNamespace(frame_index=k) for k in range(4)],
+        inertial=True,
+        has_wheels=False,
+    )
+    inertial = bundle_problem(state, SurveySettings(), None).inertial
+    assert [edge[:2] for edge in inertial.edges] == ([(0, 1), (2, 3)] if is_pause else [(0, 1), (1, 2), (2, 3)])
+    assert [(term.i, term.j) for term in blackout_factors(guess, state)] == ([(1, 2)] if is_pause else [])
 
 
 def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
