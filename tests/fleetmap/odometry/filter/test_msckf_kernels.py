@@ -6,11 +6,10 @@ import pytest
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.inertial import imu_intervals
 from fleetmap.odometry.filter import msckf_kernels, propagation_kernels
-from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, sample_motion
-from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, error_of, perturbed, room, true_state
+from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, error_of, perturbed, true_state
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 INTRINSICS = np.array([CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px, CAMERA.focal_px * CAMERA.baseline_m])
@@ -33,14 +32,6 @@ def intervals() -> tuple[Array, Array, Array]:
     return imu_intervals(sample_motion(rate_hz=200.0, duration_s=1.0), 3_000_000, 503_000_000)
 
 
-def test_propagation_follows_the_motion(intervals: tuple[Array, Array, Array]) -> None:
-    state, _, _ = moved(true_state(0.003), *intervals)
-    error = error_of(state, true_state(0.503))
-    assert np.linalg.norm(error[:3]) < 1e-5
-    assert np.linalg.norm(error[3:6]) < 1e-4
-    assert np.linalg.norm(error[6:9]) < 1e-4
-
-
 def test_transition_is_the_derivative_of_the_invariant_error(intervals: tuple[Array, Array, Array]) -> None:
     truth = true_state(0.003, np.array([0.02, -0.01, 0.03]), np.array([0.1, 0.2, -0.1]))
     end, phi, _ = moved(truth, *intervals)
@@ -50,23 +41,6 @@ def test_transition_is_the_derivative_of_the_invariant_error(intervals: tuple[Ar
         sides = [moved(perturbed(truth, so3_exp(sign * error[:3]), sign * error), *intervals)[0] for sign in (1, -1)]
         numeric = (error_of(sides[0], end) - error_of(sides[1], end)) / (2 * step)
         np.testing.assert_allclose(phi[:, k], numeric, atol=2e-4 if k >= 9 else 1e-8, err_msg=f"column {k}")
-
-
-def test_transition_does_not_depend_on_the_state_where_the_error_is_invariant(
-    intervals: tuple[Array, Array, Array],
-) -> None:
-    """Rotation, velocity and position columns are the same for any state: linearisation cannot invent information."""
-    _, first, _ = moved(true_state(0.003), *intervals)
-    _, second, _ = moved(true_state(2.0), *intervals)
-    np.testing.assert_allclose(first[:, :9], second[:, :9], atol=1e-12)
-
-
-def test_turns_about_gravity_and_shifts_pass_through(intervals: tuple[Array, Array, Array]) -> None:
-    _, phi, _ = moved(true_state(0.003), *intervals)
-    unobservable = np.zeros((15, 4))
-    unobservable[2, 0] = 1.0
-    unobservable[6:9, 1:] = np.eye(3)
-    np.testing.assert_allclose(phi @ unobservable, unobservable, atol=1e-12)
 
 
 def test_process_noise_is_the_scatter_of_noisy_runs(intervals: tuple[Array, Array, Array]) -> None:
@@ -160,41 +134,6 @@ def test_triangulation_finds_the_point_from_a_poor_start() -> None:
             WEIGHTS, found,
         )  # fmt: skip
         np.testing.assert_allclose(found, target, atol=1e-3)
-
-
-def test_vision_says_nothing_about_where_the_world_is() -> None:
-    """A common turn or shift of all clones is in the null space, also for wrong transforms and noisy pixels."""
-    rng = np.random.default_rng(8)
-    bodies = np.array([analytic_motion(0.1 * k).map_from_body for k in range(5)])
-    wrong = bodies.copy()
-    wrong[:, :3, 3] += 0.02 * rng.normal(size=(5, 3))
-    points = room(rng, 150)
-    starts, clones, pixels, first = [0], [], [], []
-    for point in points:
-        seen = np.array(
-            [CAMERA.pixel_from_point(transform_points(se3_inverse(b @ BODY_FROM_CAM), point[None]))[0] for b in bodies]
-        )
-        if not np.isfinite(seen).all() or np.abs(seen[:, 0] - 320).max() > 300:
-            continue
-        clones += list(range(5))
-        pixels += list(seen + 0.3 * rng.normal(size=seen.shape))
-        starts.append(len(clones))
-        first.append(transform_points(se3_inverse(wrong[0] @ BODY_FROM_CAM), point[None])[0])
-    information, scatter, vector = np.zeros((30, 32)), np.zeros((30, 30)), np.zeros(30)
-    used = np.zeros(len(first), np.int8)
-    rotations, positions = np.ascontiguousarray(wrong[:, :3, :3]), np.ascontiguousarray(wrong[:, :3, 3])
-    anchors = np.zeros(len(first), np.int64)
-    tracks = Tracks(np.array(starts), np.array(clones), np.array(pixels), anchors, np.array(first))
-    model = PixelModel(INTRINSICS, WEIGHTS, np.array([1.0, 0.0, 0.0, 0.0]), 2.3)
-    equations = NormalEquations(information, scatter, vector)
-    bodies_of = Clones(rotations, positions, BODY_FROM_CAM)
-    msckf_kernels.accumulate_tracks(bodies_of, tracks, model, np.eye(30), np.zeros(30), equations, used)
-    assert (used == 1).sum() > 10
-    information = information[:, 2:]
-    np.testing.assert_allclose(scatter, information, atol=1e-9 * np.abs(information).max())  # nothing but white noise
-    common = np.tile(np.eye(6), (5, 1))
-    assert np.abs(information @ common).max() < 1e-9 * np.abs(information).max()
-    assert np.linalg.matrix_rank(information, tol=1e-6 * np.abs(information).max()) == 24
 
 
 def test_intervals_hold_the_middle_of_the_samples() -> None:

@@ -5,7 +5,6 @@ import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3, so3_exp
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
-from fleetmap.odometry.init.static_initialization import polynomial_rate
 from fleetmap.odometry.modes import StartingMode
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -90,18 +89,6 @@ def test_the_speed_of_an_even_drive_is_known_at_once(
     assert way_m == pytest.approx(2.0 * (b - a) * FRAME_NS * 1e-9, abs=0.04)
     monkeypatch.setattr(StartingMode, "_moving_evenly", lambda _mode, start: start)
     assert np.linalg.norm(inertial()[0][1].velocity_odom_mps) < 0.1
-
-
-@pytest.mark.parametrize(("degree", "value"), [(1, 0.8), (2, 0.8), (1, 0.0), (2, 0.0)])
-def test_rates_are_those_of_the_polynomial(degree: int, value: float) -> None:
-    times_s = np.arange(20) * 0.05
-    along = value * times_s if degree == 1 else 0.5 * value * times_s**2 + 2.0 * times_s
-    samples = [(int(t * 1e9), np.array([x, 1.0, -2.0])) for t, x in zip(times_s, along, strict=True)]
-    rate = polynomial_rate(samples, degree)
-    assert rate is not None
-    np.testing.assert_allclose(rate, [value, 0.0, 0.0], atol=1e-6)
-    assert polynomial_rate(samples[:6], degree) is None  # too short to say
-    assert polynomial_rate([], degree) is None
 
 
 def off_in_a_turn_deg(*, by_gyro: bool) -> float:

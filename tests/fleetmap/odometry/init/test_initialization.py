@@ -31,34 +31,6 @@ def at_rest(rng: np.random.Generator, odom_from_body: Array, accel_bias: Array, 
     )
 
 
-def means_agree(window: ImuSamples) -> bool:
-    """The rule of a steady window, by numpy."""
-    parts = [np.hstack([window.gyro_radps, window.accel_mps2])[k] for k in np.array_split(np.arange(len(window)), 10)]
-    means = np.array([part.mean(axis=0) for part in parts])
-    spread, mean = means.std(axis=0), means.mean(axis=0)
-    return bool(
-        spread[:3].max() < START.steady_gyro_sigma_radps
-        and spread[3:].max() < START.steady_accel_sigma_mps2
-        and np.linalg.norm(mean[:3]) < START.steady_gyro_mean_radps
-        and abs(np.linalg.norm(mean[3:]) - 9.81) < START.max_gravity_error_mps2
-    )
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_the_latest_steady_window_is_found(seed: int) -> None:
-    """Rest with jolts of growing size: where all windows are steady, the last one counts, else the latest that is."""
-    rng = np.random.default_rng(seed)
-    imu = at_rest(rng, np.eye(4)[:3, :3], np.zeros(3), duration_s=4.0)
-    for at in rng.integers(400, 800, 3):
-        imu.gyro_radps[at : at + 20] += rng.normal(0, 0.02 * (1 + seed), 3)
-        imu.accel_mps2[at : at + 20] += rng.normal(0, 0.1 * (1 + seed), 3)
-    until_ns, window_ns = int(imu.stamps_ns[-1]), 800_000_000
-    ends = [until_ns - k * window_ns // 4 for k in range(17)]
-    steady = [end for end in ends if end >= window_ns and means_agree(imu.between(end - window_ns, end))]
-    start = static_initialization(imu, until_ns, SETTINGS)
-    assert (None if start is None else start.stamp_ns) == (max(steady) if steady else None)
-
-
 def test_shaken_all_the_time_there_is_no_start() -> None:
     imu = at_rest(np.random.default_rng(4), np.eye(3), np.zeros(3))
     wave = np.sin(np.arange(len(imu)) / 9.0)[:, None] * np.array([0.3, 0.0, 0.0])

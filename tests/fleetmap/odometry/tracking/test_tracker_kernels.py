@@ -36,15 +36,3 @@ def test_what_disagrees_ends_and_the_rest_keeps_its_depth() -> None:
     disparities = expected[[0, 1, 3], 0] - expected[[0, 1, 3], 2]
     np.testing.assert_allclose(carried[[0, 1, 3], 0] - carried[[0, 1, 3], 2], disparities)
     assert np.isnan(carried[2, 2])
-
-
-def test_ways_are_those_of_what_both_saw() -> None:
-    rng = np.random.default_rng(6)
-    old_ids, ids = (np.sort(rng.choice(60, 30, replace=False)) for _ in range(2))
-    old_pixels, pixels = rng.uniform(0, 600, (2, 30, 3))
-    _, before, now = np.intersect1d(old_ids, ids, return_indices=True)
-    ways_px = np.empty(30)
-    count = tracker_kernels.ways_of_common(old_ids, old_pixels, ids, pixels, ways_px)
-    expected = np.linalg.norm(pixels[now, :2] - old_pixels[before, :2], axis=1)
-    np.testing.assert_allclose(ways_px[:count], expected)
-    assert tracker_kernels.ways_of_common(old_ids[:0], old_pixels[:0], ids, pixels, ways_px) == 0
