@@ -1,7 +1,6 @@
 """What commands print is what was written: neither help texts nor strangers' names are read as markup."""
 
 import io
-import re
 from collections.abc import Iterator
 
 import click
@@ -10,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fleetmap.console import plain_console
-from support.fleet.contracts_documents import REPOSITORY, click_command
+from support.fleet.contracts_documents import click_command
 
 STRANGE = "[red] :smile: A:B:C [/nothing]"
 
@@ -38,13 +37,3 @@ def test_names_are_shown_as_they_are() -> None:
     console.print(STRANGE)
     console.print(table)
     assert console.file.getvalue().count(STRANGE) == 4
-
-
-def test_all_commands_use_the_plain_console() -> None:
-    made = [
-        path
-        for folder in ("shared", "mapserver", "locclient")
-        for path in (REPOSITORY / folder).rglob("*.py")
-        if path.name != "console.py" and re.search(r"\bConsole\(", path.read_text("utf-8"))
-    ]
-    assert made == []

@@ -75,11 +75,6 @@ def test_nothing_is_declared_that_nothing_imports() -> None:
         assert declared(extra) - BEHIND <= shared | server, extra
 
 
-def test_the_client_brings_nothing_that_the_server_alone_needs() -> None:
-    assert declared("client") == set()
-    assert not declared(None) & declared("server")
-
-
 def test_every_extra_is_documented() -> None:
     named = {word for row in rows(text("docs/install.md").partition("## From")[0]) for word in code_words(row[0])}
     assert named == set(PROJECT["optional-dependencies"])

@@ -1,7 +1,6 @@
-"""The tree stays navigable: no import circles, and a class name means one thing."""
+"""No module of the project imports itself by way of others."""
 
 import ast
-from collections import defaultdict
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -28,15 +27,10 @@ def _modules() -> dict[str, Path]:
     return found
 
 
-@cache
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text("utf-8"))
-
-
 def _imports(module: str, path: Path) -> set[str]:
     """The project's modules that this one imports when it is imported; not inside functions, not for types alone."""
     found: set[str] = set()
-    pending: list[ast.stmt] = list(_tree(path).body)
+    pending: list[ast.stmt] = list(ast.parse(path.read_text("utf-8")).body)
     while pending:
         node = pending.pop()
         if isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.dump(node.test):
@@ -57,14 +51,3 @@ def test_nothing_imports_itself_by_way_of_others() -> None:
         TopologicalSorter({module: _imports(module, path) for module, path in _modules().items()}).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_a_class_name_means_one_thing_in_a_package(package: str) -> None:
-    places: dict[str, list[str]] = defaultdict(list)
-    for module, path in _modules().items():
-        if module.partition(".")[0] == package:
-            for node in _tree(path).body:
-                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                    places[node.name].append(module)
-    assert {name: modules for name, modules in places.items() if len(modules) > 1} == {}

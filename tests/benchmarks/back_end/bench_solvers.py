@@ -1,4 +1,4 @@
-"""Solvers beside gtsam in one run: pose graphs, wrong loops, BAL, local and global bundle adjustment; and the place query.
+"""Solvers in one run: pose graphs with and without wrong loops; local and global bundle adjustment beside gtsam's.
 
 `PYTHONPATH=tests python tests/benchmarks/back_end/bench_solvers.py [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
 hour. The reference problems lie beside the project, in `../shared/data`; without them their sections are left out, loudly.
@@ -20,13 +20,10 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 
-from benchmarks.back_end.bal_reference import reference_cost
-from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
 from mapserver.survey.bundle.bundle_adjustment import BundleProblem, optimize
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from support.problems.bal import BalProblem, optimize_bal, parse_bal
 from support.problems.g2o import parse_g2o
 from support.recordings.realdata import DATA
 from support.worlds.bundle_gtsam import gtsam_graph
@@ -51,7 +48,7 @@ def pose_graphs(names: Sequence[str] = GRAPHS) -> dict[str, Figures]:
 
     off_clean: root mean square distance of the keyframes from where they are without wrong loops, after SE(3) alignment as
     everywhere (else the edges of the one keyframe that is held would decide), as a share of the extent (the diagonal of the
-    box around all of them) and of the way that joins them in order; held_off_clean: without alignment.
+    box around all of them) and of the way that joins them in order.
     """
     found = {}
     for name in names:
@@ -91,88 +88,14 @@ def _with_wrong_loops(map_from_body: Array, edges: list[PoseEdge], clean: Array)
             wrong.append(PoseEdge(i, j, i_from_j, edges[-1].cov_rot_trans, is_loop=True))
     seconds, robust = timed(lambda: optimize_pose_graph(map_from_body, [*edges, *wrong], noise="estimated"))
     kept = robust.loop_weights >= 0.5
-    held_m, rms_m = (_rms_m(places, clean[:, :3, 3]) for places in _held_and_aligned(robust.map_from_body, clean))
+    places, wanted = robust.map_from_body[:, :3, 3], clean[:, :3, 3]
+    aligned = transform_points(align_points(wanted, places)[0], places)
+    rms_m = float(np.sqrt(((aligned - wanted) ** 2).sum(axis=1).mean()))
     return {
         "loops_right": right, "right_kept": float(kept[:right].sum()), "loops_wrong": len(wrong),
         "wrong_kept": float(kept[right:].sum()), "off_clean_share_of_extent": rms_m / extent_m,
-        "off_clean_share_of_way": rms_m / way_m, "held_off_clean_share_of_extent": held_m / extent_m, "robust_cpu_s": seconds,
+        "off_clean_share_of_way": rms_m / way_m, "robust_cpu_s": seconds,
     }  # fmt: skip
-
-
-def _held_and_aligned(map_from_body: Array, clean: Array) -> tuple[Array, Array]:
-    """Places as they are, and after the rigid motion that brings them nearest to `clean`."""
-    places = map_from_body[:, :3, 3]
-    return places, transform_points(align_points(clean[:, :3, 3], places)[0], places)
-
-
-def _rms_m(places: Array, wanted: Array) -> float:
-    return float(np.sqrt(((places - wanted) ** 2).sum(axis=1).mean()))
-
-
-def bal() -> Figures:
-    """Ladybug-49, all of it against a solver that shares nothing with ours; and a part of it against gtsam.
-
-    gtsam leaves out observations from behind, so landmarks where that happens go from both.
-    """
-    file = DATA / "pose_graphs" / "problem-49-7776-pre.txt"
-    problem = parse_bal(file.read_text())
-    whole = optimize_bal(problem, BundleSettings(max_iterations=100, relative_cost_tolerance=1e-8))
-    dropped = _seen_from_behind(problem, *_as_arrays(whole.state)) | _seen_from_behind(
-        problem, *_as_arrays(problem.start)
-    )
-    for _ in range(3):
-        graph, values = _bal_graph(file, dropped)
-        theirs_s, optimum = timed(lambda: _gtsam_optimum(graph, values, 100))  # noqa: B023
-        more = _seen_from_behind(problem, *_places_of(optimum, problem, whole.state.points_map)) - dropped
-        if not more:
-            break
-        dropped |= more
-    keep = ~np.isin(problem.landmarks, sorted(dropped))
-    part = BalProblem(problem.start, problem.cameras[keep], problem.landmarks[keep], problem.pixels[keep])
-    ours_s, ours = timed(lambda: optimize_bal(part, BundleSettings(max_iterations=100, relative_cost_tolerance=1e-8)))
-    theirs, second = graph.error(optimum), reference_cost(file)
-    return {
-        "cost_all": whole.costs[-1], "reference_cost_all": second, "above_reference": whole.costs[-1] / second - 1.0,
-        "landmarks_left_out": len(dropped), "cost": ours.costs[-1], "gtsam_cost": theirs,
-        "above_gtsam": ours.costs[-1] / theirs - 1.0, "cpu_s": ours_s, "gtsam_cpu_s": theirs_s,
-    }  # fmt: skip
-
-
-def _as_arrays(state) -> tuple[Array, Array, Array]:
-    return state.rotations[:, 2], state.shifts_m[:, 2], state.points_map
-
-
-def _places_of(values: gtsam.Values, problem: BalProblem, points: Array) -> tuple[Array, Array, Array]:
-    cameras = [values.atPinholeCameraCal3Bundler(gtsam.symbol("c", c)) for c in range(len(problem.start.rotations))]
-    inverse = np.array([se3_inverse(camera.pose().matrix()) for camera in cameras])
-    keys = [gtsam.symbol("p", n) for n in range(len(points))]
-    placed = np.array([values.atPoint3(k) if values.exists(k) else p for k, p in zip(keys, points, strict=True)])
-    return -inverse[:, 2, :3], -inverse[:, 2, 3], placed
-
-
-def _seen_from_behind(problem: BalProblem, axes: Array, shifts_m: Array, points: Array) -> set[int]:
-    z = np.einsum("ma,ma->m", axes[problem.cameras], points[problem.landmarks]) + shifts_m[problem.cameras]
-    return set(problem.landmarks[z >= -1e-3].tolist())
-
-
-def _bal_graph(file: Path, dropped: set[int]) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    data, noise = gtsam.SfmData.FromBalFile(str(file)), gtsam.noiseModel.Unit.Create(2)
-    for c in range(data.numberCameras()):
-        values.insert(gtsam.symbol("c", c), data.camera(c))
-    for n in sorted(set(range(data.numberTracks())) - dropped):
-        track = data.track(n)
-        values.insert(gtsam.symbol("p", n), track.point3())
-        for m in range(track.numberMeasurements()):
-            c, pixel = track.measurement(m)
-            graph.add(gtsam.GeneralSFMFactorCal3Bundler(pixel, noise, gtsam.symbol("c", c), gtsam.symbol("p", n)))
-    return graph, values
-
-
-def _gtsam_optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
-    settings = gtsam.LevenbergMarquardtParams.CeresDefaults()
-    settings.setMaxIterations(iterations)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
 
 
 def corridor(keyframes: int, landmarks: int, observations: int, fixed: int) -> BundleProblem:
@@ -248,33 +171,11 @@ def adjustment(keyframes: int, landmarks: int, observations: int, fixed: int, re
     }  # fmt: skip
 
 
-def place_query(places: int = 10_000, words: int = 800, vocabulary: int = 10_000) -> Figures:
-    """CPU ms of one query; words fall as unevenly as in pictures."""
-    rng = np.random.default_rng(5)
-    index = PlaceIndex(vocabulary)
-    frequency = 1.0 / (np.arange(vocabulary) + 200.0)
-
-    def vector() -> BowVector:
-        drawn = np.unique(rng.choice(vocabulary, words, p=frequency / frequency.sum()))
-        weights = rng.random(len(drawn)).astype(np.float32)
-        return BowVector(drawn.astype(np.int32), weights / weights.sum())
-
-    for place in range(places):
-        index.add(place, vector())
-    queries = [vector() for _ in range(50)]
-    index.query(queries[0])
-    spent = [timed(lambda q=q: index.query(q))[0] for q in queries]
-    return {"places": places, "ms_median": 1e3 * float(np.median(spent)), "ms_worst": 1e3 * max(spent)}
-
-
 SECTIONS: dict[str, Callable[[], object]] = {
-    "place query": place_query,
     "local adjustment": lambda: adjustment(30, 2000, 8000, 15, 5),
-    "bal": bal,
     "pose graphs": pose_graphs,
     "global adjustment": lambda: adjustment(1000, 60_000, 360_000, 1, 1),
 }
-NEEDS_DATA = ("bal", "pose graphs")
 
 
 def main() -> None:
@@ -289,7 +190,7 @@ def main() -> None:
         "gtsam": metadata.version("gtsam"),
     }
     for name in options.only or SECTIONS:
-        if name in NEEDS_DATA and not (DATA / "pose_graphs").exists():
+        if name == "pose graphs" and not (DATA / "pose_graphs").exists():
             print(f"SKIPPED {name}: no reference problems at {DATA / 'pose_graphs'}", flush=True)
             continue
         found[name] = SECTIONS[name]()
