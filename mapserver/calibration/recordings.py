@@ -15,8 +15,8 @@ from mapserver.calibration.estimate import CalibrationEstimate, continued_from, 
 from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.survey_data import stretch_of_survey
-from mapserver.survey.pipeline import begin_survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import begin_survey
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 P = CalibrationParameter

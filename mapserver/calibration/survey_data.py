@@ -13,8 +13,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import WheelSample
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
-from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.state import Keyframe, SurveyState
 
 MOST_KEYFRAMES = 120  # of one stretch: more would cost time and say little more
 _ROW_SIGMA_PX = 0.15
@@ -31,7 +30,7 @@ def stretch_of_survey(
 ) -> CalibrationData:
     """The keyframes of a survey that turn most, with what they see. rig: the calibration that the survey used, and its rectifier."""
     chosen = _busiest(state)
-    part = state_of(state, chosen)
+    part = state.of(chosen)
     marks, motion = part.landmarks, part.motion
     order = np.argsort(marks.obs_landmark, kind="stable")
     number = np.flatnonzero(chosen).tolist()

@@ -67,7 +67,7 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.merge.multi_session import Joined, Joining, Session
+from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
@@ -156,7 +156,7 @@ class Built:
     """The surveys and their outcomes: the map in its final frame, its accuracy, and whether it is the site's first."""
 
     surveyed: list[Surveyed]
-    joined: Joined
+    joined: MergedMap
     accuracy: Accuracy
     is_first: bool
 
@@ -255,7 +255,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
 
-        pinhole, joining = None if base is None else base.camera, Joining(base, settings)
+        pinhole, joining = None if base is None else base.camera, MapMerger(base, settings)
         with open_side_thread(options.threads) as beside:
 
             def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:

@@ -28,9 +28,8 @@ from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread, starts_without_prior
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.pipeline import Survey
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.stages import Survey
+from mapserver.survey.survey_map import SurveyMap, history_of
 
 PROBES = 40  # of each kind: one wrong or missing frame weighs 2.5 %
 

@@ -11,11 +11,11 @@ from mapserver.floor_plan.survey_requests import SiteFiles, open_requests
 from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.surfels.surfel_map import SurfelReport, Surfels, encode_surfels, surfel_report
 from mapserver.surfels.survey_surfels import grow_surfels
-from mapserver.survey.merge.multi_session import Joined
+from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
 
 
-def layer_sessions(taken: Sequence[Surveyed], joined: Joined) -> list[GridSession]:
+def layer_sessions(taken: Sequence[Surveyed], joined: MergedMap) -> list[GridSession]:
     """The recordings that are in the map, where their frames are in its final frame."""
     places = [trajectory.frame_from_body for trajectory in map_trajectories(joined)]
     return [GridSession(s.entry.name, s.survey, place) for s, place in zip(taken, places, strict=True)]
@@ -44,7 +44,7 @@ def surfel_layer(
 _CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: stamps before are no calendar's, but count from a start
 
 
-def covered_requests(files: SiteFiles, site: str, joined: Joined) -> dict[str, float]:
+def covered_requests(files: SiteFiles, site: str, joined: MergedMap) -> dict[str, float]:
     """By id of each open request the share of its places that these recordings drove past; what is older counts for nothing."""
     places = joined.map.map_from_body[:, :2, 3]
     drives = map_trajectories(joined)

@@ -15,7 +15,7 @@ from fleetmap.errors import StoreError, disk_errors
 from fleetmap.geometry import AnyArray
 from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.survey.keyframes.keyframes import MemoryImageStore, Pictures
+from mapserver.survey.state import MemoryImageStore, Pictures
 
 if TYPE_CHECKING:
     from fleetmap.recordings import FrameSource

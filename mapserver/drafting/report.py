@@ -21,7 +21,7 @@ from mapserver.quality.figures import Evidence, Starts, TileDirections
 from mapserver.quality.probes import lookalike_words
 from mapserver.surfels.surfel_map import SurfelReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
-from mapserver.survey.merge.multi_session import Joined
+from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.survey_map import SurveyMap
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class BuildCost(msgspec.Struct, frozen=True):
 
 
 def make_report(
-    recordings: "Sequence[Surveyed]", joined: Joined, found: Accuracy, cost: BuildCost, evidence: Evidence
+    recordings: "Sequence[Surveyed]", joined: MergedMap, found: Accuracy, cost: BuildCost, evidence: Evidence
 ) -> BuildReport:
     """The report of surveyed recordings, map_bytes still unknown."""
     survey_map = joined.map
@@ -168,7 +168,7 @@ def make_report(
     )
 
 
-def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
+def sessions_report(names: list[str], joined: MergedMap) -> list[dict[str, Any]]:
     """What became of every recording, in their order."""
     return [
         {"recording": names[o.number], "joined": o.joined, "verdict": o.verdict.value, "reason": o.reason}
@@ -179,7 +179,7 @@ def sessions_report(names: list[str], joined: Joined) -> list[dict[str, Any]]:
 
 
 def report_details(
-    surveyed: "Sequence[Surveyed]", joined: Joined, found: Accuracy, stage_s: dict[str, float]
+    surveyed: "Sequence[Surveyed]", joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
 ) -> dict[str, Any]:
     """Keys of the full report beside the stable ones, which help to understand those; they may change.
 
@@ -231,7 +231,7 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     )
 
 
-def loop_places(taken: "Sequence[Surveyed]", joined: Joined) -> list[dict[str, Any]]:
+def loop_places(taken: "Sequence[Surveyed]", joined: MergedMap) -> list[dict[str, Any]]:
     """Loops of the recordings that are in the map, accepted ones and the refused ones that looked most alike.
 
     Of each the recording, both ends (x, y) in `map`, verdict, reason and score.

@@ -36,8 +36,8 @@ from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
-from mapserver.survey.merge.multi_session import Joined, chained
-from mapserver.survey.pipeline import Survey, survey
+from mapserver.survey.merge.multi_session import MergedMap, chained
+from mapserver.survey.stages import Survey, survey
 from mapserver.survey.survey_inputs import Progress, SurveyConfig, SurveyInputs, SurveyTools, no_progress
 
 _log = logging.getLogger(__name__)
@@ -350,7 +350,7 @@ def survey_all(
     return done
 
 
-def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: Joined) -> None:
+def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: MergedMap) -> None:
     """Names the recordings that could not be joined; raises SurveyError where none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
     for recording, outcome in left:
@@ -363,14 +363,14 @@ def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: 
         )
 
 
-def joined_truth(surveyed: list[Surveyed], joined: Joined) -> Trajectory | None:
+def joined_truth(surveyed: list[Surveyed], joined: MergedMap) -> Trajectory | None:
     """The truth of the joined recordings on one clock, None where one of them has none."""
     truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
     known = [truth for truth in truths if truth is not None]
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
-def map_trajectories(joined: Joined) -> list[Trajectory]:
+def map_trajectories(joined: MergedMap) -> list[Trajectory]:
     """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
     ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
     parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])

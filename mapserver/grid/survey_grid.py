@@ -12,8 +12,8 @@ from fleetmap.version_grid import Counts, Tiles
 from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
 from mapserver.grid.site_grid import SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
-from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.pipeline import Survey
+from mapserver.survey.stages import Survey
+from mapserver.survey.state import Keyframe
 
 _FLOOR_VIEWS = 15
 

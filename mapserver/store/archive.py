@@ -19,8 +19,7 @@ from fleetmap.geometry import AnyArray
 from fleetmap.mapformat import pack, unpack
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.survey_map import History, SurveyMap
+from mapserver.survey.survey_map import History, SurveyMap, history_of
 
 ARCHIVE_MAGIC = b"FMAR"
 ARCHIVE_FORMAT = 2

@@ -36,7 +36,7 @@ from mapserver.surfels.merge_kernels import (
     voxel_keys,
 )
 from mapserver.surfels.surfel_map import EXPOSURE, Surfels
-from mapserver.survey.keyframes.keyframes import Keyframe
+from mapserver.survey.state import Keyframe
 
 _KEPT_STEP_PX = 4  # of what a view shows every so many pixels are kept, to ask what it sees through
 _BLOCK_M = 4.0  # surfels are judged by the views that are near to their block

@@ -10,10 +10,10 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.frame_tracks import FrameTracks
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
-from mapserver.survey.odometry_pass import OdometryPass, summary_of
+from mapserver.survey.odometry_pass import summary_of
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 # Assumed drift of the poses, a random walk: standard deviations after one metre.

@@ -11,46 +11,15 @@ from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus,
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
-from mapserver.survey.frame_tracks import FrameTracks
-from mapserver.survey.keyframes.keyframes import FrameSummary, Keyframe, KeyframePolicy, make_keyframes, sharpness
+from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
 _AWAY_RAD, _AWAY_MPS = np.pi, 1.0  # in a pause: any turn, and the way at the speed of one who carries a robot
 _NO_IDS = np.zeros(0, np.int64)
-
-
-@dataclass(frozen=True, slots=True)
-class Cut:
-    """A frame at which a survey was to be cut into segments, seconds after its first one; refused: why it could not, None where it was."""
-
-    frame: int
-    after_s: float
-    refused: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryPass:
-    """Odometry of F frames and K keyframes.
-
-    odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): whether the frame is tied to the
-    ones before; inertial: whether gravity was found; scale_known: whether lengths are metres; has_wheels: whether wheel odometry
-    took part; tracks: the points that were followed, None where none were; cuts: where segments were to begin. Of one camera only tracked
-    frames are in one frame and scale, and only they give keyframes.
-    """
-
-    estimates: list[OdometryEstimate]
-    odom_from_body: Array
-    covariances: Array
-    tracked: Array
-    keyframes: list[Keyframe]
-    inertial: bool
-    scale_known: bool = True
-    has_wheels: bool = False
-    tracks: FrameTracks | None = None
-    cuts: tuple[Cut, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,10 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.keyframes import ImageStore
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import ImageStore, OdometryPass, SurveyState
+from mapserver.survey.tracks.mono_depths import MonoDepths
 
 _RELEASED_EVERY = 4096  # steps of a stage: the features that these have read are far fewer than a site's
 Progress = Callable[[str, int, int], None]  # stage, done, total
@@ -79,3 +80,16 @@ class SurveyTools:
         """What was found in keyframes may leave memory until it is read again."""
         if self.images is not None:
             self.images.release()
+
+
+@dataclass(frozen=True)
+class AdjustedChain:
+    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already.
+
+    depths: of one camera's features; None for rigs that measure depth.
+    """
+
+    odometry: OdometryPass
+    state: SurveyState
+    matched: set[tuple[int, int]]
+    depths: MonoDepths | None

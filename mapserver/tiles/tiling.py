@@ -9,8 +9,7 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
 from mapserver.survey.finish.landmark_visibility import viewing_cones
-from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.survey_map import SurveyMap, history_of
 
 TILE_SIZE_M = 16.0
 MAX_PLACE_LANDMARKS = 300

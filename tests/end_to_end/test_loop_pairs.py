@@ -23,11 +23,12 @@ from fleetmap.recordings.calibration_files import read_euroc_camera
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
+from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.loops.loops import LoopCloser, Loops, LoopVerdict
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
+from mapserver.survey.state import Keyframe, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 from support.recordings.realdata import real_data

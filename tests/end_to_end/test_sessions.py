@@ -21,10 +21,10 @@ from fleetmap.sensors.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from mapserver.survey.merge.membership import JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.pipeline import extend
-from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
 from support.storage.known_rig import KNOWN_RIG
@@ -253,8 +253,8 @@ def test_a_prior_alone_joins_nothing(nights: Nights, tmp_path: Path) -> None:
         foreign = survey(inputs, SurveyConfig(settings, default_vocabulary()))
     for docks in (None, np.eye(4), se3(np.eye(3), np.array([30.0, 20.0, 0.0]))):
         held = extend(base, foreign, settings, anchored=True, map_from_survey=docks)
-        assert isinstance(held, NotJoined)
-        assert held.verdict is not JoinVerdict.JOINED
+        assert isinstance(held, Membership)
+        assert held.verdict is not MembershipVerdict.JOINED
         assert "drive" in held.reason
 
 

@@ -13,9 +13,9 @@ from benchmarks.common.simulated_survey import drawn_alignment, session_of, simu
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
-from mapserver.survey import pipeline
-from mapserver.survey.bundle.bundle_rounds import SurveyState
-from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey import stages
+from mapserver.survey.state import SurveyState
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig
 from studies.study import Column, Row, publish, results, table
 
 SEEDS = range(41, 46)
@@ -24,7 +24,7 @@ _STAGES = "odometry", "neighbours", "pose graph", "all together"
 _BARS = "#d1342f", "#c77700", "#2563eb", "#14924b"
 
 
-def stages(sensors: str, seed: int) -> dict[str, Any]:
+def errors_by_stage(sensors: str, seed: int) -> dict[str, Any]:
     """ATE of the keyframes in metres after each stage of one survey, without pictures; features, tracks and sensors are simulated."""
     settings = survey_settings(None, SENSORS[sensors])
     session = session_of("small-loop", ["survey"], seed)
@@ -33,19 +33,19 @@ def stages(sensors: str, seed: int) -> dict[str, Any]:
         session.session = replace(session.session, nominal=bare, imu=ImuSamples.empty(), wheel=())
     survey = simulated_survey(session, settings)
     seen: list[SurveyState] = []
-    close, adjust = pipeline._close_loops, pipeline._adjust_globally
+    close, adjust = stages.close_loops, stages.adjust_globally
 
-    def before_loops(odometry: Any, state: SurveyState, *rest: Any) -> Any:
-        seen.append(state)
-        return close(odometry, state, *rest)
+    def before_loops(chain: AdjustedChain, *rest: Any) -> Any:
+        seen.append(chain.state)
+        return close(chain, *rest)
 
     def after_loops(odometry: Any, state: SurveyState, *rest: Any) -> Any:
         seen.append(state)
         return adjust(odometry, state, *rest)
 
-    hooks = patch.multiple(pipeline, _close_loops=before_loops, _adjust_globally=after_loops)
+    hooks = patch.multiple(stages, close_loops=before_loops, adjust_globally=after_loops)
     with drawn_alignment(survey), hooks:
-        made = pipeline.survey_from(survey.odometry, survey.inputs, SurveyConfig(settings, default_vocabulary()))
+        made = stages.survey_from(survey.odometry, survey.inputs, SurveyConfig(settings, default_vocabulary()))
     numbers = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
     truth = survey.map_from_body[numbers]
     kept = survey.map_from_body[[keyframe.frame_index for keyframe in made.odometry.keyframes]]
@@ -56,7 +56,7 @@ def stages(sensors: str, seed: int) -> dict[str, Any]:
 
 def case(sensors: str) -> Row:
     """Medians over the seeds, and the worst."""
-    found = [stages(sensors, seed) for seed in SEEDS]
+    found = [errors_by_stage(sensors, seed) for seed in SEEDS]
     medians = {stage: 1e3 * float(np.median([f[stage] for f in found])) for stage in _STAGES}
     worst = {f"worst {stage}": 1e3 * max(f[stage] for f in found) for stage in _STAGES}
     return {"sensors": sensors, "loops": float(np.median([f["loops"] for f in found])), **medians, **worst}

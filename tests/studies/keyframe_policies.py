@@ -18,8 +18,8 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import SensorSet
 from mapserver.config import survey_settings
 from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy
-from mapserver.survey.pipeline import survey_from
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import survey_from
 from mapserver.survey.survey_inputs import SurveyConfig
 from studies.study import Column, Row, publish, results, table
 

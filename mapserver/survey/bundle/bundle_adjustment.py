@@ -12,11 +12,6 @@ from mapserver.survey.bundle.factors import Normal, State, Terms, pack_terms
 from mapserver.survey.bundle.problem import (
     BundleProblem,
     BundleResult,
-    InertialTerms,
-    MotionPrior,
-    PriorTerm,
-    RelativeTerm,
-    continued,
 )
 from mapserver.survey.bundle.reduced_system import Chains, ReducedSystem, build_chains, solve_reduced
 from mapserver.survey.bundle.reprojection_kernels import (
@@ -30,18 +25,6 @@ from mapserver.survey.bundle.reprojection_kernels import (
 from mapserver.survey.bundle.schur_kernels import Eliminated, View, invert_landmarks, reduce_to_poses
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure, build_structure
-
-__all__ = [
-    "BundleProblem",
-    "BundleResult",
-    "BundleSettings",
-    "InertialTerms",
-    "MotionPrior",
-    "PriorTerm",
-    "RelativeTerm",
-    "continued",
-    "optimize",
-]
 
 LAMBDA_MIN, LAMBDA_MAX = 1e-10, 1e10
 DAMPING_FLOOR = 1e-9

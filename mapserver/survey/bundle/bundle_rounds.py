@@ -9,62 +9,11 @@ from fleetmap.geometry import Array
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_adjustment import (
-    BundleProblem,
-    BundleResult,
-    InertialTerms,
-    RelativeTerm,
-    optimize,
-)
+from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.measured_noise import measured_sigmas
+from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks
-
-
-@dataclass(frozen=True)
-class KeyframeMotion:
-    """Velocities and biases at K keyframes; inertial is False for a rig whose gravity was never found.
-
-    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is no IMU, and where
-    pictures show nothing. goes_on (K,): whether an inertial factor joins a keyframe with the one before; True everywhere for None.
-    """
-
-    inertial: bool
-    imu: ImuSamples
-    noise: ImuNoise | None
-    imu_minus_cam_s: float
-    velocities_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
-    relative: list[RelativeTerm]
-    goes_on: NDArray[np.bool_] | None = None
-
-    def of(self, chosen: NDArray[np.bool_]) -> "KeyframeMotion":
-        """That of the chosen keyframes (K,), numbered anew."""
-        number = np.cumsum(chosen) - 1
-        kept = [r for r in self.relative if chosen[r.i] and chosen[r.j]]
-        return replace(
-            self,
-            velocities_mps=self.velocities_mps[chosen],
-            gyro_bias_radps=self.gyro_bias_radps[chosen],
-            accel_bias_mps2=self.accel_bias_mps2[chosen],
-            relative=[replace(r, i=int(number[r.i]), j=int(number[r.j])) for r in kept],
-        )
-
-
-@dataclass(frozen=True)
-class SurveyState:
-    """Variables of the adjustment: K keyframes and the landmarks."""
-
-    stamps_ns: NDArray[np.int64]
-    map_from_body: Array
-    body_from_cam: Array
-    camera: StereoCamera
-    motion: KeyframeMotion
-    landmarks: Landmarks
-    is_depth_camera: bool = False
+from mapserver.survey.state import Landmarks, RelativeTerm, SurveyState
 
 
 def bundle_rounds(
@@ -96,17 +45,6 @@ def bundle_rounds(
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
         del problem, result  # and with them the observations that were dropped
     return state
-
-
-def state_of(state: SurveyState, chosen: NDArray[np.bool_]) -> SurveyState:
-    """A state of its own of the chosen keyframes (K,) and of the landmarks that two of them see."""
-    number = np.cumsum(chosen) - 1
-    marks = state.landmarks.keep_observations(chosen[state.landmarks.obs_keyframe], 2)
-    marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
-    stamps_ns, map_from_body = state.stamps_ns[chosen], state.map_from_body[chosen]
-    return replace(
-        state, stamps_ns=stamps_ns, map_from_body=map_from_body, landmarks=marks, motion=state.motion.of(chosen)
-    )
 
 
 def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:

@@ -7,7 +7,8 @@ import numpy as np
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import GRAVITY_MAP, Preintegrated
 from mapserver.survey.bundle.factor_kernels import Measurement, linearise_inertial, linearise_prior, linearise_relative
-from mapserver.survey.bundle.problem import BundleProblem, PriorTerm, RelativeTerm
+from mapserver.survey.bundle.problem import BundleProblem, PriorTerm
+from mapserver.survey.state import RelativeTerm
 
 # Below this an increment's covariance means nothing: rounding of the sums, and it keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)

@@ -15,16 +15,7 @@ from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-
-
-@dataclass(frozen=True)
-class RelativeTerm:
-    """A measured i_from_j (4, 4) between keyframes i and j; information (6, 6) of a perturbation in the axes of i."""
-
-    i: int
-    j: int
-    i_from_j: Array
-    information: Array
+from mapserver.survey.state import RelativeTerm
 
 
 @dataclass(frozen=True)

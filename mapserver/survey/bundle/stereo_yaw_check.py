@@ -12,12 +12,13 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, BundleResult, optimize
-from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_problem
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.measured_noise import measured_sigmas
+from mapserver.survey.bundle.problem import BundleProblem, BundleResult
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import Landmarks, SurveyState
 
 _FIRST_TRY_PX = 0.05
 _MAX_STEPS = 4

@@ -8,11 +8,9 @@ from scipy.spatial import cKDTree
 
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array
-from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, mark_redundant
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.settings import CullSettings
-from mapserver.survey.tracks.tracks import Landmarks, of_features
+from mapserver.survey.state import Keyframe, Landmarks, SurveyState
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +30,7 @@ def cull(
     sigmas_m (N,) of the landmarks.
     """
     marks = state.landmarks
-    octaves = of_features(marks, [k.features.octaves for k in keyframes]).astype(np.int64)
+    octaves = marks.of_features([k.features.octaves for k in keyframes]).astype(np.int64)
     double = _duplicates(marks, keyframes, sigmas_m, settings)
     weak = ~double & (parallax_rad(state) < np.radians(settings.min_parallax_deg))
     lasting = ~(double | weak)
@@ -69,7 +67,7 @@ def _duplicates(
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     first = replace(marks, obs_keyframe=marks.obs_keyframe[starts[:-1]], obs_feature=marks.obs_feature[starts[:-1]])
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64)
-    descriptors = packed(of_features(first, [k.features.descriptors for k in keyframes]))
+    descriptors = packed(first.of_features([k.features.descriptors for k in keyframes]))
     landmarks = marks.points_map, sigmas_m, starts, marks.obs_keyframe, descriptors
     mark_duplicates(near, *landmarks, settings.duplicate_distance, double)
     return double

@@ -13,23 +13,17 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
-from mapserver.survey.bundle.bundle_adjustment import (
-    BundleProblem,
-    InertialTerms,
-    MotionPrior,
-    RelativeTerm,
-    continued,
-    optimize,
-)
-from mapserver.survey.bundle.bundle_rounds import SurveyState, scaled_noise
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.bundle_rounds import scaled_noise
 from mapserver.survey.bundle.odometry_factors import edge_covariance
+from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, MotionPrior, continued
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import OdometryPass, RelativeTerm, SurveyState
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -10,15 +10,12 @@ from fleetmap.features.patch_align import halvings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.finish.culling import Culled, cull
 from mapserver.survey.finish.frame_adjustment import PlacedFrames
 from mapserver.survey.finish.map_assembly_kernels import medoids
-from mapserver.survey.keyframes.keyframes import Keyframe
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.survey.tracks.tracks import Landmarks, of_features
 
 _PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
 _CHUNK = 5000  # landmarks
@@ -32,7 +29,7 @@ def assemble(
     marks, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
     keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
-    octaves = of_features(marks, [k.features.octaves for k in keyframes])
+    octaves = marks.of_features([k.features.octaves for k in keyframes])
     frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
     stamps_ns, map_from_kept = state.stamps_ns[kept], state.map_from_body[kept]
     handed_on = replace(state, stamps_ns=stamps_ns, map_from_body=map_from_kept, landmarks=marks)
@@ -60,7 +57,7 @@ def assemble(
 
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
     """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
-    rows = of_features(marks, [k.features.descriptors for k in keyframes])
+    rows = marks.of_features([k.features.descriptors for k in keyframes])
     chosen = np.zeros(len(marks.points_map), np.int64)
     medoids(packed(rows), np.searchsorted(marks.obs_landmark, np.arange(len(chosen) + 1)), chosen)
     return rows[chosen]

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.bundle.bundle_rounds import SurveyState
+from mapserver.survey.state import SurveyState
 from mapserver.survey.survey_map import SurveyMap
 
 

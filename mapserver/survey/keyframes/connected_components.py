@@ -12,10 +12,9 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
-from mapserver.survey.bundle.bundle_rounds import SurveyState, state_of
+from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.loops.parts import Parts
-from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.state import OdometryPass, SurveyState
 from mapserver.survey.survey_map import SurveyMap
 
 MIN_SHARED = 15  # landmarks, as many as a loop needs matches
@@ -77,23 +76,25 @@ def find_components(survey_map: Observations, odometry_sigmas_m: "SigmaBetween",
     are with the component before or after as long as three sigmas of the odometry are within that limit.
     """
     seeing = _seeing(survey_map)
-    groups = np.unique(_parts(survey_map, seeing, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
+    groups = np.unique(_grouped(survey_map, seeing, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
     return _named(survey_map, groups.astype(np.int64), np.flatnonzero(seeing))
 
 
-def find_parts(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
-    """The same before loops are closed, where parts may be many and none is chosen."""
-    return _parts(survey_map, _seeing(survey_map), odometry_sigmas_m, join_sigma_m)
+def find_groups(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> KeyframeGroups:
+    """The same before loops are closed, where groups may be many and none is chosen."""
+    return _grouped(survey_map, _seeing(survey_map), odometry_sigmas_m, join_sigma_m)
 
 
 def _seeing(survey_map: Observations) -> NDArray[np.bool_]:
     return np.bincount(survey_map.obs_keyframe, minlength=len(survey_map.keyframe_stamps_ns)) >= MIN_SEEN
 
 
-def _parts(survey_map: Observations, seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float) -> Parts:
+def _grouped(
+    survey_map: Observations, seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float
+) -> KeyframeGroups:
     rows, columns = shared_landmarks(survey_map, MIN_SHARED)
     joins = [*zip(rows.tolist(), columns.tolist(), strict=True), *bridges(seeing, sigmas_m, join_sigma_m)]
-    return Parts(joins, len(seeing))
+    return KeyframeGroups(joins, len(seeing))
 
 
 def bridges(
@@ -140,7 +141,7 @@ def only_kept(
     number = np.cumsum(kept) - 1
     edges = [replace(e, i=int(number[e.i]), j=int(number[e.j])) for e in loops.edges if kept[e.i] and kept[e.j]]
     keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
-    return state_of(state, kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
+    return state.of(kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
 
 
 def shared_landmarks(survey_map: Observations, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,10 +1,9 @@
 """Keyframe selection, and the data that is kept of each keyframe."""
 
 from collections import deque
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import count, islice
-from typing import Protocol
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -12,107 +11,13 @@ from numpy.typing import NDArray
 
 from fleetmap.features import orb, patch_align, stereo
 from fleetmap.features.extraction import extract
-from fleetmap.geometry import AnyArray, Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
+from mapserver.survey.state import ImageStore, Keyframe, MemoryImageStore, Pictures
 
 _BATCH = 2  # frames for one call: a twentieth of a second each
-
-
-@dataclass(frozen=True, slots=True)
-class Pictures:
-    """What a keyframe looks like: its rectified frame and the left picture's pyramid."""
-
-    frame: RectifiedFrame
-    pyramid: patch_align.Pyramid
-
-
-class ImageStore(Protocol):
-    """Storage for the pictures of keyframes, and for what is found in them: those of a long survey do not fit in memory. For any thread."""
-
-    def put(self, pictures: Pictures) -> int:
-        """The number under which `get` gives them back."""
-
-    def get(self, number: int) -> Pictures:
-        """The pictures as they were put."""
-
-    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        """The same arrays, where memory need not hold them all the time."""
-
-    def release(self) -> None:
-        """A stage is over: what `keep` returned may leave memory until it is read again."""
-
-
-class MemoryImageStore:
-    """Keeps all pictures as they are."""
-
-    def __init__(self) -> None:
-        self._numbers = count()
-        self._pictures: dict[int, Pictures] = {}
-
-    def put(self, pictures: Pictures) -> int:
-        number = next(self._numbers)
-        self._pictures[number] = pictures
-        return number
-
-    def get(self, number: int) -> Pictures:
-        return self._pictures[number]
-
-    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        return list(arrays)
-
-    def release(self) -> None:
-        """See ImageStore."""
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
-
-    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own. nodes (N, 2): the
-    vocabulary's branches that are nearest to each feature; None where all descriptors are compared.
-    """
-
-    frame_index: int
-    stamp_ns: int
-    features: orb.Features
-    disparities: Array
-    points_cam: Array
-    images: ImageStore
-    image_number: int
-    from_views: bool = False
-    nodes: NDArray[np.int32] | None = None
-
-    @property
-    def pictures(self) -> Pictures:
-        """The pictures, fetched from the image store."""
-        return self.images.get(self.image_number)
-
-    @property
-    def frame(self) -> RectifiedFrame:
-        """The rectified frame."""
-        return self.pictures.frame
-
-    @property
-    def pyramid(self) -> patch_align.Pyramid:
-        """The left picture and its halvings."""
-        return self.pictures.pyramid
-
-
-@dataclass(frozen=True, slots=True)
-class PosedKeyframes:
-    """K keyframes at map_from_body (K, 4, 4), seen by one camera with the mounting body_from_cam (4, 4)."""
-
-    keyframes: list[Keyframe]
-    map_from_body: Array
-    body_from_cam: Array
-    camera: StereoCamera
-
-    @property
-    def map_from_cam(self) -> Array:
-        """(K, 4, 4)."""
-        return self.map_from_body @ self.body_from_cam
 
 
 def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
@@ -166,20 +71,6 @@ def set_aside(keyframe: Keyframe, store: ImageStore) -> Keyframe:
     found = own.pixels, own.octaves, own.angles_deg, own.descriptors, keyframe.disparities, keyframe.points_cam
     *features, disparities, points_cam = store.keep(found)
     return replace(keyframe, features=orb.Features(*features), disparities=disparities, points_cam=points_cam)
-
-
-def with_pictures(keyframe: Keyframe, *, whole: bool) -> Keyframe:
-    """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
-    pictures, images = keyframe.pictures, MemoryImageStore()
-    if not whole:
-        frame = RectifiedFrame(keyframe.stamp_ns, pictures.pyramid[0], None, None)
-        pictures = Pictures(frame, pictures.pyramid)
-    return replace(keyframe, images=images, image_number=images.put(pictures))
-
-
-def without_pictures(keyframe: Keyframe) -> Keyframe:
-    """The same keyframe with an empty image store, cheap to send where only features are compared."""
-    return replace(keyframe, images=MemoryImageStore(), image_number=0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import (
-    SurveyState,
     apply_result,
     bundle_problem,
     bundle_rounds,
-    state_of,
     with_keyframes_of,
 )
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.keyframes.revisit_thinning_kernels import TrackMembers, mark_repeated
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks, Tracks
+from mapserver.survey.state import Keyframe, Landmarks, SurveyState
+from mapserver.survey.tracks.tracks import Tracks
 
 _LONGEST_GAP_S = 3.0  # over which the IMU carries from one keyframe to the next where those between take no part
 
@@ -65,7 +63,7 @@ def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> Surve
     """The state of all other keyframes; no inertial factor joins those between which redundant ones leave a long gap."""
     if not redundant.any():
         return state
-    part, chosen = state_of(state, ~redundant), np.flatnonzero(~redundant)
+    part, chosen = state.of(~redundant), np.flatnonzero(~redundant)
     goes_on = (np.diff(chosen, prepend=-1) == 1) | (np.diff(part.stamps_ns, prepend=0) < int(_LONGEST_GAP_S * 1e9))
     return replace(part, motion=replace(part.motion, goes_on=goes_on))
 

@@ -14,19 +14,21 @@ from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
 from fleetmap.live_survey import LivePart, LiveRevisit
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.survey.bundle.bundle_adjustment import MotionPrior, RelativeTerm, optimize
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, apply_result, bundle_problem
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
+from mapserver.survey.bundle.problem import MotionPrior
 from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBetween, bridges
-from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe, without_pictures
+from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe, joined_imu
+from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import CONTRADICTED, LoopCloser, LoopRecord, LoopVerdict, body_edge
-from mapserver.survey.loops.parts import Parts
-from mapserver.survey.loops.sim3_loops import Sim3LoopCloser, gate_covariances, rigid, solve_scaled
+from mapserver.survey.loops.sim3_loops import gate_covariances, rigid, solve_scaled
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from mapserver.survey.state import Keyframe, KeyframeMotion, PosedKeyframes, RelativeTerm, SurveyState, survey_camera
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder
-from mapserver.survey.tracks.mono_depths import MonoDepths, survey_camera
+from mapserver.survey.tracks.mono_depths import MonoDepths
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks import build_landmarks, tracks_of
 
@@ -65,8 +67,8 @@ class LiveMap:
         self._level = np.eye(3)
         self._adjusted_ns = 0
         self._seeing = np.zeros(0, bool)
-        self._parts = Parts()  # by what keyframes share with their neighbours, and by odometry
-        self._joined = Parts()  # by loops as well, as the loop closer has it
+        self._parts = KeyframeGroups()  # by what keyframes share with their neighbours, and by odometry
+        self._joined = KeyframeGroups()  # by loops as well, as the loop closer has it
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -117,7 +119,7 @@ class LiveMap:
 
     def parts(self) -> LiveParts:
         """What belongs together: by neighbours, by odometry, and by the loops that are believed."""
-        whole = Parts(enumerate(self._parts.labels().tolist()), len(self))
+        whole = KeyframeGroups(enumerate(self._parts.labels().tolist()), len(self))
         for edge in self._believed:
             whole.join(edge.i, edge.j)
         firsts = whole.labels()
@@ -164,7 +166,7 @@ class LiveMap:
         keyframe = make_keyframe(frame, new.number, self._rig.camera, self._settings)
         self._keyframes.append(keyframe)
         if len(self._keyframes) > _WINDOW:
-            self._keyframes[-_WINDOW - 1] = without_pictures(self._keyframes[-_WINDOW - 1])
+            self._keyframes[-_WINDOW - 1] = self._keyframes[-_WINDOW - 1].without_pictures()
             if self._depths is not None:
                 self._depths.release(len(self._keyframes) - _WINDOW - 1)
         self._news.append(new)
@@ -355,8 +357,10 @@ class LiveMap:
         marginals = GraphMarginals(self._map_from_body, [*self._known(), *learned])
         self._marginals = marginals
         if self._closer is None:
-            kind = LoopCloser if self._rig.scale_known else Sim3LoopCloser
-            self._closer = kind(posed, self._options, marginals, set(matched), parts=self._joined)
+            measures_scale = not self._rig.scale_known
+            self._closer = LoopCloser(
+                posed, self._options, marginals, matched, groups=self._joined, measures_scale=measures_scale
+            )
             self._closer.close(0)
         else:
             self._closer.grow(posed, marginals, matched)
@@ -375,7 +379,7 @@ class LiveMap:
 
     def _solved(self, closer: LoopCloser, edges: list[PoseEdge]) -> tuple[Array, Array]:
         """(K, 4, 4) of the keyframes by chain and loops, and the loops' weights."""
-        if isinstance(closer, Sim3LoopCloser):
+        if not self._rig.scale_known:
             walk = self._settings.monocular.scale_walk
             scaled = solve_scaled(closer.begin, self._chain, edges, closer.scales, walk)
             return rigid(scaled), scaled.loop_weights

@@ -11,13 +11,13 @@ from fleetmap.bow import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_inverse, se3_log
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, without_pictures
-from mapserver.survey.loops.parts import Parts, Revisit, WaitingRevisits
+from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits
 from mapserver.survey.loops.repetition import Repetition
+from mapserver.survey.loops.sim3_loops import measured_log_scale
 from mapserver.survey.pose_graph.graph_marginals import CHI2_3_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+from mapserver.survey.state import Keyframe, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyConfig
-from mapserver.survey.tracks.matching import median_depth_m
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_pair, match_task
 
 # Matched points share calibration and depth errors: a pair's own covariance is too narrow by about this factor.
@@ -25,10 +25,8 @@ _CORRELATION = 3.0
 _CHUNK = 64  # candidates that are gated at once
 _SIDES = 16  # to which the site may repeat
 _ALIAS_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
-_ALIAS_REACH, _ALIAS_GATE = (
-    0.5,
-    4.0,
-)  # of the view's reach, and of the gate, beyond which a match is of another place for certain
+# Of the view's reach, and of the gate, beyond which a match is of another place for certain
+_ALIAS_REACH, _ALIAS_GATE = 0.5, 4.0
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
 # Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
@@ -36,6 +34,7 @@ _WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
 _LEARNED_PER_DOUBLING = 64
 CONTRADICTED = "contradicts the other loops in the pose graph"
 _WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
+_FAR = "too far apart to see the same, given how well the way between is known"
 
 
 class LoopVerdict(StrEnum):
@@ -91,155 +90,185 @@ class Loops:
 
 
 class LoopCloser:
-    """Searches a chain of keyframes for revisits; `marginals` narrows with every loop that is accepted."""
+    """Searches a chain of keyframes for revisits: candidates pass a gate, are verified one by one and decided on together.
+
+    `marginals` narrows with every loop that is accepted. loops: the outcome so far. learned: loops by which the gate has narrowed.
+    scales: where it is measured, by how much each verified loop's keyframes differ in scale: (log scale, sigma) by (new, old).
+    """
 
     def __init__(
         self,
         posed: PosedKeyframes,
-        options: SurveyConfig,
+        config: SurveyConfig,
         marginals: GraphMarginals,
-        matched: set[tuple[int, int]],
+        matched: Iterable[tuple[int, int]],
         executor: Executor = SERIAL,
-        parts: Parts | None = None,
+        groups: KeyframeGroups | None = None,
+        *,
+        measures_scale: bool = False,
     ) -> None:
-        """matched: pairs of keyframes that were matched as neighbours, and so are no loops. parts: joined here by sure revisits; None
+        """matched: pairs of keyframes that were matched as neighbours, and so are no loops. groups: joined here by sure revisits; None
         where all keyframes belong together.
         """
-        self.parts = parts
-        self._waiting = WaitingRevisits()
-        self._repetition = Repetition()
-        self._camera, self._vocabulary = posed.camera, options.vocabulary
-        self._body_from_cam, self._cam_from_body = posed.body_from_cam, se3_inverse(posed.body_from_cam)
-        self._settings, self._zones = options.settings.loops, options.zones
-        self._vectors: list[BowVector] = []
+        self.loops, self.learned = Loops(), list[PoseEdge]()
+        self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
+        self._config, self._settings, self._executor = config, config.settings.loops, executor
+        self._measures_scale = measures_scale
+        self._waiting, self._repetition = WaitingRevisits(), Repetition()
         self._neighbours: dict[int, list[int]] = {}
-        self._executor = executor
-        self._shared = MatchInputs({}, posed.camera, options.settings.pairs)
-        self._bare: dict[int, Keyframe] = {}
-        self._inputs = replace(self._shared, keyframes=self._bare)
+        self._vectors: list[BowVector] = []
+        self._index = PlaceIndex(config.vocabulary.word_count)
         self._depths_m = np.zeros(0)
-        self._index = PlaceIndex(options.vocabulary.word_count)
-        self.loops = Loops()
-        self.learned: list[PoseEdge] = []  # loops by which the gate has narrowed
+        self._bare: dict[int, Keyframe] = {}
+        self._shared = MatchInputs({}, posed.camera, config.settings.pairs)
+        self._inputs = replace(self._shared, keyframes=self._bare)
         self.grow(posed, marginals, matched)
 
     def grow(self, posed: PosedKeyframes, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
         """Takes a longer chain: all keyframes where they are now, those that are known first; `matched` adds to what was given."""
-        new = posed.keyframes[len(self._vectors) :]
-        self._keyframes, self._map_from_body, self._marginals = posed.keyframes, posed.map_from_body, marginals
-        vocabulary = self._vocabulary
+        self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body, marginals
+        vocabulary, new = self._config.vocabulary, posed.keyframes[len(self._vectors) :]
         self._vectors += [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in new]
         for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
-        bare = [replace(without_pictures(k), nodes=vocabulary.branches(k.features.descriptors)) for k in new]
+        bare = [replace(k.without_pictures(), nodes=vocabulary.branches(k.features.descriptors)) for k in new]
         self._bare.update(enumerate(bare, len(self._bare)))
-        self._depths_m = np.append(self._depths_m, [median_depth_m(keyframe) for keyframe in new])
+        self._depths_m = np.append(self._depths_m, [keyframe.median_depth_m for keyframe in new])
 
     @property
     def begin(self) -> Array:
-        """(K, 4, 4) from where a pose graph with the loops is to begin: where the keyframes were, unless a loop has turned a part."""
+        """(K, 4, 4) from where a pose graph with the loops is to begin: where the keyframes were, unless a loop has turned a group."""
         return self._marginals.linearised_at
 
     def close(self, i: int) -> None:
         """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
-        ids, scores = self._alike(i)
+        candidates = self._gate(i, self._alike(i))
+        self._decide(self._verify(i, candidates))
+        self._index.add(i, self._vectors[i])
+
+    def _alike(self, i: int) -> "_Candidates":
+        """Old keyframes that share words with i and are not matched with it."""
+        ids = self._index.place_ids
+        new = i - ids >= self._settings.min_gap_keyframes
+        new &= ~np.isin(ids, self._neighbours.get(i, []))
+        if not new.any():
+            return _Candidates(np.zeros(0, np.int64), np.zeros(0), [])
+        ids, scores = self._index.query(self._vectors[i], new, self._settings.depth)
+        return _Candidates(ids, scores, [])
+
+    def _gate(self, i: int, found: "_Candidates") -> "_Candidates":
+        """Chooses the candidates that may be seen from where i can be, at most `top`.
+
+        Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
+        list, and records what it refused on the way.
+        """
+        far, zoned = list[int](), list[int]()
+        for start in range(0, len(found.ids), _CHUNK):
+            js = found.ids[start : start + _CHUNK]
+            reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
+            reachable = self._marginals.reachable(i, js, reach_m)
+            for n, is_reachable in enumerate(reachable.tolist(), start):
+                here, there = self._map_from_body[[i, found.ids[n]], :3, 3]
+                if not is_reachable:
+                    far.append(n)
+                elif not self._config.zones.compatible(here, there):
+                    zoned.append(n)
+                else:
+                    found.chosen.append(n)
+        for refused, reason in ((far, _FAR), (zoned, "in different zones")):
+            if refused:
+                first, *others = (int(found.ids[n]) for n in refused)
+                fate = float(found.scores[refused[0]]), LoopVerdict.GATED_OUT, reason
+                self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
+        del found.chosen[self._settings.top :]
+        return found
+
+    def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
+        """The candidates that pass every test alone, with their edges; records the others."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
-        inside = self._gate(i, ids, scores)
-        tasks = [PairTask.of([self._predict(i, int(ids[n]))], self._inputs) for n in inside]
+        tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
-        for n, (match,) in zip(inside, matches, strict=True):
-            j, score = int(ids[n]), float(scores[n])
+        for n, (match,) in zip(found.chosen, matches, strict=True):
+            j, score = int(found.ids[n]), float(found.scores[n])
             others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
             if len(same) >= self._settings.per_place:
                 reason = f"its place is closed with keyframe {same[0]} already"
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
-            outcome = self._examine(i, j, score, match, ids[scores >= _ALIAS_SCORE * score])
-            if isinstance(outcome, LoopRecord):
-                self.loops.records.append(outcome)
+            edge = None if match is None else self._edge(match)
+            aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
+            verdict, reason = self._examined(match, edge, aliases)
+            record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
+            if edge is not None and verdict is LoopVerdict.ACCEPTED:
+                verified.append((edge, record))
             else:
-                verified.append(outcome)
-        self._decide(i, verified)
-        self._index.add(i, self._vectors[i])
+                self.loops.records.append(record)
+        return verified
+
+    def _examined(
+        self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
+    ) -> tuple[LoopVerdict, str]:
+        """The verdict on one candidate alone, and its reason. aliases: old keyframes that look as much like the new one."""
+        if match is None or edge is None:
+            return LoopVerdict.REJECTED, "too few features agree on one motion"
+        count, settings = len(match.features), self._settings
+        cells = _cells(self._posed.keyframes[match.j], match.features[:, 1], self._posed.camera)
+        if count < settings.min_inliers or cells < settings.min_cells:
+            return LoopVerdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded"
+        innovation = self._marginals.innovation_squared(edge)
+        if innovation > settings.max_innovation:
+            self._learn_repetition(edge, count, innovation)
+            reason = f"matches, but from where the robot cannot be (innovation {innovation:.0f})"
+            return LoopVerdict.GATED_OUT, reason
+        supported = self._neighbours_agree(match)
+        if supported is False or (supported is None and count < settings.alone_inliers):
+            return LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it"
+        shift_m = self._unseen_alias(edge, aliases)
+        if shift_m is not None:
+            alike = f"places {shift_m:.2f} m apart look the same here"
+            return LoopVerdict.AMBIGUOUS, f"{alike}, and another such step is as possible as this one"
+        return LoopVerdict.ACCEPTED, "verified"
+
+    def _decide(self, verified: list[tuple[PoseEdge, LoopRecord]]) -> None:
+        """Accepts what is left, unless the candidates exclude each other: then none is."""
+        places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in verified]
+        spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
+        js = np.array([edge.j for edge, _ in verified], np.int64)
+        between = [np.trace(self._marginals.relative_covs(j, js[js != j])[:, 3:, 3:], axis1=1, axis2=2) for j in js]
+        tolerance = 0.3 + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
+        records = self.loops.records
+        for edge, record in verified:
+            if spread > tolerance:
+                reason = f"candidates {spread:.2f} m apart exclude each other"
+                records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
+            elif self.groups is None or self._is_of_one_group(edge):
+                records.append(record)
+                self._accept(edge)
+            else:
+                revisit = Revisit(edge, len(records))
+                records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=_WAITING))
+                sure = self._waiting.add(revisit, self.groups, self._marginals)
+                for each in sure:
+                    verdict = LoopVerdict.ACCEPTED
+                    records[each.record] = replace(records[each.record], verdict=verdict, reason="verified")
+                    self.groups.join(each.edge.i, each.edge.j)
+                for each in sure:
+                    self._accept(each.edge)
+
+    def _accept(self, edge: PoseEdge) -> None:
+        self.loops.edges.append(edge)
+        well_known = _WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING)
+        if self._marginals.gain(edge, well_known) > _WORTH_LEARNING:
+            self._marginals.add(edge)
+            self.learned.append(edge)
+            self._map_from_body = self._marginals.map_from_body
 
     def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(M,) whether old keyframes are other places than j: they cannot be seen from where it is."""
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
         return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
-
-    def _alike(self, i: int) -> tuple[NDArray[np.int64], Array]:
-        """Ids and scores of old keyframes that share words with i and are not matched with it, the most alike first."""
-        settings = self._settings
-        ids = self._index.place_ids
-        new = i - ids >= settings.min_gap_keyframes
-        new &= ~np.isin(ids, self._neighbours.get(i, []))
-        if not new.any():
-            return np.zeros(0, np.int64), np.zeros(0)
-        return self._index.query(self._vectors[i], new, settings.depth)
-
-    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> list[int]:
-        """Which candidates (numbers along ids) may be seen from where i can be, at most `top`.
-
-        Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
-        list, and records what it refused on the way.
-        """
-        loops = self._settings
-        inside: list[int] = []
-        far: list[int] = []
-        zoned: list[int] = []
-        for start in range(0, len(ids), _CHUNK):
-            js = ids[start : start + _CHUNK]
-            reach_m = loops.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
-            reachable = self._marginals.reachable(i, js, reach_m)
-            for n, is_reachable in enumerate(reachable.tolist(), start):
-                if not is_reachable:
-                    far.append(n)
-                elif not self._zones.compatible(self._map_from_body[i, :3, 3], self._map_from_body[ids[n], :3, 3]):
-                    zoned.append(n)
-                else:
-                    inside.append(n)
-        for refused, reason in (
-            (far, "too far apart to see the same, given how well the way between is known"),
-            (zoned, "in different zones"),
-        ):
-            if refused:
-                first, *others = (int(ids[n]) for n in refused)
-                fate = float(scores[refused[0]]), LoopVerdict.GATED_OUT, reason
-                self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
-        return inside[: loops.top]
-
-    def _examine(
-        self, i: int, j: int, score: float, match: PairMatch | None, aliases: NDArray[np.int64]
-    ) -> tuple[PoseEdge, LoopRecord] | LoopRecord:
-        """The edge of a candidate that passed every test alone, or why it did not."""
-
-        def refuse(verdict: LoopVerdict, reason: str, inliers: int = 0) -> LoopRecord:
-            return LoopRecord(i, j, score, verdict, reason, inliers)
-
-        if match is None:
-            return refuse(LoopVerdict.REJECTED, "too few features agree on one motion")
-        count = len(match.features)
-        cells = _cells(self._keyframes[i], match.features[:, 1], self._camera)
-        if count < self._settings.min_inliers or cells < self._settings.min_cells:
-            reason = f"{count} matches in {cells} of 48 cells are too few or too crowded"
-            return refuse(LoopVerdict.REJECTED, reason, count)
-        edge = self._edge(match)
-        innovation = self._marginals.innovation_squared(edge)
-        if innovation > self._settings.max_innovation:
-            self._learn_repetition(edge, count, innovation)
-            reason = f"matches, but from where the robot cannot be (innovation {innovation:.0f})"
-            return refuse(LoopVerdict.GATED_OUT, reason, count)
-        supported = self._neighbours_agree(match)
-        if supported is False or (supported is None and count < self._settings.alone_inliers):
-            return refuse(LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it", count)
-        shift_m = self._unseen_alias(edge, aliases)
-        if shift_m is not None:
-            alike = f"places {shift_m:.2f} m apart look the same here"
-            reason = f"{alike}, and another such step is as possible as this one"
-            return refuse(LoopVerdict.AMBIGUOUS, reason, count)
-        return edge, LoopRecord(i, j, score, LoopVerdict.ACCEPTED, "verified", count)
 
     def _unseen_alias(self, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
         """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
@@ -252,7 +281,7 @@ class LoopCloser:
         if len(aliases):
             aliases = aliases[self._are_apart(edge.j, aliases)]
             ways = self._map_from_body[aliases, :3, 3] - self._map_from_body[edge.j, :3, 3]
-        learnt = self._repetition.steps_m if self._are_of_one_part(edge) else np.zeros((0, 3))
+        learnt = self._repetition.steps_m if self._is_of_one_group(edge) else np.zeros((0, 3))
         steps = np.concatenate([ways, -ways, learnt, _around(self._settings.repeats_every_m)])
         if not len(steps):
             return None
@@ -272,20 +301,20 @@ class LoopCloser:
         is_far = (
             np.linalg.norm(step_m) > _ALIAS_REACH * reach_m and innovation > _ALIAS_GATE * self._settings.max_innovation
         )
-        if not is_far or count < self._settings.alone_inliers or not self._are_of_one_part(edge):
+        if not is_far or count < self._settings.alone_inliers or not self._is_of_one_group(edge):
             return
         off = se3_log(edge.i_from_j @ se3_inverse(self._map_from_body[edge.j]) @ here)
         cov = self._marginals.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         if off[:3] @ np.linalg.solve(cov[:3, :3], off[:3]) <= CHI2_3_0999:
             self._repetition.see(edge.i, step_m, float(np.trace(cov[3:, 3:])) / 3)
 
-    def _are_of_one_part(self, edge: PoseEdge) -> bool:
-        return self.parts is None or self.parts.of(edge.i) == self.parts.of(edge.j)
+    def _is_of_one_group(self, edge: PoseEdge) -> bool:
+        return self.groups is None or self.groups.of(edge.i) == self.groups.of(edge.j)
 
     def _cam_from_cam(self, j: int, i: int) -> Array:
-        map_from_body = self._map_from_body
-        cam_from_map = self._cam_from_body @ se3_inverse(map_from_body[j])
-        return np.asarray(cam_from_map @ map_from_body[i] @ self._body_from_cam)
+        body_from_cam = self._posed.body_from_cam
+        cam_from_map = se3_inverse(body_from_cam) @ se3_inverse(self._map_from_body[j])
+        return np.asarray(cam_from_map @ self._map_from_body[i] @ body_from_cam)
 
     def _predict(self, i: int, j: int) -> tuple[int, int, PredictedMotion]:
         """The motion by which to match j (as reference) with i; the graph's rotation is used where it is known well enough."""
@@ -294,7 +323,11 @@ class LoopCloser:
         return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
 
     def _edge(self, match: PairMatch) -> PoseEdge:
-        return body_edge(match, self._body_from_cam)
+        if self._measures_scale:
+            points_old = self._posed.keyframes[match.i].points_cam[match.features[:, 0]]
+            points_new = self._posed.keyframes[match.j].points_cam[match.features[:, 1]]
+            self.scales[match.j, match.i] = measured_log_scale(points_old, points_new, match.j_from_i)
+        return body_edge(match, self._posed.body_from_cam)
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
         """Whether a covisible neighbour of the old keyframe, placed by this match, matches too; None where none can be seen."""
@@ -309,45 +342,18 @@ class LoopCloser:
                 continue
             tried += 1
             off = se3_inverse(predicted) @ other.j_from_i
-            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * median_depth_m(self._keyframes[i]):
+            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * self._depths_m[i]:
                 return True
         return False if tried else None
 
-    def _decide(self, i: int, verified: list[tuple[PoseEdge, LoopRecord]]) -> None:
-        """Accepts what is left, unless the candidates exclude each other: then none is."""
-        places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in verified]
-        spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
-        js = np.array([edge.j for edge, _ in verified], np.int64)
-        between = [np.trace(self._marginals.relative_covs(j, js[js != j])[:, 3:, 3:], axis1=1, axis2=2) for j in js]
-        tolerance = 0.3 + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
-        for edge, record in verified:
-            if spread > tolerance:
-                reason = f"candidates {spread:.2f} m apart exclude each other"
-                self.loops.records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
-                continue
-            self.loops.records.append(record)
-            if self.parts is None or self._are_of_one_part(edge):
-                self._accept([edge])
-                continue
-            number = len(self.loops.records) - 1
-            self.loops.records[number] = replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=_WAITING)
-            sure = self._waiting.add(Revisit(edge, number), self.parts, self._marginals)
-            for revisit in sure:
-                waited = self.loops.records[revisit.record]
-                self.loops.records[revisit.record] = replace(waited, verdict=LoopVerdict.ACCEPTED, reason="verified")
-                self.parts.join(revisit.edge.i, revisit.edge.j)
-            self._accept([revisit.edge for revisit in sure])
 
-    def _accept(self, edges: list[PoseEdge]) -> None:
-        for edge in edges:
-            self.loops.edges.append(edge)
-            if self._marginals.gain(edge, self._well_known()) > _WORTH_LEARNING:
-                self._marginals.add(edge)
-                self.learned.append(edge)
-                self._map_from_body = self._marginals.map_from_body
+@dataclass(frozen=True, slots=True)
+class _Candidates:
+    """Old keyframes by their likeness to a new one: ids (C,), scores (C,), falling; chosen: the numbers of those that are followed."""
 
-    def _well_known(self) -> Array:
-        return np.asarray(_WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING))
+    ids: NDArray[np.int64]
+    scores: Array
+    chosen: list[int]
 
 
 def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:

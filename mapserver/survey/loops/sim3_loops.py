@@ -3,7 +3,6 @@
 import numpy as np
 
 from fleetmap.geometry import Array, transform_points
-from mapserver.survey.loops.loops import LoopCloser
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.pose_graph.sim3_pose_graph import (
     Similarities,
@@ -11,27 +10,10 @@ from mapserver.survey.pose_graph.sim3_pose_graph import (
     SimilarityResult,
     optimize_similarities,
 )
-from mapserver.survey.tracks.pairs import PairMatch
 
 _MIN_SHARED = 8  # points with depth in both keyframes below which a loop says nothing about the scale
 _CORRELATION = 3.0  # depths of one keyframe share the errors of its neighbours
 _UNKNOWN_SIGMA = 1.0
-
-
-class Sim3LoopCloser(LoopCloser):
-    """A LoopCloser that also keeps by how much each loop's two keyframes differ in scale; (log scale, sigma) by (new, old)."""
-
-    scales: dict[tuple[int, int], tuple[float, float]]
-
-    def _edge(self, match: PairMatch) -> PoseEdge:
-        if not hasattr(self, "scales"):
-            self.scales = {}
-        self.scales[match.j, match.i] = measured_log_scale(
-            self._keyframes[match.i].points_cam[match.features[:, 0]],
-            self._keyframes[match.j].points_cam[match.features[:, 1]],
-            match.j_from_i,
-        )
-        return super()._edge(match)
 
 
 def measured_log_scale(points_i: Array, points_j: Array, j_from_i: Array) -> tuple[float, float]:

@@ -9,8 +9,7 @@ from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, 
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.finish.landmark_visibility import viewing_cones
-from mapserver.survey.merge.initial_history import history_of
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.survey_map import SurveyMap, history_of
 
 
 class BaseMap:

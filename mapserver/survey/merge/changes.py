@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.finish.culling import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.joint_adjustment import Joint, free_observations
+from mapserver.survey.merge.joint_adjustment import JointSolution, free_observations
 from mapserver.survey.merge.landmark_persistence import Shift, shifts
 from mapserver.survey.merge.merge import Change, chosen, fewer_keyframes, joined, resighted
 from mapserver.survey.merge.new_landmarks import new_landmarks
-from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SessionSettings, SurveySettings
+from mapserver.survey.stages import Survey
 
 _KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
 Mask = NDArray[np.bool_]
 
 
 def what_changes(
-    base: BaseMap, survey: Survey, joint: Joint, gone: Mask, settings: SurveySettings, *, anchored: bool
+    base: BaseMap, survey: Survey, joint: JointSolution, gone: Mask, settings: SurveySettings, *, anchored: bool
 ) -> tuple[Change, int, int]:
     """The change, and how many keyframes and landmarks of the map moved. gone (N,): landmarks that have faded."""
     marks, body_from_cam = survey.state.landmarks, survey.state.body_from_cam
@@ -47,7 +47,7 @@ def what_changes(
     return change, int(moved_keyframes.sum()), int(alone.sum() + (moved & keep).sum())
 
 
-def known_well(survey: Survey, joint: Joint, settings: SurveySettings) -> Mask:
+def known_well(survey: Survey, joint: JointSolution, settings: SurveySettings) -> Mask:
     """(N,) own landmarks of the survey that are seen under an angle that places them, as a survey demands of those it hands on."""
     took_part = np.isfinite(joint.own_points_map).all(axis=1)
     marks = replace(survey.state.landmarks, points_map=np.nan_to_num(joint.own_points_map))
@@ -55,7 +55,7 @@ def known_well(survey: Survey, joint: Joint, settings: SurveySettings) -> Mask:
     return np.asarray(took_part & (parallax_rad(placed) >= np.radians(settings.cull.min_parallax_deg)))
 
 
-def _keyframes_moved(base: BaseMap, joint: Joint, settings: SessionSettings) -> Mask:
+def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSettings) -> Mask:
     """(B,) keyframes of the map that the new survey moved by more than their anchors admit."""
     before = base.map_from_body[joint.base_keyframes]
     shift_m = np.linalg.norm(joint.base_from_body[:, :3, 3] - before[:, :3, 3], axis=1)
@@ -66,7 +66,7 @@ def _keyframes_moved(base: BaseMap, joint: Joint, settings: SessionSettings) -> 
 
 
 def _moved_points(
-    base: BaseMap, joint: Joint, judged: Shift, moved_keyframes: Mask, cameras: Array, *, anchored: bool
+    base: BaseMap, joint: JointSolution, judged: Shift, moved_keyframes: Mask, cameras: Array, *, anchored: bool
 ) -> tuple[Array, Mask]:
     """Where the map's landmarks (N, 3) are, and which (N,) moved with the keyframes that saw them.
 

@@ -14,9 +14,9 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import Rows
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.relocalization.settings import FixSettings, RelocalizerSettings
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Keyframe
 
 _CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
 

@@ -10,24 +10,18 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.relocalization.landmark_visibility import Rows
-from mapserver.survey.bundle.bundle_adjustment import (
-    BundleProblem,
-    BundleResult,
-    InertialTerms,
-    PriorTerm,
-    RelativeTerm,
-    optimize,
-)
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState, scaled_noise
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.bundle_rounds import scaled_noise
+from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms, PriorTerm
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import KeyframeMotion, Landmarks, RelativeTerm, SurveyState
 
 
 @dataclass(frozen=True)
-class Joint:
+class JointSolution:
     """What the adjustment found.
 
     map_from_body (K, 4, 4) of the new keyframes; base_keyframes (B,) of the map that took part, base_from_body (B, 4, 4) where
@@ -52,7 +46,7 @@ def adjust_jointly(
     settings: SurveySettings,
     *,
     anchored: bool,
-) -> Joint:
+) -> JointSolution:
     """Old and new keyframes and landmarks that fit all observations best; map_from_body (K, 4, 4) is where the new ones start.
 
     anchored: the map is published, its keyframes stay within `anchor_sigma_m`; else only its first one holds it. A survey that
@@ -67,7 +61,7 @@ def adjust_jointly(
     points[problem.own_used] = result.points_map[len(problem.rows) :]
     old_map_from_body, old_points_map = result.map_from_body[: problem.old], result.points_map[: len(problem.rows)]
     old = (problem.base_keyframes, old_map_from_body, problem.rows, old_points_map)
-    return Joint(map_from_body, *old, points, sightings)
+    return JointSolution(map_from_body, *old, points, sightings)
 
 
 class _Problem:

@@ -10,11 +10,11 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pnp.pnp import GATE_SQUARED
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.finish.map_assembly import point_information
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
 from mapserver.survey.merge.guided_matching import Sighting, keyframe_features
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Keyframe
 
 _PRIOR_COUNT = 4.0  # observations that the whole survey's rate counts for, where a landmark has no history
 _AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place

@@ -21,7 +21,7 @@ from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
-from mapserver.survey.merge.session_alignment import Placed, alignments, find_fixes, fixes_around, follow_fixes
+from mapserver.survey.merge.session_alignment import Alignment, alignments, find_fixes, fixes_around, follow_fixes
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
@@ -37,7 +37,7 @@ _BESIDE_M, _BESIDE_COSINE = 2.0, 0.8  # from a place of the map, and between bot
 _PRIOR_M = 3.0  # within which an alignment is where position priors put the session
 
 
-class JoinVerdict(StrEnum):
+class MembershipVerdict(StrEnum):
     """Outcomes of the test."""
 
     JOINED = "joined"
@@ -46,7 +46,7 @@ class JoinVerdict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class JoinEvidence:
+class MembershipEvidence:
     """Figures of the test.
 
     fixes: keyframes whose fixes agree with the session's own motion; places: those of them that lie a metre apart. cells_expected,
@@ -68,20 +68,20 @@ class JoinEvidence:
 
 
 @dataclass(frozen=True, slots=True)
-class NotJoined:
+class Membership:
     """A session that is not joined: why, and by what evidence."""
 
     reason: str
-    verdict: JoinVerdict = JoinVerdict.UNDECIDED
-    evidence: JoinEvidence = JoinEvidence()
+    verdict: MembershipVerdict = MembershipVerdict.UNDECIDED
+    evidence: MembershipEvidence = MembershipEvidence()
 
 
 @dataclass(frozen=True, slots=True)
-class Located:
+class SessionPlace:
     """A session's place: map_from_body (K, 4, 4) of its keyframes, the fixes that agree and how many of them were believed."""
 
     map_from_body: Array
-    placed: Placed
+    placed: Alignment
     believed: int
     seen: Confirmation
     competitor_share: float | None
@@ -89,7 +89,7 @@ class Located:
 
 
 @dataclass(frozen=True)
-class Visit:
+class SessionKeyframes:
     """A session as the test takes it.
 
     keyframes (K) with their features and depths; survey_from_body (K, 4, 4) and the edges of its motion; camera on a body.
@@ -104,21 +104,21 @@ class Visit:
     map_from_survey: Array | None = None
 
 
-class JoinTest:
+class MembershipTest:
     """The test of one session in one map."""
 
     def __init__(
         self,
         relocalizer: Relocalizer,
         firm: NDArray[np.bool_],
-        visit: Visit,
+        visit: SessionKeyframes,
         settings: SessionSettings,
     ) -> None:
         """firm (N,): landmarks of the relocalizer's view that are expected to be found again."""
         self._relocalizer, self._firm, self._visit, self._settings = relocalizer, firm, visit, settings
         self.tried = 0
 
-    def locate(self) -> Located | NotJoined:
+    def locate(self) -> SessionPlace | Membership:
         """Where the session is, if fixes say so and nowhere else looks alike. The map's confirmation there is not judged yet."""
         visit, settings = self._visit, self._settings
         ks = self._chosen_keyframes(settings.fix_keyframes)
@@ -130,12 +130,12 @@ class JoinTest:
         found = alignments(fixes, visit.survey_from_body, GraphMarginals(visit.survey_from_body, visit.chain))
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
         if not enough:
-            most = found[0] if found else Placed((), np.eye(4), 0)
-            return NotJoined(
+            most = found[0] if found else Alignment((), np.eye(4), 0)
+            return Membership(
                 f"it was not found in the map: at most {len(most.fixes)} fixes of {len(ks)} keyframes at {most.places} places agree "
                 f"on where it lies, {settings.min_fixes} at {settings.min_places} are needed; drive a longer way through places "
                 "that are in the map, the same way round",
-                evidence=JoinEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
+                evidence=MembershipEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
             )
         # Where priors put it there may be few fixes: most of it is new, and a look-alike of what the map has has more.
         ranked = sorted(enough, key=lambda placed: not self._is_where_priors_say(placed))
@@ -156,7 +156,7 @@ class JoinTest:
         looking = map_from_body @ self._visit.body_from_cam
         return [k for k, at in enumerate(looking) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
 
-    def _is_where_priors_say(self, placed: Placed) -> bool:
+    def _is_where_priors_say(self, placed: Alignment) -> bool:
         visit = self._visit
         if visit.map_from_survey is None:
             return False
@@ -178,10 +178,10 @@ class JoinTest:
         looks = [look(view, visit.camera, visit.keyframes[k], map_from_body[k] @ visit.body_from_cam) for k in ks]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
-    def evidence(self, located: Located, seen: Confirmation) -> JoinEvidence:
+    def evidence(self, located: SessionPlace, seen: Confirmation) -> MembershipEvidence:
         """The figures of a place at which the session sees so much of the map."""
         placed, share, low, high = located.placed, *(round(value, 4) for value in (seen.share, seen.low, seen.high))
-        return JoinEvidence(
+        return MembershipEvidence(
             fixes=len(placed.fixes),
             places=placed.places,
             cells_expected=seen.cells,
@@ -194,7 +194,7 @@ class JoinTest:
             priors_off_m=located.priors_off_m,
         )
 
-    def judged(self, located: Located, seen: Confirmation) -> NotJoined | None:
+    def judged(self, located: SessionPlace, seen: Confirmation) -> Membership | None:
         """Why a session that sees so much of the map is not joined; None where it is."""
         if _speaks_for_itself(seen):
             return None
@@ -202,22 +202,22 @@ class JoinTest:
         evidence = self.evidence(located, seen)
         if not contradicts(seen):
             bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} for sure and half in all are needed"
-            return NotJoined(
+            return Membership(
                 f"it is not certain that it belongs here: {said}, {bounds}; drive a longer way through places that are in the map, the "
                 "same way round",
                 evidence=evidence,
             )
         said = f"{said}, at most {seen.high:.0%} where half is needed"
         if located.priors_off_m is None:
-            return NotJoined(
+            return Membership(
                 f"the place that is most like it is not its own: {said}; it was recorded elsewhere, or where or in a direction in which "
                 "the map was not: drive past a dock, the same way round as the survey, or build it as another --site",
                 evidence=evidence,
             )
         reason = f"it was recorded elsewhere, or all has changed: {said}; build it as another --site"
-        return NotJoined(reason, JoinVerdict.FOREIGN, evidence)
+        return Membership(reason, MembershipVerdict.FOREIGN, evidence)
 
-    def _located(self, placed: Placed) -> Located:
+    def _located(self, placed: Alignment) -> SessionPlace:
         visit = self._visit
         map_from_body, believed = follow_fixes(placed, visit.survey_from_body, visit.chain)
         off_m = None
@@ -226,9 +226,9 @@ class JoinTest:
             ks = [fix.k for fix in placed.fixes]
             apart_m = np.linalg.norm((map_from_body - by_priors)[ks, :3, 3], axis=1)
             off_m = round(float(np.median(apart_m)), 2)
-        return Located(map_from_body, placed, believed, self.confirmation(map_from_body), None, off_m)
+        return SessionPlace(map_from_body, placed, believed, self.confirmation(map_from_body), None, off_m)
 
-    def _chosen(self, found: list[Located]) -> Located | NotJoined:
+    def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
         """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
         ranked = sorted(found, key=lambda one: (one.seen.cells - 2 * one.seen.seen, -len(one.placed.fixes)))
         best, *others = [
@@ -244,7 +244,7 @@ class JoinTest:
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
             located = _with_competitor(best, competitor_share)
-            return NotJoined(
+            return Membership(
                 f"{len(alike)} places of the map look alike to it: it sees {seen} parts of the map there; drive on to where they "
                 "differ, or past a dock",
                 evidence=self.evidence(located, located.seen),
@@ -252,13 +252,13 @@ class JoinTest:
         chosen = _with_competitor(near[0] if len(alike) > 1 else best, competitor_share)
         if chosen.priors_off_m is not None and chosen.priors_off_m >= _PRIOR_M:
             if contradicts(chosen.seen):
-                return NotJoined(
+                return Membership(
                     f"it was not found where its docks are, and the place that is most like it, {chosen.priors_off_m:.1f} m from there, is "
                     f"not its own: of {chosen.seen.cells} parts of the map that it should see there it sees {chosen.seen.seen}; drive a "
                     "longer way through places that are in the map, the same way round, or build it as another --site",
                     evidence=self.evidence(chosen, chosen.seen),
                 )
-            return NotJoined(
+            return Membership(
                 f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
                 "them out",
                 evidence=self.evidence(chosen, chosen.seen),
@@ -281,10 +281,10 @@ def contradicts(seen: Confirmation) -> bool:
     return seen.blocks >= _MIN_BLOCKS and seen.high < _REMAINING_SHARE
 
 
-def _same_place(one: Located, other: Located) -> bool:
+def _same_place(one: SessionPlace, other: SessionPlace) -> bool:
     apart_m = np.linalg.norm((one.map_from_body - other.map_from_body)[:, :3, 3], axis=1)
     return bool(np.median(apart_m) < _SAME_PLACE_M)
 
 
-def _with_competitor(one: Located, competitor_share: float | None) -> Located:
-    return Located(one.map_from_body, one.placed, one.believed, one.seen, competitor_share, one.priors_off_m)
+def _with_competitor(one: SessionPlace, competitor_share: float | None) -> SessionPlace:
+    return SessionPlace(one.map_from_body, one.placed, one.believed, one.seen, competitor_share, one.priors_off_m)

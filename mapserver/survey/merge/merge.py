@@ -11,12 +11,11 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.relocalization.landmark_visibility import Rows
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_information
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.landmark_persistence import LandmarkCounts, missed_since
+from mapserver.survey.state import Keyframe, Landmarks
 from mapserver.survey.survey_map import History, SurveyMap
-from mapserver.survey.tracks.tracks import Landmarks
 
 
 @dataclass(frozen=True, slots=True)

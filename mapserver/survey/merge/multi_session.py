@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.map_transform import transform_map
-from mapserver.survey.merge.membership import JoinEvidence, JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import Membership, MembershipEvidence, MembershipVerdict
 from mapserver.survey.merge.pipeline import Counts, Extension, extend
-from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap
 
 Mask = NDArray[np.bool_]
@@ -31,19 +31,19 @@ class Outcome:
     """What became of session `number`: in the map or left out, why, by what evidence; counts where it was joined to something."""
 
     number: int
-    verdict: JoinVerdict
+    verdict: MembershipVerdict
     reason: str
     counts: Counts | None = None
-    evidence: JoinEvidence | None = None
+    evidence: MembershipEvidence | None = None
 
     @property
     def joined(self) -> bool:
         """Whether it is in the map."""
-        return self.verdict is JoinVerdict.JOINED
+        return self.verdict is MembershipVerdict.JOINED
 
 
 @dataclass(frozen=True, slots=True)
-class Joined:
+class MergedMap:
     """The map of all sessions that could be joined, what became of each in their order, and the trajectories of the joined ones.
 
     estimated: for each trajectory, which of its frames were measured.
@@ -55,7 +55,7 @@ class Joined:
     estimated: tuple[Mask, ...]
 
 
-class Joining:
+class MapMerger:
     """One map of `base` (the published one, None on a new site) and all sessions that find their place in it.
 
     On a new site the first session with position priors begins, the first of all where none has any. Sessions with priors are joined
@@ -78,7 +78,7 @@ class Joining:
         if session.map_from_survey is not None:
             self._try(self._waiting[-1])
 
-    def finish(self) -> Joined:
+    def finish(self) -> MergedMap:
         """The map, and what became of every session."""
         self._waiting.sort(key=lambda n: self._sessions[n].map_from_survey is None)
         for number in [n for n in self._waiting if self._sessions[n].map_from_survey is None]:
@@ -93,21 +93,21 @@ class Joining:
         trajectories, estimated = tuple(self._found[n][0] for n in order), tuple(self._found[n][1] for n in order)
         joined_map = with_trajectories(self._current, trajectories, estimated) if order else self._current
         outcomes = tuple(self._outcomes[n] for n in sorted(self._outcomes))
-        return Joined(joined_map, outcomes, trajectories, estimated)
+        return MergedMap(joined_map, outcomes, trajectories, estimated)
 
     def _try(self, number: int) -> None:
         session = self._sessions[number]
         if self._current is None:
             self._current = _begun(session)
-            outcome = Outcome(number, JoinVerdict.JOINED, "begins the map")
+            outcome = Outcome(number, MembershipVerdict.JOINED, "begins the map")
         else:
             place, anchored = session.map_from_survey, self._anchored
             result = extend(self._current, session.survey, self._settings, anchored=anchored, map_from_survey=place)
-            if isinstance(result, NotJoined):
+            if isinstance(result, Membership):
                 self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
                 return
             self._current, self._has_grown = result.map, True
-            outcome = Outcome(number, JoinVerdict.JOINED, _words(result), result.counts, result.evidence)
+            outcome = Outcome(number, MembershipVerdict.JOINED, _words(result), result.counts, result.evidence)
         self._outcomes[number] = outcome
         self._found[number] = (self._current.trajectory, self._current.trajectory_estimated)
         self._waiting.remove(number)

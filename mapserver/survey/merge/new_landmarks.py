@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, image_cells
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.joint_adjustment import Joint
+from mapserver.survey.merge.joint_adjustment import JointSolution
 from mapserver.survey.settings import SessionSettings
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import Keyframe, Landmarks
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not show that the map lacks something there
@@ -21,7 +20,7 @@ def new_landmarks(
     base: BaseMap,
     keyframes: Sequence[Keyframe],
     marks: Landmarks,
-    joint: Joint,
+    joint: JointSolution,
     free: NDArray[np.bool_],
     settings: SessionSettings,
 ) -> NDArray[np.bool_]:

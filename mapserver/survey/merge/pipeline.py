@@ -13,12 +13,18 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import Sighting, keyframe_features, match_keyframe, session_relocalizer
-from mapserver.survey.merge.joint_adjustment import Joint, adjust_jointly
+from mapserver.survey.merge.joint_adjustment import JointSolution, adjust_jointly
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
-from mapserver.survey.merge.membership import JoinEvidence, JoinTest, NotJoined, Visit, contradicts
+from mapserver.survey.merge.membership import (
+    Membership,
+    MembershipEvidence,
+    MembershipTest,
+    SessionKeyframes,
+    contradicts,
+)
 from mapserver.survey.merge.merge import SessionFrames, merged
-from mapserver.survey.pipeline import Survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap
 
 
@@ -46,7 +52,7 @@ class Extension:
 
     map: SurveyMap
     counts: Counts
-    evidence: JoinEvidence
+    evidence: MembershipEvidence
 
 
 def extend(
@@ -56,7 +62,7 @@ def extend(
     *,
     anchored: bool,
     map_from_survey: Array | None = None,
-) -> Extension | NotJoined:
+) -> Extension | Membership:
     """The map with a survey joined to it, if it passes the test of `membership`: at the place that fixes say, and once more adjusted.
 
     anchored: base_map is published: what did not move significantly stays to the bit; else all of it takes its best place.
@@ -64,14 +70,14 @@ def extend(
     """
     state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
-        return NotJoined(
+        return Membership(
             "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
     test = _join_test(base, survey, relocalizer, map_from_survey, settings)
     located = test.locate()
-    if isinstance(located, NotJoined):
+    if isinstance(located, Membership):
         return located
     refused = test.judged(located, located.seen)
     if refused is not None and contradicts(located.seen):
@@ -97,9 +103,9 @@ def extend(
 
 def _join_test(
     base: BaseMap, survey: Survey, relocalizer: Relocalizer, map_from_survey: Array | None, settings: SurveySettings
-) -> JoinTest:
+) -> MembershipTest:
     state, guess = survey.state, survey.odometry
-    visit = Visit(
+    visit = SessionKeyframes(
         keyframes=[keyframe_features(keyframe) for keyframe in guess.keyframes],
         survey_from_body=state.map_from_body,  # the survey's own frame, named `map` before there was another
         chain=[*chain_edges(guess, state), *survey.loops.edges],
@@ -108,11 +114,16 @@ def _join_test(
         map_from_survey=map_from_survey,
     )
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
-    return JoinTest(relocalizer, firm, visit, settings.sessions)
+    return MembershipTest(relocalizer, firm, visit, settings.sessions)
 
 
 def _compare(
-    base: BaseMap, survey: Survey, joint: Joint, settings: SurveySettings, anchored: bool, fixes: tuple[int, int]
+    base: BaseMap,
+    survey: Survey,
+    joint: JointSolution,
+    settings: SurveySettings,
+    anchored: bool,
+    fixes: tuple[int, int],
 ) -> tuple[SurveyMap, Counts]:
     state, guess = survey.state, survey.odometry
     map_from_cam = joint.map_from_body @ state.body_from_cam

@@ -30,7 +30,7 @@ class SessionFix:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class Alignment:
     """The fixes that agree (one for each keyframe), map_from_survey (4, 4) of the one that most agree with, and at how many places
     they stand.
     """
@@ -67,14 +67,14 @@ def fixes_around(
     return [_at_body(k, fix, body_from_cam) for k, fix in found if fix is not None]
 
 
-def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Placed]:
+def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Alignment]:
     """Sets of fixes that agree with the survey's own motion, the largest first; no fix is in two of them.
 
     survey_from_body (K, 4, 4). Two fixes agree where the motion between them is that of the survey within 0.999 of chi-square of
     the covariances of its chain, of both fixes and of the map's own shape.
     """
     agreeing = [_agreeing(n, fixes, survey_from_body, chain) for n in range(len(fixes))]
-    found: list[Placed] = []
+    found: list[Alignment] = []
     free = set(range(len(fixes)))
     while free:
         sets = {n: [m for m in agreeing[n] if m in free] for n in sorted(free)}
@@ -82,7 +82,7 @@ def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: Grap
         chosen = tuple(fixes[m] for m in sets[best])
         places = _places(survey_from_body[[fix.k for fix in chosen], :3, 3])
         seed = fixes[best]
-        found.append(Placed(chosen, seed.map_from_body @ se3_inverse(survey_from_body[seed.k]), places))
+        found.append(Alignment(chosen, seed.map_from_body @ se3_inverse(survey_from_body[seed.k]), places))
         free -= set(sets[best])
     return sorted(found, key=lambda placed: -len(placed.fixes))
 
@@ -116,7 +116,7 @@ def _places(positions_m: Array) -> int:
     return len(chosen)
 
 
-def follow_fixes(placed: Placed, survey_from_body: Array, chain: Sequence[PoseEdge]) -> tuple[Array, int]:
+def follow_fixes(placed: Alignment, survey_from_body: Array, chain: Sequence[PoseEdge]) -> tuple[Array, int]:
     """map_from_body (K, 4, 4) by the pose graph of the survey's own edges and the fixes, and how many fixes were believed."""
     start = np.concatenate([np.eye(4)[None], placed.map_from_survey @ survey_from_body])
     edges = [PoseEdge(e.i + 1, e.j + 1, e.i_from_j, e.cov_rot_trans, is_loop=False) for e in chain]

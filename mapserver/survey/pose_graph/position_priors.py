@@ -11,9 +11,9 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.sensors.samples import PositionPrior
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+from mapserver.survey.state import OdometryPass
 
 _MAX_GAP_NS = 500_000_000  # between a prior and the frame that stands for its moment
 _HEADING_KNOWN_RAD = 0.2

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
 from mapserver.survey.settings import PairSettings
+from mapserver.survey.state import Keyframe
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_task, view_overlap
 
 _NEAR_CANDIDATES = 40
@@ -32,9 +32,9 @@ class PairFinder:
     ) -> None:
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
         self._executor = executor
-        self._inputs = MatchInputs([without_pictures(k) for k in keyframes], camera, settings)
+        self._inputs = MatchInputs([k.without_pictures() for k in keyframes], camera, settings)
         self._shared = replace(self._inputs, keyframes={})
-        self._depths_m = np.array([median_depth_m(k) for k in keyframes])
+        self._depths_m = np.array([k.median_depth_m for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
         """Pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
@@ -153,9 +153,3 @@ def fixed_allowance_m(map_from_body: Array) -> Callable[[int, int], float]:
     """The same after bundle adjustment: what a well-matched pair may be off by."""
     positions = map_from_body[:, :3, 3]
     return lambda i, j: 0.15 + 0.05 * float(np.linalg.norm(positions[j] - positions[i]))
-
-
-def median_depth_m(keyframe: Keyframe) -> float:
-    """Median depth of a keyframe's stereo points; 5 m without any."""
-    depths = keyframe.points_cam[np.isfinite(keyframe.disparities[:, 0]), 2]
-    return float(np.median(depths)) if len(depths) else 5.0

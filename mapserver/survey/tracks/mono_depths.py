@@ -9,14 +9,9 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.mono.two_view import triangulate_pair
-from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
-from mapserver.survey.keyframes.keyframes import Keyframe, without_pictures
+from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.settings import SurveySettings
-
-
-def survey_camera(camera: StereoCamera) -> StereoCamera:
-    """The camera that a survey reckons with: a single one gets a baseline, so that depths have disparities, as a depth sensor's have."""
-    return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)
+from mapserver.survey.state import Keyframe
 
 
 class MonoDepths:
@@ -39,7 +34,7 @@ class MonoDepths:
 
     def release(self, k: int) -> None:
         """Lets go of a keyframe's pictures."""
-        self._keyframes[k] = without_pictures(self._keyframes[k])
+        self._keyframes[k] = self._keyframes[k].without_pictures()
 
     def keyframes_at(self, map_from_body: Array, body_from_cam: Array, first: int = 0) -> list[Keyframe]:
         """The keyframes from `first` on with disparities and points of those features that several of them agree on, the others without."""

@@ -10,8 +10,8 @@ from fleetmap.features.matching import match_mutual, packed
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pnp.pnp import REFINEMENT, Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.keyframes.keyframes import Keyframe
 from mapserver.survey.settings import PairSettings
+from mapserver.survey.state import Keyframe
 from mapserver.survey.tracks.pairs_kernels import Guidance, PairFeatures, follow_motion, match_both_ways, share_in_view
 
 Indices = NDArray[np.int64]

@@ -1,8 +1,7 @@
 """Landmarks from verified pairs: feature tracks across keyframes, one feature per keyframe, with sub-pixel coordinates."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,8 @@ from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.keyframes.keyframes import Keyframe, Pictures, PosedKeyframes, with_pictures
 from mapserver.survey.settings import NoiseSettings, SurveySettings
+from mapserver.survey.state import Keyframe, Landmarks, Pictures, PosedKeyframes, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
 from mapserver.survey.tracks.tracks_kernels import join as join_kernel
@@ -22,46 +21,6 @@ _SAME_WARP = (
 )
 _ROWS = 2**18  # observations whose warps are compared at once
 _BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
-
-
-@dataclass(frozen=True)
-class Landmarks:
-    """N landmarks and their M observations, sorted by landmark; the first observation of each is its reference.
-
-    obs_keyframe, obs_landmark, obs_feature (M,); obs_pixels (M, 3) u_left v u_right; obs_sigma_px (M, 2) of pixel and disparity.
-    """
-
-    points_map: Array
-    obs_keyframe: NDArray[np.int32]
-    obs_landmark: NDArray[np.int32]
-    obs_feature: NDArray[np.int64]
-    obs_pixels: Array
-    obs_sigma_px: Array
-
-    def keep_observations(self, keep: NDArray[np.bool_], min_observations: int) -> "Landmarks":
-        """Without the other observations, and without landmarks that are then seen too rarely."""
-        counts = np.bincount(self.obs_landmark[keep], minlength=len(self.points_map))
-        lasting = counts >= min_observations
-        keep = keep & lasting[self.obs_landmark]
-        number = np.cumsum(lasting) - 1
-        keyframes, landmarks = self.obs_keyframe[keep], number[self.obs_landmark[keep]].astype(np.int32)
-        features, pixels, sigmas = self.obs_feature[keep], self.obs_pixels[keep], self.obs_sigma_px[keep]
-        return Landmarks(self.points_map[lasting], keyframes, landmarks, features, pixels, sigmas)
-
-
-def of_features(marks: Landmarks, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """What each observation's feature has: columns are one array for each keyframe, a row for each feature."""
-    return _of_features(marks.obs_keyframe, marks.obs_feature, columns)
-
-
-def _of_features(owners: NDArray[Any], features: NDArray[np.int64], columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """The same of features (M,) of keyframes `owners` (M,); a site's columns one after the other would be gigabytes."""
-    out = np.empty((len(owners), *columns[0].shape[1:]), columns[0].dtype)
-    order = np.argsort(owners, kind="stable")
-    ends = np.cumsum(np.bincount(owners, minlength=len(columns)))
-    for column, rows in zip(columns, np.split(order, ends[:-1]), strict=True):
-        out[rows] = column[features[rows]]
-    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +45,7 @@ def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
     """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
-    known = Tracks.of(no_landmarks()) if known is None else known
+    known = Tracks.of(Landmarks.empty()) if known is None else known
     if not ordered and not len(known.starts):
         return known
     # Keyframes have far fewer features than pairs have matches: any feature is a node, and links stay small.
@@ -104,12 +63,6 @@ def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     return Tracks(nodes // stride, nodes % stride, starts)
 
 
-def no_landmarks() -> Landmarks:
-    """An empty set."""
-    none = np.zeros(0, np.int32)
-    return Landmarks(np.zeros((0, 3)), none, none, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
-
-
 def build_landmarks(
     posed: PosedKeyframes,
     tracks: Tracks,
@@ -124,7 +77,7 @@ def build_landmarks(
     redundant = np.zeros(len(posed.keyframes), bool) if redundant is None else redundant
     table, points_cam = _tracks_from_reference(posed.keyframes, tracks, redundant)
     if not len(table):
-        return no_landmarks()
+        return Landmarks.empty()
     reference = posed.map_from_cam[table[_is_first(table), 0]]
     points_map = np.einsum("nij,nj->ni", reference[:, :3, :3], points_cam) + reference[:, :3, 3]
     pixels, sigmas = _observe(posed, table, points_map, settings, executor)
@@ -184,8 +137,8 @@ def _tracks_from_reference(
     if not len(tracks.keyframes):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
     owners, features = tracks.keyframes, tracks.features
-    octaves = _of_features(owners, features, [k.features.octaves for k in keyframes])
-    disparities = _of_features(owners, features, [k.disparities[:, 0] for k in keyframes])
+    octaves = of_features(owners, features, [k.features.octaves for k in keyframes])
+    disparities = of_features(owners, features, [k.disparities[:, 0] for k in keyframes])
     members, is_redundant = np.arange(len(owners)), redundant[owners]
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(owners)))
     best = np.lexsort((members, -disparities, octaves, is_redundant, ~np.isfinite(disparities), track))[tracks.starts]
@@ -200,7 +153,7 @@ def _tracks_from_reference(
     order = order[lasting[track[order]]]
     landmark = (np.cumsum(lasting) - 1)[track]
     table, best = np.column_stack([owners, landmark, features])[order], best[lasting]
-    return table, _of_features(owners[best], features[best], [k.points_cam for k in keyframes])
+    return table, of_features(owners[best], features[best], [k.points_cam for k in keyframes])
 
 
 def _observe(
@@ -218,7 +171,7 @@ def _observe(
         for group, rows in zip(groups, rows_of, strict=True):
             references = table[reference_row[rows]]
             sources = np.unique(references[:, 0]).tolist()
-            known = {k: with_pictures(keyframes[k], whole=k in group) for k in sorted({*group, *sources})}
+            known = {k: keyframes[k].with_pictures(whole=k in group) for k in sorted({*group, *sources})}
             at = {k: map_from_cam[k] for k in known}
             yield _ObservationBatch(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, at)
 

@@ -34,11 +34,10 @@ from mapserver.config import survey_settings
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from mapserver.survey import pipeline
-from mapserver.survey.keyframes.keyframes import ImageStore, MemoryImageStore
-from mapserver.survey.pipeline import Survey, survey_from
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.stages import Survey, survey_from
+from mapserver.survey.state import ImageStore, MemoryImageStore
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
@@ -93,7 +92,7 @@ def _measure(survey: SimulatedSurvey, store: ImageStore, threads: int) -> dict[s
     stages, before_mb = Stages(), _peak_mb()
     begun = time.process_time(), time.perf_counter()
     options = SurveyConfig(SETTINGS, default_vocabulary())
-    gate = patch.object(pipeline, "GraphMarginals", _Gate)
+    gate = patch.object(stages, "GraphMarginals", _Gate)
     with drawn_alignment(survey), open_executor(threads, None) as executor, gate:
         made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(stages, store, executor))
     stages("end", 0, 0)

@@ -21,7 +21,8 @@ import gtsam
 import numpy as np
 
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, optimize
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.problem import BundleProblem
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from support.problems.g2o import parse_g2o

@@ -22,7 +22,7 @@ from mapserver.config import survey_settings
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
-from mapserver.survey.merge.membership import JoinTest, Visit
+from mapserver.survey.merge.membership import MembershipTest, SessionKeyframes
 from mapserver.survey.odometry_pass import FrameChain, continued_covariances
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.simulated_run import EstimatorSession
@@ -49,7 +49,7 @@ class Site:
 class Drive:
     """A session before anyone says where it belongs: the visit without docks, and map_from_body (K, 4, 4) of its keyframes."""
 
-    visit: Visit
+    visit: SessionKeyframes
     map_from_body: Array
 
     def docks(self, shift_m: float = 0.0, turn_rad: float = 0.0) -> Array:
@@ -66,9 +66,11 @@ class SiteMap:
     relocalizer: Relocalizer
     firm: NDArray[np.bool_]
 
-    def test(self, drive: Drive, docks: Array | None) -> JoinTest:
+    def test(self, drive: Drive, docks: Array | None) -> MembershipTest:
         """The test of a drive in it."""
-        return JoinTest(self.relocalizer, self.firm, replace(drive.visit, map_from_survey=docks), SETTINGS.sessions)
+        return MembershipTest(
+            self.relocalizer, self.firm, replace(drive.visit, map_from_survey=docks), SETTINGS.sessions
+        )
 
 
 def cut(route: Route, start_m: float, length_m: float) -> Route:
@@ -152,7 +154,7 @@ def drive(run: EstimatorSession) -> Drive:
     )
     state: Any = SimpleNamespace(map_from_body=placed[frames])
     keyframes = [seen(run, frame) for frame in frames]
-    visit = Visit(keyframes, placed[frames], chain_edges(guess, state), run.camera, run.body_from_cam)
+    visit = SessionKeyframes(keyframes, placed[frames], chain_edges(guess, state), run.camera, run.body_from_cam)
     return Drive(visit, run.map_from_body[frames])
 
 

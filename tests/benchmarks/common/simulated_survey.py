@@ -25,10 +25,10 @@ from fleetsim import recorder
 from fleetsim.motion.routes import Route
 from fleetsim.scenarios import SCENARIOS, find_scenario
 from mapserver.survey.executor import Executor
-from mapserver.survey.frame_tracks import FrameTracks
-from mapserver.survey.keyframes.keyframes import ImageStore, Keyframe, Pictures, PosedKeyframes, set_aside
-from mapserver.survey.odometry_pass import OdometryPass, OdometryRun, SampleFeed, continued_covariances
+from mapserver.survey.keyframes.keyframes import set_aside
+from mapserver.survey.odometry_pass import OdometryRun, SampleFeed, continued_covariances
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyInputs
 from mapserver.survey.tracks import tracks
 from support.estimator.simulated_run import EstimatorSession

@@ -43,7 +43,7 @@ from fleetsim.commands import record_order
 from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
 from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
-from mapserver.survey.merge.membership import JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.pipeline import extend
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
@@ -81,10 +81,10 @@ def decided(here: SiteMap, moved: Drive, docks: Array | None) -> dict[str, Any]:
     """What the test says of a drive in a map, and how far off it is placed."""
     test = here.test(moved, docks)
     located = test.locate()
-    if isinstance(located, NotJoined):
+    if isinstance(located, Membership):
         return {"verdict": located.verdict.value, "cells": 0, "share": 0.0, "error_m": None, "reason": located.reason}
     refused = test.judged(located, located.seen)
-    verdict = JoinVerdict.JOINED if refused is None else refused.verdict
+    verdict = MembershipVerdict.JOINED if refused is None else refused.verdict
     off_m = error_m(located.map_from_body, moved.map_from_body, [fix.k for fix in located.placed.fixes])
     figures = {"cells": located.seen.cells, "share": round(located.seen.share, 3), "error_m": round(off_m, 4)}
     return {"verdict": verdict.value, **figures, "reason": "" if refused is None else refused.reason}
@@ -183,7 +183,7 @@ def off_in_map_m(here: Surveyed, placed: Trajectory, truth: Trajectory) -> Array
 def joined(here: Surveyed, other: Surveyed, docks: Array | None) -> dict[str, Any]:
     """A rendered session in a rendered map, adjusted jointly and merged as a build does."""
     result = extend(here.survey.map, other.survey, SETTINGS, anchored=True, map_from_survey=docks)
-    if isinstance(result, NotJoined):
+    if isinstance(result, Membership):
         seen = result.evidence
         return {
             "verdict": result.verdict.value,

@@ -14,7 +14,7 @@ from fleetmap.recordings.finalize import gravity_direction_errors_rad
 from fleetmap.recordings.ordering import ReadLog, forward_only
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, WheelSample
 from fleetmap.sources.intake import Intake
-from mapserver.survey.segments.segment import planned
+from mapserver.survey.segments import planned
 from mapserver.survey.settings import SegmentSettings
 from support.recordings import mcap_samples
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2

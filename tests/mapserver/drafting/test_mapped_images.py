@@ -12,7 +12,7 @@ from fleetmap.features.patch_align import half_pyramid
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.drafting import mapped_images
 from mapserver.drafting.mapped_images import MappedImageStore
-from mapserver.survey.keyframes.keyframes import Pictures
+from mapserver.survey.state import Pictures
 
 
 def pictures(number: int) -> Pictures:

@@ -23,7 +23,7 @@ from mapserver.drafting.trajectory.given import stamps_on_clock
 from mapserver.drafting.trajectory.readings import Followed, fitted_scale
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.given_poses import poses_as_odometry
-from mapserver.survey.odometry_pass import OdometryPass
+from mapserver.survey.state import OdometryPass
 from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_euroc
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -241,7 +241,7 @@ def test_a_build_from_poses_makes_a_map_of_them(
         begun_with.append(len(given))
         return poses_as_odometry(given, *rest)
 
-    monkeypatch.setattr("mapserver.survey.chain.poses_as_odometry", begun)
+    monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun)
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=0.1)
     options = BuildOptions(use=use, trajectory=OtherTrajectory(file), threads=1)
     done = build_map(recording, tmp_path / "maps", "hall", options)

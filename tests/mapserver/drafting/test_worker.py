@@ -20,8 +20,8 @@ from mapserver.drafting import worker as workers
 from mapserver.drafting.worker import Cluster, Threads, open_executor, open_side_thread, read_ahead
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.pipeline import survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration, make_sample

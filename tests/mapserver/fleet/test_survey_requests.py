@@ -19,7 +19,7 @@ from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import Actor, DraftContent, MapStore
-from mapserver.survey.merge.multi_session import Joined
+from mapserver.survey.merge.multi_session import MergedMap
 from support.fleet.dashboard_scene import SITE, fill_store, hall_tiles
 from support.fleet.served_api import check_problem, served_api
 from support.storage.map_samples import draft_details, random_survey, save_sample_draft
@@ -102,7 +102,7 @@ def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) 
         whole = Trajectory(
             np.concatenate([part.stamps_ns for part in parts]), np.concatenate([part.frame_from_body for part in parts])
         )
-        joined = Joined(replace(survey, trajectory=whole), (), tuple(parts), ())
+        joined = MergedMap(replace(survey, trajectory=whole), (), tuple(parts), ())
         return covered_requests(store, SITE, joined)
 
     first, second = (request.id for request in asked)

@@ -25,8 +25,8 @@ from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, lookalike_words, probe_features
-from mapserver.survey.pipeline import Survey, survey
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import Survey, survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import tiles_from_survey

@@ -21,10 +21,10 @@ from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.keyframes import ImageStore
-from mapserver.survey.pipeline import Survey, survey
-from mapserver.survey.segments.segment import planned
+from mapserver.survey.segments import planned
 from mapserver.survey.settings import SegmentSettings
+from mapserver.survey.stages import Survey, survey
+from mapserver.survey.state import ImageStore
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from support.recordings.kidnapped_ride import ride
 from support.recordings.recording_samples import Sample, calibration

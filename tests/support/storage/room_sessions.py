@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.grid.survey_grid import GridSession
-from mapserver.survey.keyframes.keyframes import MemoryImageStore
+from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, points_seen, stereo_pair
 

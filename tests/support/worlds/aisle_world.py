@@ -17,7 +17,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
-from mapserver.survey.merge.membership import JoinTest, Visit
+from mapserver.survey.merge.membership import MembershipTest, SessionKeyframes
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SurveySettings
 
@@ -108,7 +108,7 @@ def membership(
     map_from_body: Array,
     docks_map_from_survey: Array | None,
     seed: int = 0,
-) -> JoinTest:
+) -> MembershipTest:
     """The test of a session along these places in an aisle; its own frame begins at its first keyframe, and drifts.
 
     seen: what each place shows, where it is not the same from all.
@@ -122,5 +122,5 @@ def membership(
         chain.append(PoseEdge(k, k + 1, step, _STEP_COV, is_loop=False))
     shown = repeat(seen) if isinstance(seen, Aisle) else seen
     frames = [frame(one, place, rng) for one, place in zip(shown, map_from_body, strict=False)]
-    visit = Visit(frames, np.stack(survey_from_body), chain, CAMERA, BODY_FROM_CAM, docks_map_from_survey)
-    return JoinTest(*known, visit, SETTINGS.sessions)
+    visit = SessionKeyframes(frames, np.stack(survey_from_body), chain, CAMERA, BODY_FROM_CAM, docks_map_from_survey)
+    return MembershipTest(*known, visit, SETTINGS.sessions)

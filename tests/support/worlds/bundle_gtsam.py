@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem
+from mapserver.survey.bundle.problem import BundleProblem
 
 
 def gtsam_graph(problem: BundleProblem, huber: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

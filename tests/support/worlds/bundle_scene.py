@@ -8,7 +8,7 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MAP, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, InertialTerms
+from mapserver.survey.bundle.problem import BundleProblem, InertialTerms
 from support.worlds.inertial_motion import analytic_motion, corrected, sample_motion
 
 CAMERA = StereoCamera(focal_px=400.0, cx_px=320.0, cy_px=240.0, baseline_m=0.12, width_px=640, height_px=480)

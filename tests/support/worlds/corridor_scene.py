@@ -7,8 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.2]))

@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.samples import ImuSamples, Trajectory
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 from mapserver.survey.survey_map import History, SurveyMap
-from mapserver.survey.tracks.tracks import Landmarks
 from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, make_scene
 
 SIGMA_PX = 0.4

@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse
-from mapserver.survey.bundle.bundle_adjustment import (
-    BundleProblem,
-    MotionPrior,
-    PriorTerm,
-    RelativeTerm,
-)
 from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
+from mapserver.survey.bundle.problem import BundleProblem, MotionPrior, PriorTerm
 from mapserver.survey.bundle.reduced_system import dense_lower, solve_dense, solve_pcg, solve_sparse
 from mapserver.survey.bundle.settings import BundleSettings
+from mapserver.survey.state import RelativeTerm
 from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
 
 NO_ROBUSTNESS = BundleSettings(huber_sigmas=1e9)

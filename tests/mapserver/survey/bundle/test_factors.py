@@ -9,7 +9,8 @@ import pytest
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.inertial import preintegrate
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_adjustment import BundleProblem, continued, optimize
+from mapserver.survey.bundle.bundle_adjustment import optimize
+from mapserver.survey.bundle.problem import BundleProblem, continued
 from mapserver.survey.bundle.settings import BundleSettings
 from support.worlds.bundle_gtsam import gtsam_graph
 from support.worlds.bundle_scene import ACCEL_BIAS, GYRO_BIAS, NOISE, Scene, disturbed, make_scene

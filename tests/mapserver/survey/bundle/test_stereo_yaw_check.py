@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapserver.survey.bundle.bundle_rounds import SurveyState, bundle_rounds
+from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, disparity_shift, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import SurveyState
 from support.worlds.corridor_scene import CAMERA, scene
 
 SETTINGS = SurveySettings()

@@ -10,7 +10,8 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, transform_map
-from mapserver.survey.odometry_pass import OdometryPass, longest_run
+from mapserver.survey.odometry_pass import longest_run
+from mapserver.survey.state import OdometryPass
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 

@@ -7,9 +7,8 @@ import numpy as np
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 from mapserver.survey.finish.culling import cull, parallax_rad, redundant
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.settings import CullSettings
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
 from support.worlds.session_scene import CAMERA, survey_state
 
 

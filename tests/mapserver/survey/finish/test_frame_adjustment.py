@@ -11,12 +11,10 @@ from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.drafting.worker import Threads
-from mapserver.survey.bundle.bundle_rounds import SurveyState
 from mapserver.survey.finish.frame_adjustment import PlacedFrames, place_frames
 from mapserver.survey.finish.trajectory import frame_trajectory
-from mapserver.survey.frame_tracks import FrameTracks
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import FrameTracks, OdometryPass, SurveyState
 from support.worlds.corridor_scene import CAMERA, scene
 
 FRAMES, FRAME_NS = 31, 100_000_000

@@ -8,8 +8,6 @@ import pytest
 from fleetmap.errors import SurveyError
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.bundle.bundle_adjustment import RelativeTerm
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.keyframes.connected_components import (
     SigmaBetween,
     between_kept,
@@ -18,9 +16,8 @@ from mapserver.survey.keyframes.connected_components import (
     only_kept,
 )
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.odometry_pass import OdometryPass
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import KeyframeMotion, Landmarks, OdometryPass, RelativeTerm, SurveyState
 
 PER_KEYFRAME = 40
 

@@ -11,10 +11,10 @@ from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.bundle.settings import BundleSettings
-from mapserver.survey.keyframes.keyframes import Keyframe, MemoryImageStore
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks, Tracks
+from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
+from mapserver.survey.tracks.tracks import Tracks
 from support.worlds.bundle_scene import make_scene
 from support.worlds.corridor_scene import Scene, scene
 

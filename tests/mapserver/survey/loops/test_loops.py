@@ -13,12 +13,13 @@ from msgspec import structs
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from fleetmap.sensors.rectification import Rectifier
-from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
+from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
+from mapserver.survey.state import Keyframe, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3
-from mapserver.survey.merge.membership import JoinTest, JoinVerdict, Located, NotJoined
+from mapserver.survey.merge.membership import Membership, MembershipTest, MembershipVerdict, SessionPlace
 from support.worlds.aisle_world import Aisle, aisle, drive, membership, relocalizer, repainted
 
 HOME = aisle(1)
@@ -12,12 +12,12 @@ KNOWN = relocalizer(HOME, drive(56))
 PLACES = drive(30, start_m=2.0)
 
 
-def verdict(test: JoinTest) -> tuple[JoinVerdict, Located | NotJoined]:
+def verdict(test: MembershipTest) -> tuple[MembershipVerdict, SessionPlace | Membership]:
     located = test.locate()
-    if isinstance(located, NotJoined):
+    if isinstance(located, Membership):
         return located.verdict, located
     refused = test.judged(located, located.seen)
-    return (JoinVerdict.JOINED, located) if refused is None else (refused.verdict, refused)
+    return (MembershipVerdict.JOINED, located) if refused is None else (refused.verdict, refused)
 
 
 def restocked(share: float, seed: int) -> Aisle:
@@ -48,8 +48,8 @@ def docks(metres: float = 0.0) -> Array:
 def test_a_session_of_the_site_is_joined_where_it_is(share: float) -> None:
     for given in (None, docks()):
         said, located = verdict(membership(KNOWN, restocked(share, 3), PLACES, given))
-        assert said is JoinVerdict.JOINED
-        assert isinstance(located, Located)
+        assert said is MembershipVerdict.JOINED
+        assert isinstance(located, SessionPlace)
         assert located.placed.places >= 8
         assert np.linalg.norm((located.map_from_body - PLACES)[:, :3, 3], axis=1).max() < 0.03
 
@@ -57,8 +57,8 @@ def test_a_session_of_the_site_is_joined_where_it_is(share: float) -> None:
 def test_another_building_is_foreign_however_well_its_fixes_agree_and_its_docks_fit() -> None:
     """Its fixes agree at eight places and more, to the centimetre: what it shares with the site is really there."""
     said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, docks()))
-    assert said is JoinVerdict.FOREIGN
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.FOREIGN
+    assert isinstance(held, Membership)
     assert held.evidence.places >= 8
     assert held.evidence.share_high < 0.5
     assert "another --site" in held.reason
@@ -67,8 +67,8 @@ def test_another_building_is_foreign_however_well_its_fixes_agree_and_its_docks_
 def test_without_docks_another_building_may_as_well_be_an_aisle_of_the_site_the_other_way_round() -> None:
     """A session against the survey's direction is found in a neighbouring aisle that was surveyed its way: none of it is foreign."""
     said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, None))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
     assert held.evidence.share_high < 0.5
     assert "elsewhere" in held.reason
     assert "direction" in held.reason
@@ -78,22 +78,22 @@ def test_without_docks_another_building_may_as_well_be_an_aisle_of_the_site_the_
 def test_what_halls_of_one_maker_share_never_joins(given: Array | None) -> None:
     """Two fifths of the parts are really alike: seen for sure, and not enough, however long the drive."""
     said, held = verdict(membership(KNOWN, shared_above(0.8), drive(46, start_m=2.0), given))
-    assert said is not JoinVerdict.JOINED
-    assert isinstance(held, NotJoined)
+    assert said is not MembershipVerdict.JOINED
+    assert isinstance(held, Membership)
     assert held.evidence.seen_share > 0.3
 
 
 def test_against_the_surveys_direction_nothing_is_decided() -> None:
     around = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     said, held = verdict(membership(KNOWN, HOME, PLACES[::-1] @ around, PLACES[-1] @ around))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
 
 
 def test_a_session_between_both_is_held_with_its_figures() -> None:
     said, held = verdict(membership(KNOWN, restocked(0.65, 4), PLACES, None))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
     assert held.evidence.share_low < 0.5 < held.evidence.share_high
     assert "not certain" in held.reason
 
@@ -101,23 +101,23 @@ def test_a_session_between_both_is_held_with_its_figures() -> None:
 def test_a_building_that_shares_nothing_is_not_found_with_any_docks() -> None:
     for given in (None, docks(), docks(7.0)):
         said, held = verdict(membership(KNOWN, aisle(9), PLACES, given))
-        assert said is JoinVerdict.UNDECIDED
-        assert isinstance(held, NotJoined)
+        assert said is MembershipVerdict.UNDECIDED
+        assert isinstance(held, Membership)
         assert "not found in the map" in held.reason
 
 
 def test_docks_that_contradict_what_is_seen_hold_a_session() -> None:
     said, held = verdict(membership(KNOWN, HOME, PLACES, docks(8.0)))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
     assert held.evidence.priors_off_m == pytest.approx(8.0, abs=0.1)
     assert "docks" in held.reason
 
 
 def test_docks_are_not_doubted_because_some_other_place_is_a_little_like_it() -> None:
     said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, docks(8.0)))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
     assert "not found where its docks are" in held.reason
 
 
@@ -126,14 +126,14 @@ def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart(
     both = together(HOME, twin)
     known = relocalizer(both, np.concatenate([drive(56), drive(56, y_m=30.0)]))
     said, held = verdict(membership(known, both, PLACES, None))
-    assert said is JoinVerdict.UNDECIDED
-    assert isinstance(held, NotJoined)
+    assert said is MembershipVerdict.UNDECIDED
+    assert isinstance(held, Membership)
     assert "look alike" in held.reason
     for y_m in (0.0, 30.0):
         places = drive(30, start_m=2.0, y_m=y_m)
         said, located = verdict(membership(known, both, places, places[0]))
-        assert said is JoinVerdict.JOINED
-        assert isinstance(located, Located)
+        assert said is MembershipVerdict.JOINED
+        assert isinstance(located, SessionPlace)
         assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
 
 
@@ -141,11 +141,11 @@ def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
     """Two thirds of it lead through what the map has not; two metres of overlap are too few places."""
     known = relocalizer(HOME, drive(26))
     said, located = verdict(membership(known, HOME, drive(40, start_m=6.0), None))
-    assert said is JoinVerdict.JOINED
-    assert isinstance(located, Located)
+    assert said is MembershipVerdict.JOINED
+    assert isinstance(located, SessionPlace)
     assert np.linalg.norm((located.map_from_body - drive(40, start_m=6.0))[:10, :3, 3], axis=1).max() < 0.03
     said, _ = verdict(membership(KNOWN, HOME, drive(5, start_m=6.0), None))
-    assert said is JoinVerdict.UNDECIDED
+    assert said is MembershipVerdict.UNDECIDED
 
 
 @pytest.mark.parametrize("is_there", [True, False])
@@ -156,9 +156,9 @@ def test_what_the_map_saw_through_racks_is_not_asked_of_an_aisle_that_it_never_w
     shown = [together(HOME if is_there else aisle(9), backs)] * 10 + [fronts] * 50
     places = np.concatenate([drive(10, start_m=19.0), drive(50, start_m=3.0, y_m=3.2)])
     said, located = verdict(membership(known, shown, places, places[0]))
-    assert (said is JoinVerdict.JOINED) == is_there
+    assert (said is MembershipVerdict.JOINED) == is_there
     if is_there:
-        assert isinstance(located, Located)
+        assert isinstance(located, SessionPlace)
         assert np.linalg.norm((located.map_from_body - places)[:10, :3, 3], axis=1).max() < 0.03
 
 
@@ -174,9 +174,9 @@ def test_docks_choose_their_place_before_one_that_looks_more_like_it_where_it_sp
     known = relocalizer(both, np.concatenate([drive(56), drive(16, start_m=2.0, y_m=30.0)]))
     places = drive(40, start_m=2.0, y_m=30.0)
     said, located = verdict(membership(known, twin, places, places[0]))
-    assert (said is JoinVerdict.JOINED) == is_there
+    assert (said is MembershipVerdict.JOINED) == is_there
     if is_there:
-        assert isinstance(located, Located)
+        assert isinstance(located, SessionPlace)
         assert located.competitor_share is not None
         assert located.competitor_share > located.seen.share
         assert np.linalg.norm((located.map_from_body - places)[:12, :3, 3], axis=1).max() < 0.05

@@ -9,15 +9,14 @@ import pytest
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
-from mapserver.survey.bundle.bundle_rounds import KeyframeMotion, SurveyState
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.changes import known_well
-from mapserver.survey.merge.membership import JoinVerdict, NotJoined
+from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.merge import fewer_keyframes
-from mapserver.survey.merge.multi_session import Joining, Session, chained
+from mapserver.survey.merge.multi_session import MapMerger, Session, chained
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.tracks.tracks import Landmarks
+from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 from support.worlds.session_scene import session_scene
 
 SECOND_NS = 1_000_000_000
@@ -105,7 +104,7 @@ class Sites:
     def extend(self, current: Any, survey: Any, *_: object, **__: object) -> Any:
         self.tried += survey.name
         if self.needs[survey.name] not in current.letters:
-            return NotJoined(f"{survey.name} needs {self.needs[survey.name]}")
+            return Membership(f"{survey.name} needs {self.needs[survey.name]}")
         evidence = SimpleNamespace(fixes=3, places=3, cells_seen=9, cells_expected=9)
         grown = made_up_map(current.letters + survey.name)
         return SimpleNamespace(map=grown, counts=None, evidence=evidence)
@@ -132,7 +131,7 @@ def test_sessions_join_when_what_they_need_is_there(
     monkeypatch.setattr(multi_session, "extend", sites.extend)
     monkeypatch.setattr(multi_session, "_begun", lambda session: session.survey.map)
     monkeypatch.setattr(multi_session, "with_trajectories", lambda found, *_: found)
-    joining = Joining(None, SurveySettings())
+    joining = MapMerger(None, SurveySettings())
     for letter in sessions:
         survey: Any = SimpleNamespace(name=letter, map=made_up_map(letter))
         joining.add(Session(survey, np.eye(4) if letter.islower() else None))
@@ -140,6 +139,6 @@ def test_sessions_join_when_what_they_need_is_there(
     assert joined.map.letters == in_map
     assert sites.tried == tried
     assert [sessions[o.number] for o in joined.outcomes] == list(sessions)
-    assert {sessions[o.number] for o in joined.outcomes if o.verdict is JoinVerdict.JOINED} == set(in_map)
+    assert {sessions[o.number] for o in joined.outcomes if o.verdict is MembershipVerdict.JOINED} == set(in_map)
     stamps = [t.stamps_ns[0] // (10 * SECOND_NS) for t in joined.trajectories]
     assert "".join(map(chr, stamps)) == "".join(letter for letter in sessions if letter in in_map)

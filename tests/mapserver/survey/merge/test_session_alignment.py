@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp
-from mapserver.survey.merge.session_alignment import Placed, SessionFix, alignments, follow_fixes
+from mapserver.survey.merge.session_alignment import Alignment, SessionFix, alignments, follow_fixes
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
@@ -27,7 +27,7 @@ def chain(places: Array) -> list[PoseEdge]:
     return [PoseEdge(k, k + 1, step, cov, is_loop=False) for k, step in enumerate(steps)]
 
 
-def found(fixes: list[SessionFix]) -> list[Placed]:
+def found(fixes: list[SessionFix]) -> list[Alignment]:
     return alignments(fixes, drive(), GraphMarginals(drive(), chain(drive())))
 
 
@@ -85,7 +85,7 @@ def test_a_survey_that_drifted_is_bent_onto_the_map_and_a_wrong_fix_is_disbeliev
         edges.append(PoseEdge(k, k + 1, step, np.diag([0.004**2] * 3 + [0.01**2] * 3), is_loop=False))
     fixes = tuple(fix(k, MAP_FROM_SURVEY) if k != 9 else fix(k, shifted(0.5)) for k in range(1, 20, 2))
     start = MAP_FROM_SURVEY @ np.array(drifted)
-    placed, believed = follow_fixes(Placed(fixes, MAP_FROM_SURVEY, 9), np.array(drifted), edges)
+    placed, believed = follow_fixes(Alignment(fixes, MAP_FROM_SURVEY, 9), np.array(drifted), edges)
     wanted = MAP_FROM_SURVEY @ true
     before, after = (np.linalg.norm((p - wanted)[:, :3, 3], axis=1).max() for p in (start, placed))
     assert before > 0.1

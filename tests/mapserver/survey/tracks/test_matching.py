@@ -10,14 +10,14 @@ import pytest
 from fleetmap.geometry import Array, se3, se3_exp, so3_exp
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL, SerialExecutor
-from mapserver.survey.keyframes.keyframes import Keyframe, make_keyframe
+from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.settings import PairSettings, SurveySettings
+from mapserver.survey.state import Keyframe
 from mapserver.survey.tracks.matching import (
     NearPlaces,
     PairFinder,
     drift_allowance_m,
     fixed_allowance_m,
-    median_depth_m,
 )
 from mapserver.survey.tracks.pairs import PairTask, view_overlap
 from support.recordings.recording_samples import calibration
@@ -121,7 +121,7 @@ def test_after_adjustment_little_is_allowed() -> None:
 def test_depth_and_overlap_against_the_room() -> None:
     """The wall is 2.2-2.6 m ahead; the same view overlaps itself wholly, one from behind not at all."""
     keyframes, _, rectifier = seen()
-    assert 1.8 < median_depth_m(keyframes[0]) < 3.0
+    assert 1.8 < keyframes[0].median_depth_m < 3.0
     assert view_overlap(keyframes[0], rectifier.camera, np.eye(4)) > 0.99
     behind = se3(so3_exp(np.array([0, np.pi, 0])), np.zeros(3))
     assert view_overlap(keyframes[0], rectifier.camera, behind) == 0.0

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
-from mapserver.survey.tracks.mono_depths import fuse_inverse_depths, survey_camera
+from mapserver.survey.state import survey_camera
+from mapserver.survey.tracks.mono_depths import fuse_inverse_depths
 
 
 def test_views_that_agree_are_averaged_by_their_weight() -> None:

@@ -10,10 +10,11 @@ import pytest
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL
-from mapserver.survey.keyframes.keyframes import Keyframe, PosedKeyframes, make_keyframe
+from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Keyframe, Landmarks, PosedKeyframes
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
-from mapserver.survey.tracks.tracks import Landmarks, Tracks, build_landmarks, refine_observations, tracks_of
+from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, points_seen, stereo_pair
 

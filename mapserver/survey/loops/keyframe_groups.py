@@ -1,6 +1,6 @@
-"""Parts of a survey that loses itself, and when a revisit is sure enough to join two of them.
+"""Groups of keyframes in a survey that loses itself, and when a revisit is sure enough to join two of them.
 
-Within a part odometry says where keyframes lie to each other, and the gate of `LoopCloser` rests on it. Between parts it says next to
+Within a group odometry says where keyframes lie to each other, and the gate of `LoopCloser` rests on it. Between groups it says next to
 nothing: one place that looks alike would join them wrongly. So several revisits must agree, over some way.
 """
 
@@ -14,13 +14,13 @@ from fleetmap.geometry import Array, se3_inverse, so3_log
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
-_MIN_KEYFRAMES = 3  # that agree on where their part lies
+_MIN_KEYFRAMES = 3  # that agree on where their group lies
 _MIN_WAY_M = 1.0  # between the outermost of them: TRACKING is announced after as much
 _MOST_COMPETITORS = 1 / 3  # keyframes that say otherwise, for each of those that agree
 _FLOOR_M, _FLOOR_RAD, _SIGMAS = 0.3, 0.15, 3.0
 
 
-class Parts:
+class KeyframeGroups:
     """Keyframes that belong together, as far as is known (disjoint sets)."""
 
     def __init__(self, joins: Iterable[tuple[int, int]] = (), count: int = 0) -> None:
@@ -32,29 +32,29 @@ class Parts:
         return len(self._parents)
 
     def grow(self, count: int) -> None:
-        """Takes more keyframes, each a part of its own."""
+        """Takes more keyframes, each a group of its own."""
         self._parents += range(len(self._parents), count)
 
     def join(self, a: int, b: int) -> None:
-        """Keyframes a and b belong together; the part is known by its first keyframe."""
+        """Keyframes a and b belong together; the group is known by its first keyframe."""
         first, second = sorted((self.of(a), self.of(b)))
         self._parents[second] = first
 
     def of(self, k: int) -> int:
-        """The first keyframe of the part that k is in."""
+        """The first keyframe of the group that k is in."""
         while self._parents[k] != k:
             self._parents[k] = self._parents[self._parents[k]]
             k = self._parents[k]
         return k
 
     def labels(self) -> NDArray[np.int64]:
-        """(K,) the part of each keyframe, by its first keyframe."""
+        """(K,) the group of each keyframe, by its first keyframe."""
         return np.array([self.of(k) for k in range(len(self._parents))], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Revisit:
-    """A verified match of a keyframe with one of another part: the edge from that (its j) to it (its i), the number of its record."""
+    """A verified match of a keyframe with one of another group: the edge from that (its j) to it (its i), the number of its record."""
 
     edge: PoseEdge
     record: int
@@ -62,14 +62,14 @@ class Revisit:
 
 @dataclass
 class WaitingRevisits:
-    """Revisits between parts, each of which waits for others that agree with it."""
+    """Revisits between groups, each of which waits for others that agree with it."""
 
     _waiting: list[Revisit] = field(default_factory=list)
 
-    def add(self, revisit: Revisit, parts: Parts, marginals: GraphMarginals) -> list[Revisit]:
-        """One more; all that join its two parts if it makes them sure, an empty list while they are not."""
-        pair = _pair(revisit, parts)
-        beside = [other for other in self._waiting if _pair(other, parts) == pair]
+    def add(self, revisit: Revisit, groups: KeyframeGroups, marginals: GraphMarginals) -> list[Revisit]:
+        """One more; all that join its two groups if it makes them sure, an empty list while they are not."""
+        pair = _pair(revisit, groups)
+        beside = [other for other in self._waiting if _pair(other, groups) == pair]
         self._waiting.append(revisit)
         agreeing = [revisit, *(other for other in beside if _agree(revisit, other, marginals))]
         competitors = {other.edge.i for other in beside if other not in agreeing}
@@ -85,12 +85,12 @@ class WaitingRevisits:
         return sorted(agreeing, key=lambda each: each.record)
 
 
-def _pair(revisit: Revisit, parts: Parts) -> tuple[int, int]:
-    return parts.of(revisit.edge.i), parts.of(revisit.edge.j)
+def _pair(revisit: Revisit, groups: KeyframeGroups) -> tuple[int, int]:
+    return groups.of(revisit.edge.i), groups.of(revisit.edge.j)
 
 
 def _agree(one: Revisit, other: Revisit, marginals: GraphMarginals) -> bool:
-    """Whether two revisits put the new part at the same place, as far as odometry within the parts can say."""
+    """Whether two revisits put the new group at the same place, as far as odometry within the groups can say."""
     a, b, placed = one.edge, other.edge, marginals.map_from_body
     new_from_new, old_from_old = (se3_inverse(placed[q]) @ placed[p] for p, q in ((a.i, b.i), (b.j, a.j)))
     off = se3_inverse(b.i_from_j) @ new_from_new @ a.i_from_j @ old_from_old

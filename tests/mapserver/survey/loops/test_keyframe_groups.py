@@ -1,4 +1,4 @@
-"""Two parts of a survey: joined by revisits that agree over some way, and by nothing less."""
+"""Two groups of a survey: joined by revisits that agree over some way, and by nothing less."""
 
 from itertools import pairwise
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from mapserver.survey.loops.parts import Parts, Revisit, WaitingRevisits
+from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
@@ -34,8 +34,8 @@ def marginals() -> GraphMarginals:
     return GraphMarginals(placed, edges)
 
 
-def parts() -> Parts:
-    return Parts([*pairwise(FIRST), *pairwise(SECOND)], 12)
+def groups() -> KeyframeGroups:
+    return KeyframeGroups([*pairwise(FIRST), *pairwise(SECOND)], 12)
 
 
 def seen_again(i: int, j: int, at: int | None = None) -> PoseEdge:
@@ -44,9 +44,9 @@ def seen_again(i: int, j: int, at: int | None = None) -> PoseEdge:
     return PoseEdge(i, j, se3_inverse(placed[i if at is None else at]) @ placed[j], SURE, is_loop=True)
 
 
-def test_three_keyframes_over_a_metre_join_two_parts() -> None:
+def test_three_keyframes_over_a_metre_join_two_groups() -> None:
     waiting, graph = WaitingRevisits(), marginals()
-    said = [waiting.add(Revisit(seen_again(6 + k, 5 - k), k), parts(), graph) for k in range(3)]
+    said = [waiting.add(Revisit(seen_again(6 + k, 5 - k), k), groups(), graph) for k in range(3)]
     assert [len(joined) for joined in said] == [0, 0, 3]
     assert [revisit.record for revisit in said[-1]] == [0, 1, 2]
 
@@ -62,7 +62,7 @@ def test_three_keyframes_over_a_metre_join_two_parts() -> None:
 )
 def test_what_looks_alike_here_and_there_does_not_join_them(looks: list[PoseEdge]) -> None:
     waiting, graph = WaitingRevisits(), marginals()
-    assert [waiting.add(Revisit(edge, n), parts(), graph) for n, edge in enumerate(looks)] == [[]] * len(looks)
+    assert [waiting.add(Revisit(edge, n), groups(), graph) for n, edge in enumerate(looks)] == [[]] * len(looks)
 
 
 def test_a_part_that_was_turned_round_is_placed_as_it_is() -> None:
@@ -74,8 +74,8 @@ def test_a_part_that_was_turned_round_is_placed_as_it_is() -> None:
     assert graph.relative_cov(11, 0)[3:, 3:].max() < 0.1
 
 
-def test_parts_are_known_by_their_first_keyframe() -> None:
-    found = parts()
+def test_groups_are_known_by_their_first_keyframe() -> None:
+    found = groups()
     assert found.labels().tolist() == [0] * 6 + [6] * 6
     found.join(11, 3)
     found.grow(13)

@@ -1,0 +1,394 @@
+"""Long surveys in segments that overlap: each is followed and adjusted in parallel with others, and joined to the one before. Pure.
+
+Two neighbours share a keyframe, the last of one and the first of the other: it says exactly where they lie to each other, so that
+every edge between neighbouring keyframes is one that some segment has measured and adjusted. What cannot be joined is made in one piece.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
+from mapserver.survey.bundle.odometry_factors import blackout_factors, edge_covariance, initial_state
+from mapserver.survey.keyframes.keyframes import set_aside
+from mapserver.survey.settings import SegmentSettings, SurveySettings
+from mapserver.survey.state import Cut, FrameTracks, ImageStore, Landmarks, MemoryImageStore, OdometryPass, SurveyState
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
+
+_MARGIN_NS = 1_000_000_000  # of IMU and wheels behind the last frame
+_GATE = 22.46  # 0.999 of chi-square with 6 degrees of freedom
+Begin = Callable[[SurveyInputs, SurveySettings, SurveyTools], AdjustedChain]
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """Frames begin..last of a survey; its odometry starts at frame `lead`. All but the first begin where the one before has its last."""
+
+    lead: int
+    begin: int
+    last: int
+
+    @property
+    def settled_from(self) -> int:
+        """The frame from which on its odometry must be sure of itself."""
+        return (self.lead + self.begin) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A segment with its frames and the samples of IMU and wheels between them. images: takes the pictures of its keyframes."""
+
+    segment: Segment
+    frames: Iterable[CameraFrame]
+    imu: ImuSamples
+    wheel: tuple[WheelSample, ...]
+    keyframes_at: frozenset[int]
+    images: ImageStore
+
+
+@dataclass(frozen=True, slots=True)
+class _Shared:
+    """All that a process needs beside a task. begin: makes the chain of one piece."""
+
+    begin: Begin
+    calibration: RigCalibration
+    rectifier: Rectifier
+    settings: SurveySettings
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentSurvey:
+    """Odometry of a segment's frames and state of its keyframes, those at both its ends included.
+
+    Keyframes have their frame's number in the survey, and their pictures in the store that the task named, or one of the process that made
+    them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
+    odometry. unsettled, lost: why its beginning, or its end, cannot be joined to a neighbour.
+    """
+
+    segment: Segment
+    odometry: OdometryPass
+    tracks: FrameTracks
+    state: SurveyState
+    matched: set[tuple[int, int]]
+    led: Array
+    led_covariance: Array
+    unsettled: str | None
+    lost: str | None
+
+
+_Made = tuple[Segment, SegmentSurvey | str]  # in words why there is none
+
+
+def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
+    """As `begin`; a survey that is long enough, and whose odometry has metres of its own, is cut. Where goes by its frames alone.
+
+    A segment whose odometry starts on the way, in the overlap, may fail to find its feet there. Then the one before goes on in its
+    place, as it would have without the cut, and `cuts` of the odometry say so.
+    """
+    if inputs.parts is None or inputs.initial_trajectory is not None or inputs.rectifier.camera.baseline_m == 0:
+        return begin(inputs, settings, tools)
+    stamps_ns = inputs.parts.stamps_ns
+    segments = planned(stamps_ns, settings.segments)
+    shared = _Shared(begin, inputs.calibration, inputs.rectifier, settings)
+    images = MemoryImageStore() if tools.images is None else tools.images
+    tools = replace(tools, images=images)
+    made = list(_in_parallel(segments, shared, inputs, tools, images)) if len(segments) > 1 else []
+    refused: dict[int, str] = {}
+    while wrong := _refusals(made):
+        refused |= wrong
+        made = list(_made_again(made, refused, shared, inputs, tools, images))
+    cuts = tuple(
+        Cut(s.begin, float(stamps_ns[s.begin] - stamps_ns[0]) * 1e-9, refused.get(s.begin)) for s in segments[1:]
+    )
+    if not made:
+        chain = begin(inputs, settings, tools)
+        return replace(chain, odometry=replace(chain.odometry, cuts=cuts))
+    return _joined([survey for _, survey in made if isinstance(survey, SegmentSurvey)], cuts, inputs)
+
+
+def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
+    """Segments of equal time, at least as long as the settings say; a single one of what is too short to be cut."""
+    if settings.seconds and len(stamps_ns):  # a gap, of days where a clock was set, is not cut into segments
+        steps_ns = np.minimum(np.diff(stamps_ns), int(settings.seconds * 1e9))
+        stamps_ns = stamps_ns[0] + np.concatenate([[0], np.cumsum(steps_ns)])
+    seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
+    count = int(seconds / settings.seconds) if settings.seconds else 1
+    last = len(stamps_ns) - 1
+    if count < 2:
+        return [Segment(0, 0, last)]
+    starts_ns = stamps_ns[0] + (np.arange(count) * (seconds * 1e9 / count)).astype(np.int64)
+    begins = np.searchsorted(stamps_ns, starts_ns)
+    leads = np.searchsorted(stamps_ns, starts_ns - int(settings.overlap_s * 1e9))
+    ends = [*begins[1:].tolist(), last]
+    return [Segment(*each) for each in zip(leads.tolist(), begins.tolist(), ends, strict=True)]
+
+
+def _in_parallel(
+    segments: Sequence[Segment], shared: _Shared, inputs: SurveyInputs, tools: SurveyTools, images: ImageStore
+) -> Iterator[_Made]:
+    """What became of each; what processes return of pictures goes into the survey's own store as it comes."""
+    tasks = (_task_of(segment, inputs, images) for segment in segments)
+    for segment, survey in zip(segments, tools.executor.map(_survey_segment, shared, tasks), strict=True):
+        tools.at("odometry", segment.last + 1, inputs.frame_count)
+        tools.release()
+        yield segment, survey if isinstance(survey, str) else _stored(survey, images)
+
+
+def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
+    keyframes = [
+        k if k.images is images else set_aside(replace(k, images=images, image_number=images.put(k.pictures)), images)
+        for k in survey.odometry.keyframes
+    ]
+    return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
+
+
+def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Task:
+    """The segment with its part of the inputs, and with the store of its pictures.
+
+    No sample from before its first frame: what the IMU felt while no picture was there would pass for rest where the robot drove evenly.
+    """
+    assert inputs.parts is not None
+    offset_ns, stamps_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9), inputs.parts.stamps_ns
+    since_ns = int(stamps_ns[segment.lead]) + offset_ns if segment.lead else -(2**62)
+    until_ns = int(stamps_ns[segment.last]) + offset_ns + _MARGIN_NS
+    ends = {segment.begin, segment.last} - {0, len(stamps_ns) - 1}
+    return _Task(
+        segment,
+        inputs.parts.part(segment.lead, segment.last + 1),
+        inputs.imu.between(since_ns, until_ns),
+        tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
+        frozenset(frame - segment.lead for frame in ends),
+        images,
+    )
+
+
+def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
+    """The survey of one segment in any process; in words why there is none."""
+    segment = task.segment
+    inputs = SurveyInputs(
+        task.frames,
+        segment.last - segment.lead + 1,
+        task.imu,
+        shared.calibration,
+        shared.rectifier,
+        task.wheel,
+        keyframes_at=task.keyframes_at,
+    )
+    try:
+        chain = shared.begin(inputs, shared.settings, tools or SurveyTools(images=task.images))
+    except SurveyError as error:
+        return str(error)
+    return _without_lead(chain, segment)
+
+
+def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
+    """A segment's chain from `begin` on; nothing of the IMU, which the whole survey has."""
+    odometry, lead = chain.odometry, segment.lead
+    first, end, settled = segment.begin - lead, segment.last - lead + 1, segment.settled_from - lead
+    chosen = np.array([frame >= first for frame in odometry.keyframe_frames])
+    number = np.cumsum(chosen) - 1
+    keyframes = [k for k, keep in zip(odometry.keyframes, chosen, strict=True) if keep]
+    state = chain.state.of(chosen)
+    odom_from_body, tracks = odometry.odom_from_body, odometry.tracks
+    assert tracks is not None
+    kept = replace(
+        odometry,
+        estimates=[replace(e, frame_index=e.frame_index + lead) for e in odometry.estimates[first:end]],
+        odom_from_body=odom_from_body[first:end],
+        covariances=odometry.covariances[first:end],
+        tracked=odometry.tracked[first:end],
+        keyframes=[replace(k, frame_index=k.frame_index + lead) for k in keyframes],
+        tracks=None,
+    )
+    return SegmentSurvey(
+        segment,
+        kept,
+        tracks.part(first, end),
+        replace(state, motion=replace(state.motion, imu=ImuSamples.empty())),
+        {(int(number[i]), int(number[j])) for i, j in chain.matched if chosen[i] and chosen[j]},
+        se3_inverse(odom_from_body[settled]) @ odom_from_body[first],
+        edge_covariance(odometry, settled, first),
+        _doubt(chain, slice(settled, first + 1)),
+        _doubt(chain, slice(end - 1, end)),
+    )
+
+
+def _doubt(chain: AdjustedChain, frames: slice) -> str | None:
+    """Why the odometry is not sure of itself at these frames, counted from the lead; None where it is."""
+    if not chain.odometry.tracked[frames].all():
+        return "it saw too little there"
+    if chain.state.motion.noise is not None and not all(e.inertial for e in chain.odometry.estimates[frames]):
+        return "it did not know gravity there"
+    return None
+
+
+def _refusals(made: Sequence[_Made]) -> dict[int, str]:
+    """Why neighbours cannot be joined, by the frame between them."""
+    found = {}
+    for (_, before), (segment, after) in pairwise(made):
+        if isinstance(before, str):
+            found[segment.begin] = before
+        elif isinstance(after, str):
+            found[segment.begin] = after
+        elif (reason := refusal(before, after)) is not None:
+            found[segment.begin] = reason
+    return found
+
+
+def refusal(before: SegmentSurvey, after: SegmentSurvey) -> str | None:
+    """Why two neighbours cannot be joined, None where they can: both were sure of themselves, and saw the robot drive there alike."""
+    if before.lost is not None:
+        return f"the odometry before it was in doubt: {before.lost}"
+    if after.unsettled is not None:
+        return f"the odometry that started before it was in doubt: {after.unsettled}"
+    start = before.segment.begin
+    led = [frame - start for frame in (after.segment.settled_from, after.segment.begin)]
+    if led[0] < 0:
+        return "its overlap is longer than the segment before it"
+    a, b = before.odometry.odom_from_body[led]
+    off = se3_inverse(se3_inverse(a) @ b) @ after.led
+    error = np.concatenate([so3_log(off[:3, :3]), off[:3, 3]])
+    carry = np.kron(np.eye(2), after.led[:3, :3])  # covariances are in the axes of the first body
+    covariance = carry.T @ (edge_covariance(before.odometry, led[0], led[1]) + after.led_covariance) @ carry
+    if float(error @ np.linalg.solve(covariance, error)) > _GATE:
+        metres, degrees = np.linalg.norm(error[3:]), np.degrees(np.linalg.norm(error[:3]))
+        return (
+            f"the odometry before it and the one that started there differ by {metres:.2f} m and {degrees:.1f} degrees"
+        )
+    return None
+
+
+def _made_again(
+    made: Sequence[_Made],
+    refused: dict[int, str],
+    shared: _Shared,
+    inputs: SurveyInputs,
+    tools: SurveyTools,
+    images: ImageStore,
+) -> Iterator[_Made]:
+    """Neighbours that could not be joined as one segment each; nothing if that is the whole survey, which needs no segments."""
+    groups: list[list[_Made]] = []
+    for each in made:
+        if groups and each[0].begin in refused:
+            groups[-1].append(each)
+        else:
+            groups.append([each])
+    if len(groups) == 1:
+        return
+    for group in groups:
+        if len(group) == 1:
+            yield group[0]
+            continue
+        whole = Segment(group[0][0].lead, group[0][0].begin, group[-1][0].last)
+        # Here, not in a process elsewhere: it may be long, and the survey's own store keeps its pictures out of memory.
+        yield whole, _survey_segment(shared, _task_of(whole, inputs, images), tools)
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """A segment in the frame of the whole: joined_from_odom and joined_from_map (4, 4), its first keyframe's number, its tracks' first."""
+
+    made: SegmentSurvey
+    joined_from_odom: Array
+    joined_from_map: Array
+    first_keyframe: int
+    first_track: int
+
+
+def _joined(segments: Sequence[SegmentSurvey], cuts: tuple[Cut, ...], inputs: SurveyInputs) -> AdjustedChain:
+    """One chain of segments that can be joined, in the frame of the first one."""
+    level = inputs.calibration.imu is not None
+    placed = [_Placed(segments[0], np.eye(4), np.eye(4), 0, 0)]
+    for before, after in pairwise(segments):
+        last = placed[-1]
+        odom_from_body, map_from_body = before.odometry.odom_from_body, before.state.map_from_body
+        placed.append(
+            _Placed(
+                after,
+                _laid_on(last.joined_from_odom @ odom_from_body[-1], after.odometry.odom_from_body[0], level),
+                _laid_on(last.joined_from_map @ map_from_body[-1], after.state.map_from_body[0], level),
+                last.first_keyframe + len(before.odometry.keyframes) - 1,
+                last.first_track + int(before.tracks.ids.max(initial=-1)) + 1,
+            )
+        )
+    odometry = replace(_joined_odometry(placed), cuts=cuts)
+    matched = {(i + each.first_keyframe, j + each.first_keyframe) for each in placed for i, j in each.made.matched}
+    return AdjustedChain(odometry, _joined_state(placed, odometry, inputs), matched, None)
+
+
+def _laid_on(joined_from_body: Array, segment_from_body: Array, level: bool) -> Array:
+    """joined_from_segment (4, 4) by one body in both. level: both know gravity, which a turn about z alone leaves as it is.
+
+    So no segment adds its error of tilt to those behind it.
+    """
+    if not level:
+        return np.asarray(joined_from_body @ se3_inverse(segment_from_body))
+    turn = joined_from_body[:3, :3] @ segment_from_body[:3, :3].T
+    yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    rotation = so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3(rotation, joined_from_body[:3, 3] - rotation @ segment_from_body[:3, 3])
+
+
+def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
+    """Every frame is of the segment that begins with it or before it; what two saw of a shared frame, it has of both."""
+    covariances, reached = list[Array](), np.zeros((6, 6))
+    starts, ids, pixels, size = [np.zeros(1, np.int64)], [], [], 0
+    for each in placed:
+        own, turn = each.made.odometry.covariances, np.kron(np.eye(2), each.joined_from_odom[:3, :3])
+        covariances.append(reached + turn @ (own - own[0]) @ turn.T)
+        reached = covariances[-1][-1]
+        tracks = each.made.tracks
+        # A shared frame ends where its rows of the later segment do.
+        starts[-1] = starts[-1][:-1] if size else starts[-1]
+        starts.append(size + tracks.starts[1:])
+        ids.append(tracks.ids + np.int32(each.first_track))
+        pixels.append(tracks.pixels)
+        size += len(tracks.ids)
+    covariances[0] += placed[0].made.odometry.covariances[0]
+    passes = [each.made.odometry for each in placed]
+    return replace(
+        passes[-1],
+        estimates=[e for own in passes[:-1] for e in own.estimates[:-1]] + passes[-1].estimates,
+        odom_from_body=_in_turn([each.joined_from_odom @ each.made.odometry.odom_from_body for each in placed]),
+        covariances=_in_turn(covariances),
+        tracked=_in_turn([own.tracked for own in passes]),
+        keyframes=[k for own in passes[:-1] for k in own.keyframes[:-1]] + passes[-1].keyframes,
+        tracks=FrameTracks(np.concatenate(starts), np.concatenate(ids), np.concatenate(pixels)),
+    )
+
+
+def _in_turn(parts: Sequence[Array]) -> Array:
+    """Rows of all, each without its last, which the next one has first."""
+    return np.concatenate([*(part[:-1] for part in parts[:-1]), parts[-1]])
+
+
+def _joined_state(placed: Sequence[_Placed], odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
+    """Landmarks of all segments; what two have seen is two landmarks, until landmarks are made anew."""
+    velocities, poses, points, marks, number = [], [], [], [], 0
+    for each in placed:
+        own, turn = each.made.state, each.joined_from_map
+        velocities.append(own.motion.velocities_mps @ turn[:3, :3].T)
+        poses.append(turn @ own.map_from_body)
+        points.append(own.landmarks.points_map @ turn[:3, :3].T + turn[:3, 3])
+        seen_by = own.landmarks.obs_keyframe + np.int32(each.first_keyframe)
+        owners = (own.landmarks.obs_landmark + number).astype(np.int32)
+        marks.append(replace(own.landmarks, obs_keyframe=seen_by, obs_landmark=owners))
+        number += len(points[-1])
+    state, motions = initial_state(odometry, inputs), [each.made.state.motion for each in placed]
+    motion = replace(
+        state.motion,
+        velocities_mps=_in_turn(velocities),
+        gyro_bias_radps=_in_turn([m.gyro_bias_radps for m in motions]),
+        accel_bias_mps2=_in_turn([m.accel_bias_mps2 for m in motions]),
+    )
+    landmarks = Landmarks.concatenated(np.concatenate(points), marks)
+    state = replace(state, map_from_body=_in_turn(poses), motion=motion, landmarks=landmarks)
+    if odometry.inertial:
+        state = replace(state, motion=replace(motion, relative=blackout_factors(odometry, state)))
+    return state

@@ -1,0 +1,284 @@
+"""A survey from a recording to a map: its stages in order, each a function of what the ones before it have found.
+
+| stage | takes | gives |
+|---|---|---|
+| `follow` | frames, IMU, wheels | odometry of all frames, keyframes with their features |
+| `adjust_chain` | odometry | keyframes matched with their neighbours, landmarks, both adjusted; of a long recording segment by segment |
+| `close_loops` | the chain | revisits, and keyframes where the pose graph with them says |
+| `adjust_globally` | keyframes after loops | all views matched anew, adjusted together; the stereo pair's error of yaw |
+| `keep_largest` | the adjusted state | the connected component that becomes the map |
+| `place_frames`, `assemble` | the state that is kept | all frames, and the map |
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import Vocabulary
+from fleetmap.errors import SurveyError
+from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
+from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, initial_state, odometry_factors
+from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.finish.culling import Culled
+from mapserver.survey.finish.frame_adjustment import place_frames
+from mapserver.survey.finish.map_assembly import assemble
+from mapserver.survey.given_poses import poses_as_odometry
+from mapserver.survey.keyframes.connected_components import (
+    Component,
+    SigmaBetween,
+    between_kept,
+    covisibility_of,
+    find_components,
+    find_groups,
+    only_kept,
+)
+from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
+from mapserver.survey.loops.loops import LoopCloser, Loops
+from mapserver.survey.loops.sim3_loops import gate_covariances, rigid, solve_scaled
+from mapserver.survey.odometry_pass import run_odometry
+from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
+from mapserver.survey.pose_graph.position_priors import learn_priors
+from mapserver.survey.segments import in_segments
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Landmarks, OdometryPass, PosedKeyframes, SurveyState
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
+from mapserver.survey.tracks.mono_depths import MonoDepths
+from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
+
+_MIN_KEYFRAMES = 2
+_MIN_LANDMARKS = 30
+_ADJUSTED_SIGMA_RAD = 0.02  # of the rotation between adjusted keyframes, and between neighbours with an IMU
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The result of a survey.
+
+    odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation.
+    components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw error of the pair.
+    seen (F,): frames that points of the map place; the others are where odometry or the IMU carries them.
+    """
+
+    map: SurveyMap
+    vocabulary: Vocabulary
+    loops: Loops
+    odometry: OdometryPass
+    state: SurveyState
+    culled: Culled
+    stereo_yaw: StereoYaw
+    components: list[Component]
+    seen: NDArray[np.bool_]
+
+
+def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
+    """Maps one recording. Raises SurveyError where it holds too little to map."""
+    tools = tools or SurveyTools()
+    return _finished(begin_survey(inputs, config.settings, tools), inputs, config, tools)
+
+
+def survey_from(
+    odometry: OdometryPass, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None
+) -> Survey:
+    """All stages after the initial trajectory."""
+    tools = tools or SurveyTools()
+    return _finished(adjust_chain(odometry, inputs, config.settings, tools), inputs, config, tools)
+
+
+def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
+    """The stages before loops are looked for, of a long recording by segments. Raises SurveyError where there is too little."""
+    return in_segments(_whole, inputs, settings, tools)
+
+
+def _whole(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
+    return adjust_chain(follow(inputs, settings, tools), inputs, settings, tools)
+
+
+def _finished(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
+    settings, depths = config.settings, chain.depths
+    state, loops = close_loops(chain, inputs, config, tools)
+    # Neighbours need not be matched again. Of one camera they are, as depths by which they were matched have changed.
+    matched, tracks = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
+    odometry = chain.odometry
+    # The landmarks so far are those of neighbours; all are made anew, and nobody may hold the old ones meanwhile.
+    del chain
+    state = replace(state, landmarks=Landmarks.empty())
+    odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
+    tools.at("global adjustment", 2, 2)
+    frames_of = np.array(odometry.keyframe_frames, np.int64)
+    components = find_components(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
+    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
+    placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
+    survey_map, culled = assemble(state, odometry, placed, settings)
+    between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
+    survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
+    every = [*components.components, *components.stray]
+    return Survey(survey_map, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+
+
+def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
+    """Odometry of all frames, or the poses of another system in its place, with the keyframes."""
+    if inputs.initial_trajectory is None:
+        return run_odometry(inputs, settings, tools)
+    return poses_as_odometry(inputs.initial_trajectory, inputs, settings, tools)
+
+
+def adjust_chain(
+    odometry: OdometryPass, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
+) -> AdjustedChain:
+    """Keyframes matched with their neighbours and adjusted, before loops are looked for; SurveyError where there is too little."""
+    if len(odometry.keyframes) < _MIN_KEYFRAMES:
+        raise SurveyError(
+            f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} keyframe(s) that belong together; a map needs "
+            f"motion, at least {_MIN_KEYFRAMES}"
+        )
+    state = initial_state(odometry, inputs)
+    depths = None
+    if inputs.rectifier.camera.baseline_m == 0:
+        depths = MonoDepths(odometry.keyframes, state.camera, settings)
+    odometry = _with_depths(odometry, state, depths)
+    allowed_m = drift_allowance_m(odometry.covariances[odometry.keyframe_frames], state.map_from_body[:, :3, 3])
+    finder, previous = _pair_finder(odometry, state, settings, tools), settings.pairs.previous
+    near = max(settings.loops.min_gap_keyframes, previous)
+    candidates = finder.candidates(state.map_from_body, previous=previous, only_near=near)
+    pairs = finder.match(
+        candidates,
+        state.map_from_body,
+        allowed_m,
+        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD if odometry.inertial else None,
+        progress=_progress_of(tools, "matching", len(candidates)),
+    )
+    landmarks = build_landmarks(_posed(odometry, state), tracks_of(pairs), settings, tools.executor)
+    state = replace(state, landmarks=landmarks)
+    if odometry.inertial:
+        state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
+    if len(landmarks.points_map) < _MIN_LANDMARKS:
+        raise SurveyError(
+            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; look at the recording with "
+            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
+        )
+    matched = {(p.i, p.j) for p in pairs}
+    del pairs, landmarks, finder  # as large as all else in a long survey
+    tools.at("local adjustment", 0, 1)
+    if state.motion.inertial:
+        # All at once: windows hold what came before them, and so lose the direction that odometry has from the gyro.
+        held = [state]
+        del state  # or its observations would be in memory twice
+        state = bundle_rounds(held.pop(), settings, rounds=2)
+    else:
+        state = local_windows(state, settings)
+    return AdjustedChain(_with_depths(odometry, state, depths), state, matched, depths)
+
+
+def close_loops(
+    begun: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools
+) -> tuple[SurveyState, Loops]:
+    """Finds loops; the keyframes are then where the pose graph with them says. Position priors are known to the gate alone."""
+    odometry, state, settings = begun.odometry, begun.state, config.settings
+    chain, scale_walk = chain_edges(odometry, state), settings.monocular.scale_walk
+    known = chain if odometry.scale_known else gate_covariances(chain, scale_walk)
+    marginals = GraphMarginals(state.map_from_body, known)
+    if odometry.scale_known:
+        learn_priors(marginals, inputs.priors, inputs.calibration.base_from_body, odometry)
+    groups = find_groups(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
+    closer = LoopCloser(
+        _posed(odometry, state),
+        config,
+        marginals,
+        begun.matched,
+        tools.executor,
+        groups,
+        measures_scale=not odometry.scale_known,
+    )
+    for i in range(len(odometry.keyframes)):
+        closer.close(i)
+        tools.at("loops", i + 1, len(odometry.keyframes))
+    loops = closer.loops
+    if not loops.edges:
+        return state, loops
+    if odometry.scale_known:
+        solved = optimize_pose_graph(closer.begin, [*chain, *loops.edges])
+        return state.moved(solved.map_from_body), loops.without_outliers(solved.loop_weights)
+    scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
+    state = state.moved(rigid(scaled))
+    factors = odometry_factors(odometry, state.map_from_body)
+    return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(scaled.loop_weights)
+
+
+def adjust_globally(
+    odometry: OdometryPass,
+    state: SurveyState,
+    depths: MonoDepths | None,
+    matched: set[tuple[int, int]],
+    tracks: Tracks | None,
+    settings: SurveySettings,
+    tools: SurveyTools,
+) -> tuple[OdometryPass, SurveyState, StereoYaw]:
+    """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error.
+
+    matched: pairs that need not be matched again, and the tracks that they have joined.
+    """
+    yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
+    finder = _pair_finder(odometry, state, settings, tools)
+    for round_number in range(2):
+        tools.at("global adjustment", round_number, 2)
+        search = round_number == 0 or depths is not None
+        if depths is not None:
+            odometry = _with_depths(odometry, state, depths)
+            finder = _pair_finder(odometry, state, settings, tools)
+        posed = _posed(odometry, state)
+        if search:
+            every = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
+            candidates = [pair for pair in every if pair not in matched]
+            pairs = finder.match(
+                candidates,
+                state.map_from_body,
+                fixed_allowance_m(state.map_from_body),
+                rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
+                progress=_progress_of(tools, "matching again", len(candidates)),
+            )
+            joined = tracks_of(pairs, tracks)
+            redundant = redundant_keyframes(joined, odometry.keyframes, settings)
+            landmarks = build_landmarks(posed, joined, settings, tools.executor, redundant)
+            observed_from = posed.map_from_cam
+            del pairs, joined
+        else:  # a second search finds hardly a match more; its coordinates are finer
+            landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
+        held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))]
+        del landmarks, state  # or observations would be in memory twice
+        tools.release()
+        state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
+        if round_number == 0:
+            yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
+    return odometry, state, yaw
+
+
+def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
+    """The keyframes of one camera with depths by where they are now; unchanged for rigs that measure depth."""
+    if depths is None:
+        return odometry
+    return replace(odometry, keyframes=depths.keyframes_at(state.map_from_body, state.body_from_cam))
+
+
+def _pair_finder(
+    odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
+) -> PairFinder:
+    return PairFinder(odometry.keyframes, state.camera, state.body_from_cam, settings.pairs, tools.executor)
+
+
+def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
+    return PosedKeyframes(odometry.keyframes, state.map_from_body, state.body_from_cam, state.camera)
+
+
+def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
+    covariances = odometry.covariances[odometry.keyframe_frames]
+    return SigmaBetween(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
+
+
+def _progress_of(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
+    """Reports steps of a stage, numbered from 0."""
+    return lambda number: tools.at(stage, number + 1, total)
