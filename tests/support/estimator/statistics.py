@@ -1,6 +1,7 @@
 """Statistics of what an estimator measures on the simulator's pictures.
 
-Measured once on rendered pictures of `small-loop`: the survey by day, the tote by day and by night, with the next day's stock.
+Measured by `python tests/benchmarks/simulator/measure_statistics.py` on `small-loop` (survey by day; tote by day and night, the next
+day's stock). Figures in the comments are that command's.
 """
 
 from typing import NamedTuple

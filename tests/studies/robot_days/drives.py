@@ -1,0 +1,130 @@
+"""Drives of one situation under one configuration: the localizer in the loop, judged by the definition of a failure."""
+
+import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from benchmarks.common import estimator_loop
+from benchmarks.robot.aliased_starts import RememberingSession, prior_at
+from fleetmap.geometry import Array, rotation_angle_rad
+from fleetmap.sensors.samples import ImuSamples, PositionPrior
+from locclient.localization.estimate import Estimate
+from locclient.replay import run_metrics
+from locclient.replay.run_metrics import FrameRecord
+from studies.robot_days import own_map
+from studies.robot_days.closeness import KINDS, Blocks, closeness
+from studies.robot_days.configurations import Configuration
+from studies.robot_days.site import LAYOUT, Trip, driven, surveyed_site
+from studies.robot_days.situations import SITUATIONS, Prior
+from studies.robot_days.ungated_map import ungated_view
+
+_DOCK_SIGMA_M, _TOLD_SIGMA_M = 0.05, 0.5
+_SILENT_S = 1.0
+_COUNTED_S = 3.0  # an event that begins later than so long before the end is not counted, nor a failure that it might have led to
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One drive's outcome. kinds: how many failures of each kind; one failure may be of two. blocks: how near it came to more."""
+
+    hours: float
+    failures: int
+    silent: int
+    kinds: dict[str, int]
+    errors_m: Array
+    blocks: Blocks
+
+
+@lru_cache(maxsize=1)
+def _session(situation: str, seed: int, number: int, day: int) -> tuple[Trip, RememberingSession]:
+    trip = SITUATIONS[situation].trip_of(seed, number)
+    return trip, driven(seed, day, trip)
+
+
+def _prior(session: RememberingSession, kind: Prior, rng: np.random.Generator) -> PositionPrior | None:
+    """What the robot is told where it begins; a person who names the wrong aisle knows it to half a metre otherwise."""
+    if kind == "none":
+        return None
+    if kind == "dock":
+        return prior_at(session, _DOCK_SIGMA_M, rng)
+    prior = prior_at(session, _TOLD_SIGMA_M, rng)
+    own = int(LAYOUT.chunk_at(*prior.map_from_base[:2, 3])[1])
+    other = int(rng.choice([aisle for aisle in range(LAYOUT.aisles) if aisle != own]))
+    prior.map_from_base[1, 3] += LAYOUT.aisle_y_m(other) - LAYOUT.aisle_y_m(own)
+    return replace(prior, is_revisable=True)
+
+
+def _without_imu(session: RememberingSession) -> RememberingSession:
+    blind = copy.copy(session)
+    nominal = replace(session.session.nominal, imu=None)
+    blind.session = replace(session.session, imu=ImuSamples.empty(), nominal=nominal)
+    return blind
+
+
+def is_restart(situation: str) -> bool:
+    """Whether it begins, or goes on, where the robot does not know."""
+    return SITUATIONS[situation].prior != "dock" or situation.startswith("carried")
+
+
+def _estimates(
+    session: RememberingSession, situation: str, seed: int, prior: PositionPrior | None, configuration: Configuration
+) -> list[Estimate]:
+    seen = session if configuration.has_imu else _without_imu(session)
+    if is_restart(situation) and not configuration.has_shared_map:
+        return own_map.estimates(seen, prior)
+    view = ungated_view(seed) if configuration.survey == "ungated" else surveyed_site(seed).view
+    has_wheels = configuration.has_imu
+    return estimator_loop.run_localizer(seen, view, prior, has_wheels=has_wheels, settings=configuration.settings)
+
+
+def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]) -> Drive:
+    """Failures of the estimates against the truth."""
+    moved_m = np.linalg.norm(np.diff(map_from_body[:, :3, 3], axis=0, prepend=map_from_body[:1, :3, 3]), axis=1)
+    lasted_s = np.diff(np.array(stamps_ns) * 1e-9, prepend=stamps_ns[0] * 1e-9 - 1.0)
+    speeds = moved_m / lasted_s
+    frames = [_record(e, t, float(v)) for e, t, v in zip(estimates, map_from_body, speeds, strict=True)]
+    kinds = {
+        "silent": run_metrics.silent_failures(frames) or 0,
+        "overconfident": len(run_metrics._episodes(frames, run_metrics._is_overconfident, _SILENT_S)),
+        "not found": len(run_metrics.not_found(frames)),
+    }
+    failures = run_metrics.position_failures(frames)
+    kinds["blind"] = int(failures > 0 and not any(kinds.values())) * failures
+    errors = np.array([f.error_m for f in frames if f.error_m is not None and f.status == "TRACKING"])
+    hours = (stamps_ns[-1] - stamps_ns[0]) / 3.6e12
+    return Drive(hours, failures, kinds["silent"], kinds, errors, closeness(frames))
+
+
+def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
+    error_map_m, error_rad = None, None
+    if estimate.map_from_body is not None:
+        error_map_m = estimate.map_from_body[:3, 3] - truth[:3, 3]
+        error_rad = rotation_angle_rad(estimate.map_from_body[:3, :3].T @ truth[:3, :3])
+    return FrameRecord(
+        estimate.stamp_ns, estimate.status, estimate.fix is not None, estimate.cov_rot_trans, error_map_m, error_rad,
+        0.0, 0.0, {}, speed_mps,
+    )  # fmt: skip
+
+
+def row_of(situation: str, seed: int, number: int, configuration: Configuration) -> dict[str, object]:
+    """A situation's drive of that number under a configuration, as it is kept; equal arguments give equal rows.
+
+    exposure: hours, or events where the situation has some. The figures of `closeness` are kept to three digits.
+    """
+    about = SITUATIONS[situation]
+    day = configuration.day or about.day(number)
+    trip, session = _session(situation, seed, number, day)
+    prior = _prior(session, about.prior, np.random.default_rng([seed, 7004, number]))
+    estimates = _estimates(session, situation, seed, prior, configuration)
+    found = judged(estimates, session.map_from_body, session.stamps_ns)
+    events = len(trip.movers) or sum(fault.start_s < 3600 * found.hours - _COUNTED_S for fault in trip.faults) or 1
+    hours = round(found.hours, 5)
+    return {
+        "situation": situation, "seed": seed, "day": day, "hours": hours,
+        "exposure": hours if about.kind == "hours" else events,
+        "failures": found.failures, "silent": found.silent,
+        "kinds": ", ".join(f"{kind} {count}" for kind, count in found.kinds.items() if count),
+        "p99_mm": round(1e3 * float(np.percentile(found.errors_m, 99)), 1) if len(found.errors_m) else None,
+    } | {kind: " ".join(f"{value:.3g}" for value in values) for kind, values in zip(KINDS, found.blocks, strict=True)}  # fmt: skip
