@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
-from fleetmap.bus import TlsFiles, ZenohBus, check_endpoint, handshake_fault, has_tls, is_loopback
+from fleetmap.bus import Bus, TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
 from fleetmap.mapformat import check_name
@@ -117,7 +117,7 @@ class RobotIdentity:
         first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")
         if fault := handshake_fault(who.endpoint, first):
             raise LinkError(f"{who.endpoint}: {fault}")
-        with ZenohBus.connect(who.endpoint, tls=first) as bus:
+        with Bus.connect(who.endpoint, tls=first) as bus:
             made._ask(bus, given.own.encode(), _ANSWER_S)
         (folder / "bundle.pem").unlink(missing_ok=True)
         return made

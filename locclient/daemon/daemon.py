@@ -10,7 +10,7 @@ from pathlib import Path
 
 import cv2
 
-from fleetmap.bus import Bus, ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import WantedVersion
 from fleetmap.numerics.free_memory import give_back_free_memory
@@ -224,7 +224,7 @@ def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
 
 def _output_bus(config: LocclientConfig, bus: Bus | None, stack: ExitStack) -> Bus | None:
     if config.output.endpoint is not None:
-        bus = ZenohBus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
+        bus = Bus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
         stack.callback(bus.close)
     return bus
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleetmap.bus import Bus, RobotQuestions, ZenohBus, is_loopback
+from fleetmap.bus import Bus, RobotQuestions, is_loopback
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.identity import MapAddress
@@ -33,9 +33,9 @@ class MapConnection:
     outbox: Path | None = None
 
 
-def open_bus(address: MapAddress) -> ZenohBus:
+def open_bus(address: MapAddress) -> Bus:
     """A connection to the server, with the robot's identity where it has one."""
-    return ZenohBus.connect(str(address.server), tls=address.tls)
+    return Bus.connect(str(address.server), tls=address.tls)
 
 
 def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:

@@ -143,18 +143,18 @@ def _stopping() -> Callable[[], bool]:
 
 
 def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
-    from fleetmap.bus import ZenohBus, check_endpoint, has_tls
+    from fleetmap.bus import Bus, check_endpoint, has_tls
 
     if server is None:
         return nullcontext(None)
     if not has_tls(check_endpoint(server)):
-        return ZenohBus.connect(server)
+        return Bus.connect(server)
     from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
     with MapStore.open(store) as maps:
         tls = RobotRegister(maps).survey_tls()
-    return ZenohBus.connect(server, tls=tls)
+    return Bus.connect(server, tls=tls)
 
 
 def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[FoxgloveServer | None]":

@@ -15,7 +15,7 @@ from mapserver.commands.options import StoreFolder
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from fleetmap.bus import ZenohBus
+    from fleetmap.bus import Bus
     from fleetmap.foxglove.server import FoxgloveServer
     from mapserver.api.guard import GuardSettings
     from mapserver.api.sign_in_proxy import SignInProxy
@@ -235,7 +235,7 @@ class _Http(NamedTuple):
 
 
 def _run(
-    maps: "MapStore", guarded_bus: "tuple[ZenohBus, BusGuard | None]", http: _Http, settings: "MapserverConfig"
+    maps: "MapStore", guarded_bus: "tuple[Bus, BusGuard | None]", http: _Http, settings: "MapserverConfig"
 ) -> None:
     import logging
     import signal

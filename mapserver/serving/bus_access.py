@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from fleetmap.bus import ZenohBus, has_tls, is_loopback
+from fleetmap.bus import Bus, has_tls, is_loopback
 from fleetmap.errors import UsageError
 from fleetmap.log_lines import LogLimit
 from mapserver.store import MapStore
@@ -29,7 +29,7 @@ def check_binding(endpoint: str, *, insecure: bool) -> bool:
     )
 
 
-def prepare_bus(store: MapStore, endpoint: str, *, insecure: bool) -> "tuple[ZenohBus, BusGuard | None]":
+def prepare_bus(store: MapStore, endpoint: str, *, insecure: bool) -> "tuple[Bus, BusGuard | None]":
     """The server's bus, not open yet, and who keeps its rules; nobody on loopback without TLS, where everything is allowed.
 
     Raises UsageError as `check_binding`, StateError for TLS in a store without certificates.
@@ -38,18 +38,18 @@ def prepare_bus(store: MapStore, endpoint: str, *, insecure: bool) -> "tuple[Zen
     if not has_tls(endpoint):
         if is_open:
             _log.warning("--insecure: at %s anybody can speak as any robot, and answer in the server's place", endpoint)
-        return ZenohBus(endpoint, is_server=True), None
+        return Bus(endpoint, is_server=True), None
     register = RobotRegister(store)
     tls = register.tls
     register.authorities.check()
-    bus = ZenohBus(endpoint, is_server=True, tls=tls, access=register.access())
+    bus = Bus(endpoint, is_server=True, tls=tls, access=register.access())
     return bus, BusGuard(register, bus)
 
 
 class BusGuard:
     """Opens the bus anew when robots were enrolled or revoked, or a certificate was replaced; says who is there and should not be."""
 
-    def __init__(self, register: RobotRegister, bus: ZenohBus, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, register: RobotRegister, bus: Bus, clock_s: Callable[[], float] = time.monotonic) -> None:
         self.register, self._bus, self._clock_s = register, bus, clock_s
         self.access = register.access()
         self._state, self._tls_state = register.state(), register.tls_state()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from fleetmap.recordings.calibration_files import format_calibration
 from locclient.delivery.outbox import Outbox
@@ -85,7 +85,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             link.bring(link.wanted())
             service.close()
 
-        with ZenohBus.listen("tcp/127.0.0.1:0") as found_port:
+        with Bus.listen("tcp/127.0.0.1:0") as found_port:
             endpoint = found_port.endpoint  # free again in a moment, and nobody answers there
         dark_walk = write_walk(tmp_path / "dark", 280, range(130, 280))
         with daemon(configuration(tmp_path, dark_walk, endpoint, speed=0.0), tmp_path / "notify") as process:
@@ -106,7 +106,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             return encode_message(FailureAck(id=table[-1]))
 
         fleet = Fleet(store)
-        with ZenohBus.listen(endpoint) as bus:
+        with Bus.listen(endpoint) as bus:
             init_here(store)
             service = BusService(store, fleet, bus, lambda *_: None)
             bus.queryable(robot_key("*", "*", "failures"), take)

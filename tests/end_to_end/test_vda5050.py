@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import uvicorn
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
@@ -67,7 +67,7 @@ def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_aw
     with (
         mosquitto(tmp_path) as broker,
         MapStore.open(tmp_path / "store", create=True) as store,
-        ZenohBus.listen("tcp/127.0.0.1:0") as bus,
+        Bus.listen("tcp/127.0.0.1:0") as bus,
     ):
         robot_world.save(store)
         init_here(store)

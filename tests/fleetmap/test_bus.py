@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, ZenohBus, check_endpoint
+from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, check_endpoint
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
 from support.fleet.memory_bus import MemoryBus, MemoryHub, key_includes
 
@@ -19,8 +19,8 @@ def pair(request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
         hub = MemoryHub()
         server, robot = MemoryBus(hub), MemoryBus(hub)
     else:
-        server = ZenohBus.listen("tcp/127.0.0.1:0")
-        robot = ZenohBus.connect(server.endpoint)
+        server = Bus.listen("tcp/127.0.0.1:0")
+        robot = Bus.connect(server.endpoint)
     with server, robot:
         yield server, robot
     assert server.closed()
@@ -82,7 +82,7 @@ def test_silence_is_an_error(pair: tuple[Bus, Bus]) -> None:
 
 def test_a_slow_answer_is_silence_not_a_refusal() -> None:
     done = threading.Event()
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robot:
+    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
         server.queryable("slow", lambda *_: b"late" if done.wait(20) else b"")
         with pytest.raises(UnreachableError):
             robot.get("slow", timeout_s=0.3)
@@ -92,7 +92,7 @@ def test_a_slow_answer_is_silence_not_a_refusal() -> None:
 
 def test_who_connects_hears_bursts_and_images_whole() -> None:
     """As cameras publish them: a server alone drops what floods it."""
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robot:
+    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
         heard: dict[str, list[int]] = {"server": [], "robot": []}
         server.subscribe("fleetmap/s/robots/r/health", lambda _, payload: heard["server"].append(len(payload)))
         robot.subscribe("image", lambda _, payload: heard["robot"].append(len(payload)))
@@ -100,7 +100,7 @@ def test_who_connects_hears_bursts_and_images_whole() -> None:
         # What the sender drops, because the machine is busy, says nothing of who hears.
         image, control = bytes(3_000_000), zenoh.CongestionControl.BLOCK
 
-        def put(bus: ZenohBus, key: str, payload: bytes) -> None:
+        def put(bus: Bus, key: str, payload: bytes) -> None:
             bus._session.put(key, payload, congestion_control=control)
 
         assert eventually(lambda: put(server, "image", b"") or bool(heard["robot"]))
@@ -160,33 +160,33 @@ def test_a_closed_handle_answers_no_more(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_a_robot_survives_the_absence_of_its_server() -> None:
-    server = ZenohBus.listen("tcp/127.0.0.1:0")
+    server = Bus.listen("tcp/127.0.0.1:0")
     endpoint = server.endpoint
     server.close()
-    with ZenohBus.connect(endpoint) as robot:
+    with Bus.connect(endpoint) as robot:
         robot.publish("lost", b"")
         with pytest.raises(UnreachableError):
             robot.get("x", timeout_s=0.2)
         for _ in range(2):
-            with ZenohBus.listen(endpoint) as back:
+            with Bus.listen(endpoint) as back:
                 back.queryable("x", lambda *_: b"back")
                 assert robot.get("x", timeout_s=20) == b"back"
 
 
 def test_the_server_stays_on_its_own_endpoint() -> None:
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server:
+    with Bus.listen("tcp/127.0.0.1:0") as server:
         with pytest.raises(LinkError, match="another server"):
-            ZenohBus.listen(server.endpoint)
-        with ZenohBus.listen("tcp/127.0.0.1:0") as other:
+            Bus.listen(server.endpoint)
+        with Bus.listen("tcp/127.0.0.1:0") as other:
             other.queryable("x", lambda *_: b"not yours")
-            with ZenohBus.connect(server.endpoint) as robot, pytest.raises(UnreachableError):
+            with Bus.connect(server.endpoint) as robot, pytest.raises(UnreachableError):
                 # Nothing is found by multicast or gossip: servers on one network don't see each other's robots.
                 robot.get("x", timeout_s=0.5)
 
 
 def test_threads_end_with_the_bus() -> None:
     before = threading.active_count()
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server:
+    with Bus.listen("tcp/127.0.0.1:0") as server:
         server.subscribe("a", lambda *_: None)
         server.queryable("b", lambda *_: b"")
     assert eventually(lambda: threading.active_count() <= before)
@@ -231,7 +231,7 @@ def test_key_expressions() -> None:
 
 
 def test_presence_of_more_than_a_channel_usually_holds() -> None:
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robots:
+    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robots:
         keys = [f"fleetmap/lab/robots/r{n}/alive" for n in range(700)]
         for key in keys:
             robots.declare_alive(key)

@@ -5,7 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
 
 
@@ -103,7 +103,7 @@ def test_what_comes_beside_a_payload_counts() -> None:
         begun.set()
         gate.wait(20)
 
-    with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as evil:
+    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as evil:
         server.subscribe("fleetmap/*/robots/*/health", listen)
         until_s = time.monotonic() + 20
         while not begun.is_set() and time.monotonic() < until_s:

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 import locclient.identity as identity_module
-from fleetmap.bus import TlsFiles, ZenohBus
+from fleetmap.bus import Bus, TlsFiles
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import robot_key
 from locclient.config import LocclientConfig, RunSection, SourceSection
@@ -28,7 +28,7 @@ class Server:
     """Authorities and a bus that renews; `answers` False loses them."""
 
     register: RobotRegister
-    bus: ZenohBus
+    bus: Bus
     answers: bool = True
 
     def bundle(self, robot: str) -> bytes:
@@ -50,7 +50,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
         init_here(store)
         register = RobotRegister(store)
         register.authorities.init(["127.0.0.1"], None, None)
-        with ZenohBus.listen("tls/127.0.0.1:0", tls=register.tls, access=register.access()) as bus:
+        with Bus.listen("tls/127.0.0.1:0", tls=register.tls, access=register.access()) as bus:
             made = Server(register, bus)
             bus.queryable(robot_key("*", "*", "renew"), made.renew)
             bus.queryable(robot_key("*", "*", "wanted"), lambda key, _: key.encode())
@@ -58,7 +58,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
 
 
 def asks(identity: RobotIdentity, robot: str) -> bytes:
-    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
         return bus.get(robot_key("lab", robot, "wanted"), timeout_s=5)
 
 
@@ -81,7 +81,7 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
     now = datetime.now(UTC)
     assert not identity.is_renewal_due(now)
     assert identity.is_renewal_due(now + timedelta(days=31))
-    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
         identity.renew(bus)
         assert bus.get(robot_key("lab", "r1", "wanted"), timeout_s=5), "the connection that stands goes on"
     after = RobotIdentity.load(folder).certificate()
@@ -99,7 +99,7 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
     server.answers = True
     identity = RobotIdentity.enrol(folder, bundle)
     server.answers = False
-    with ZenohBus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
         before = identity.certificate()
         with pytest.raises(LinkError, match="lost on its way"):
             identity.renew(bus)

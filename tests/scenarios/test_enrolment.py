@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.bus.zenoh_bus import _config
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import WantedVersion, decode_message, encode_message, robot_key
@@ -42,7 +42,7 @@ def eventually(condition: Callable[[], bool], within_s: float) -> float:
     return time.monotonic() - begun_s
 
 
-def wanted(bus: ZenohBus, robot: str, timeout_s: float = 10.0) -> int | None:
+def wanted(bus: Bus, robot: str, timeout_s: float = 10.0) -> int | None:
     try:
         return decode_message(bus.get(robot_key(SITE, robot, "wanted"), timeout_s=timeout_s), WantedVersion).version
     except UnreachableError:
@@ -80,7 +80,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
             assert listed.count("certificate for 365 days") == 2
             # Row 1: a robot that answers in the server's place.
             thief = stack.enter_context(attacker(site.endpoint, one))
-            honest = stack.enter_context(ZenohBus.connect(two.who.endpoint, tls=two.tls))
+            honest = stack.enter_context(Bus.connect(two.who.endpoint, tls=two.tls))
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
             given = GivenAddress(
                 site=None, robot=None, server=None, store=None, root=None, identity=str(two.folder), insecure=False
@@ -91,7 +91,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
         with site.serving(site.endpoint):
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
             # Row 6: revoked while it is connected.
-            with ZenohBus.connect(one.who.endpoint, tls=one.tls) as stolen:
+            with Bus.connect(one.who.endpoint, tls=one.tls) as stolen:
                 assert wanted(stolen, "r1") == 1
                 site.run("mapserver", "robots", "revoke", "r1", "--site", SITE, "--store", site.store)
                 eventually(lambda: wanted(stolen, "r1", 0.3) is None, 5)
@@ -104,7 +104,7 @@ def test_the_same_thief_without_tls_is_heard(site: TlsSite) -> None:
     """The control: on an open bus he answers first, most of the time."""
     with (
         site.serving("tcp/127.0.0.1:0"),
-        ZenohBus.connect(site.endpoint) as honest,
+        Bus.connect(site.endpoint) as honest,
         attacker(site.endpoint, None) as thief,
     ):
         assert eventually(lambda: wanted(honest, "r2") == 99, 20) < 20
@@ -113,14 +113,14 @@ def test_the_same_thief_without_tls_is_heard(site: TlsSite) -> None:
 
 def test_a_bus_that_listens_before_the_server_answers_is_the_thiefs() -> None:
     """The control of row 2: as it was while the server still read its store."""
-    with ZenohBus.listen("tcp/127.0.0.1:0") as bare, ZenohBus.connect(bare.endpoint) as honest:
+    with Bus.listen("tcp/127.0.0.1:0") as bare, Bus.connect(bare.endpoint) as honest:
         thief = attacker(bare.endpoint, None)
         assert wanted(honest, "r2") == 99
         thief.close()
 
 
 def test_the_demo_needs_no_keys(site: TlsSite) -> None:
-    with site.serving("tcp/127.0.0.1:0"), ZenohBus.connect(site.endpoint) as robot:
+    with site.serving("tcp/127.0.0.1:0"), Bus.connect(site.endpoint) as robot:
         assert wanted(robot, "anybody") == 1
     assert re.search(
         "has no certificate", site.run("mapserver", "serve", "--store", site.store, "--zenoh", "tls/127.0.0.1:0")

@@ -18,7 +18,7 @@ import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 from typer.testing import CliRunner
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import AdmittedVersion, TrustedMap, ask_over
@@ -43,7 +43,7 @@ class Drill:
         self.folder, self.store, self.lists = folder, folder / "store", SignedLists(folder / "store")
         self.stick = folder / "stick"
         self.words: dict[str, str] = {}
-        self.robots: list[ZenohBus] = []
+        self.robots: list[Bus] = []
         monkeypatch.setattr(getpass, "getpass", lambda prompt: self.words[prompt.split()[-1].rstrip(":")])
 
     def run(self, *words: object, fails: str = "") -> str:
@@ -63,7 +63,7 @@ class Drill:
         return ["--key", self.stick / "root-1.pem"]
 
     def robot(self, name: str) -> "Robot":
-        bus = ZenohBus.connect(self.endpoint)
+        bus = Bus.connect(self.endpoint)
         self.robots.append(bus)
         return Robot(self, bus, name)
 
@@ -92,7 +92,7 @@ class Drill:
 class Robot:
     """A robot that trusts the first root of the drill's store."""
 
-    def __init__(self, drill: Drill, bus: ZenohBus, name: str) -> None:
+    def __init__(self, drill: Drill, bus: Bus, name: str) -> None:
         folder, root = drill.folder / name, (drill.lists.folder / "1.root.json").read_bytes()
         self.client = MapClient(bus, TileCache(folder), SITE, name)
         self.trust = TrustedMap(folder / "trust", SITE, root, ask_over(bus, SITE))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import count
 
-from fleetmap.bus.protocol import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings.ros2.graph import PUBLISHER, SERVICE, SUBSCRIPTION, Endpoint, KeyLayout, NodeName, Qos
 from fleetmap.recordings.ros2.keys import answer_attachment, attachment

@@ -1,10 +1,11 @@
-"""The bus over zenoh, which is used here alone."""
+"""The bus between server and robots: query, answer, publish, subscribe, presence, over zenoh, which is used here alone."""
 
 import json
 import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any, Self
 
@@ -14,23 +15,22 @@ import zenoh.ext
 from fleetmap.access import Access
 from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback, with_free_port
 from fleetmap.bus.fair_queue import FairQueue, sender_of
-from fleetmap.bus.protocol import (
-    MAX_MESSAGE_BYTES,
-    Answer,
-    Attach,
-    Bus,
-    Handle,
-    LatchedPublisher,
-    Listen,
-    answer_query,
-    check_size,
-    deliver,
-    no_answer,
-    query_refused,
-)
 from fleetmap.bus.tls import TlsFiles
-from fleetmap.errors import LinkError, UsageError
+from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UsageError
+from fleetmap.messages import own_map_key
 
+Answer = Callable[[str, bytes], bytes]
+"""Bytes that answer the question (key, payload); a FleetmapError that it raises travels back as the answer's error."""
+
+Listen = Callable[[str, bytes], None]
+"""Takes (key, payload) of what was published. Runs on a thread of the bus."""
+
+Attach = Callable[[bytes], bytes]
+"""The attachment of an answer, by that of its question; empty for none."""
+
+MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one large message delays all others behind it
+_MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
+_ASK_AGAIN_AFTER_S = 600.0  # a server that was silent under a robot's own key
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
@@ -41,6 +41,39 @@ _BUSY = b"later: too much of this sender is waiting already"
 _log = logging.getLogger(__name__)
 
 
+class Handle:
+    """Something declared on the bus; `close` takes it back, as does closing the bus."""
+
+    def __init__(self, undo: Callable[[], None]) -> None:
+        self._undo: Callable[[], None] | None = undo
+
+    def closed(self) -> bool:
+        """Whether it was taken back."""
+        return self._undo is None
+
+    def close(self) -> None:
+        """Takes it back; a second call does nothing."""
+        undo, self._undo = self._undo, None
+        if undo is not None:
+            undo()
+
+
+class LatchedPublisher(Handle):
+    """Publishes under one key, and keeps the last message for subscribers who come later and ask for it."""
+
+    def __init__(self, put: Callable[[bytes, bytes], None], undo: Callable[[], None]) -> None:
+        super().__init__(undo)
+        self._put = put
+
+    def put(self, payload: bytes, attachment: bytes = b"") -> None:
+        """Publishes; LinkError for more than _MAX_LATCHED_BYTES, or on a closed bus."""
+        if len(payload) > _MAX_LATCHED_BYTES:
+            raise LinkError(
+                f"{len(payload)} bytes are more than the {_MAX_LATCHED_BYTES} that are kept for late subscribers"
+            )
+        self._put(payload, attachment)
+
+
 class _Declared:
     """Something declared: how to declare it on a session, the object that zenoh gave for it, and what ends with it."""
 
@@ -49,11 +82,13 @@ class _Declared:
         self.current: Any = None
 
 
-class ZenohBus(Bus):
-    """A zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself.
+class Bus:
+    """One participant, a zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself.
 
-    What a server hears passes a `FairQueue`: one sender who floods is dropped. Whoever connects hears all that he asked for.
-    A server's session can be opened anew with other rules; what was declared is declared again.
+    Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES. Questions, answers and publications block while
+    the network is full, rather than being lost, unless they may be. What a server hears passes a `FairQueue`: one sender who floods is
+    dropped. Whoever connects hears all that he asked for. A server's session can be opened anew with other rules; what
+    was declared is declared again.
     """
 
     def __init__(
@@ -141,7 +176,15 @@ class ZenohBus(Bus):
                         raise LinkError(f"cannot listen on {self.endpoint} again ({error}); trying on") from error
                     time.sleep(_RETRY_S)
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
+        """Answers questions for keys that match `key_expr` (`*` is one chunk, `**` any number)."""
+
         def reply(query: Any, key: str) -> None:
             # Leaving the block ends the question: without it the asker would wait for its timeout.
             with query:
@@ -172,7 +215,10 @@ class ZenohBus(Bus):
         return self._declare(lambda session: session.declare_queryable(key_expr, direct, complete=True), queue.close)
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
-        """See Bus. Asks again until the time is over, because before a connection stands zenoh answers with silence."""
+        """The first answer to a question; asks again until the time is over, because before a connection stands zenoh is silent.
+
+        Raises UnreachableError when nobody answers within `timeout_s`, LinkError with the reason when the other side refuses.
+        """
         check_size(payload, key)
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
@@ -190,13 +236,20 @@ class ZenohBus(Bus):
         raise no_answer(key, timeout_s, is_silenced=self._tls is not None and self.connected())
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
+        """Tells all subscribers; nobody there is no error. `may_drop` loses it rather than wait for a full network.
+
+        attachment: beside the payload, for what other programs want there; no subscriber of this class is shown it.
+        """
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
         beside = {"attachment": attachment} if attachment else {}
         check_size(payload, key)
         self._guarded(lambda session: session.put(key, payload, congestion_control=control, **beside))
 
     def latched_publisher(self, key: str) -> LatchedPublisher:
-        """See Bus. Who is late asks with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do."""
+        """A publisher under `key` that keeps its last message.
+
+        Who is late asks with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do.
+        """
         declared = self._declared_now(
             lambda session: zenoh.ext.declare_advanced_publisher(
                 session,
@@ -214,9 +267,12 @@ class ZenohBus(Bus):
         return LatchedPublisher(put, partial(self._undeclare, declared))
 
     def session_id(self) -> str:
+        """Names this participant on its network."""
         return str(self._guarded(lambda session: session.zid()))
 
     def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
+        """Calls `listen` for everything that is published under keys that match; is_latched: first for what latched publishers keep."""
+
         def take(sample: Any) -> None:
             key = str(sample.key_expr)
             size = _size(sample, key)
@@ -236,9 +292,11 @@ class ZenohBus(Bus):
         return self._declare(lambda session: session.declare_subscriber(key_expr, direct), queue.close)
 
     def declare_alive(self, key: str) -> Handle:
+        """Shows this participant's presence under `key` until the handle or the bus is closed, or the process dies."""
         return self._declare(lambda session: session.liveliness().declare_token(key))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
+        """Keys under which somebody is present, sorted."""
         # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
         channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
         replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=timeout_s))
@@ -250,16 +308,18 @@ class ZenohBus(Bus):
         return sorted(link.auth_identifier for link in links if link.auth_identifier)
 
     def connected(self) -> bool:
+        """True if anybody else can be reached now."""
         session = self._session
         if session is None or session.is_closed():
             return False
         return bool(session.info.routers_zid() or session.info.peers_zid())
 
     def closed(self) -> bool:
+        """True once this participant was closed."""
         return self._is_closed
 
     def close(self) -> None:
-        """See Bus. Without it the process would hang at its end."""
+        """Takes everything back that was declared here; a second call does nothing. Without it the process would hang at its end."""
         with self._lock:
             declared, self._declared, self._is_closed = self._declared, [], True
             if self._session is not None and not self._session.is_closed():
@@ -314,6 +374,70 @@ class ZenohBus(Bus):
                 with self._lock:
                     if session is self._session or self._is_closed:
                         raise LinkError(f"the bus at {self.endpoint} refused ({error}); is it closed?") from error
+
+
+class RobotQuestions:
+    """Asks for maps under a robot's own keys, so that the server can serve robots in turn.
+
+    A server of before, which is silent there, is asked under the keys that all robots share.
+    """
+
+    def __init__(self, bus: Bus, robot: str, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._bus, self._robot, self._clock_s = bus, robot, clock_s
+        self._shared_until_s = 0.0
+
+    def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
+        """As Bus.get, with the shared key."""
+        if self._clock_s() >= self._shared_until_s:
+            with suppress(UnreachableError):
+                return self._bus.get(own_map_key(key, self._robot), payload, timeout_s=timeout_s)
+        answer = self._bus.get(key, payload, timeout_s=timeout_s)
+        self._shared_until_s = self._clock_s() + _ASK_AGAIN_AFTER_S
+        return answer
+
+
+def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None, str]:
+    """The answer, or None and the reason. A fault in the handler reaches the log and the client, which waits for an answer."""
+    try:
+        return check_size(answer(key, payload), key), ""
+    except FleetmapError as error:
+        return None, str(error)
+    except Exception as error:
+        _log.exception("answering %r failed", key[:200])
+        return None, f"internal error of the other side ({type(error).__name__}); its log says more"
+
+
+def check_size(payload: bytes, key: str) -> bytes:
+    """`payload` itself; raises LinkError for one that no message holds."""
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise LinkError(
+            f"{len(payload)} bytes under {key} are more than the {MAX_MESSAGE_BYTES} of a message; use parts"
+        )
+    return payload
+
+
+def deliver(listen: Listen, key: str, payload: bytes) -> None:
+    """Calls a subscriber. What it raises is logged and does not reach the publisher."""
+    try:
+        listen(key, payload)
+    except Exception:
+        _log.exception("the subscriber for %r failed", key[:200])
+
+
+def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> UnreachableError:
+    """The error of a query without an answer. is_silenced: a server is there, and it knows the asker's certificate."""
+    why = "is the server running and reachable?"
+    if is_silenced:
+        why = (
+            "the server is there and lets this certificate say nothing: revoked, enrolled anew, or of another site? "
+            "`mapserver robots list` shows it"
+        )
+    return UnreachableError(f"nobody answered for {key} within {timeout_s:g} s; {why}")
+
+
+def query_refused(key: str, reason: str) -> LinkError:
+    """The error of a query that the other side refused."""
+    return LinkError(f"{key} was refused: {reason}")
 
 
 def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import cv2
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.recordings import OpenOptions, Topics, open_recording, read_calibration
 from fleetmap.recordings.ros2.graph import key_layout
@@ -42,7 +42,7 @@ def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Sourc
 
 def _ros2(section: SourceSection, topics: Topics, map_frame: str) -> Source:
     calibration = _calibration(section)
-    layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
+    layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
     return Ros2Source(bus, layout, topics, calibration, has_depth=section.sensors == "rgbd", map_frame=map_frame)
 
 
@@ -53,7 +53,7 @@ def _uvc(section: SourceSection, topics: Topics, map_frame: str) -> Source:
         )
     calibration = _calibration(section)
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    layout, bus = key_layout(section.keys, section.domain), ZenohBus.connect(section.endpoint, is_ros=True)
+    layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
     topic_source = Ros2Source(bus, layout, topics, calibration, images=False, map_frame=map_frame)
     mode = VideoMode(section.width_px, section.height_px, section.rate_hz, section.delay_s)
     return UvcSource(lambda: cv2.VideoCapture(device), calibration, mode, topic_source)

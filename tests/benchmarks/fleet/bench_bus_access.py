@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fleetmap.access import Holder
-from fleetmap.bus import TlsFiles, ZenohBus
+from fleetmap.bus import Bus, TlsFiles
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import robot_key
 from mapserver.serving.bus_access import BusGuard
@@ -62,7 +62,7 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     register.enrol(SITE, names, ENDPOINT)
     holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
     before_mib = _resident_mib()
-    bus = ZenohBus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access())
+    bus = Bus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access())
     bus.queryable(robot_key("*", "*", "wanted"), lambda *_: b"1")
     begun_s, cpu_s = time.perf_counter(), time.process_time()
     bus.open()
@@ -75,7 +75,7 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
             guard.follow()
 
     threading.Thread(target=follow, daemon=True).start()
-    robots = [ZenohBus.connect(bus.endpoint, tls=robot_files(register, holder, folder)) for holder in holders]
+    robots = [Bus.connect(bus.endpoint, tls=robot_files(register, holder, folder)) for holder in holders]
 
     def answered(number: int) -> bool:
         try:

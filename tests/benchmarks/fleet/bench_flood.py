@@ -24,7 +24,7 @@ import zenoh
 from benchmarks.fleet.bench_bus_access import SITE, open_register, robot_files
 from benchmarks.fleet.bench_service import resident_mb, serving
 from fleetmap.access import ALIVE, ORDERS, QUESTIONS, REPORTS, Holder
-from fleetmap.bus import TlsFiles, ZenohBus
+from fleetmap.bus import Bus, TlsFiles
 from fleetmap.messages import (
     FailureAck,
     FailureReport,
@@ -57,7 +57,7 @@ def _health(robot: str, words: str = "") -> bytes:
 
 
 def _sender(session: Any, robot: str, kind: str) -> Callable[[int], None]:
-    """Sends one message; the attacker waits for no answer, and is not kept to the sizes of `ZenohBus`."""
+    """Sends one message; the attacker waits for no answer, and is not kept to the sizes of `Bus`."""
 
     def put(what: str, payload: bytes) -> None:
         session.put(robot_key(SITE, robot, what), payload, congestion_control=_BLOCK)
@@ -85,7 +85,7 @@ def _sender(session: Any, robot: str, kind: str) -> Callable[[int], None]:
 
 
 def _flood(endpoint: str, files: TlsFiles, robot: str, kind: str, seconds: float, said: Any) -> None:
-    with ZenohBus.connect(endpoint, tls=files) as bus:
+    with Bus.connect(endpoint, tls=files) as bus:
         bus.get(robot_key(SITE, robot, "wanted"), timeout_s=60.0)
         send, sent, begun_s = _sender(bus._session, robot, kind), 0, time.monotonic()
         while (elapsed_s := time.monotonic() - begun_s) < seconds:
@@ -99,7 +99,7 @@ def _flood(endpoint: str, files: TlsFiles, robot: str, kind: str, seconds: float
 
 def _others(endpoint: str, robots: dict[str, TlsFiles], orders: Any, said: Any) -> None:
     """Answers each order, a number of seconds, with the waits (s) of every question and failure in that time."""
-    buses = {name: ZenohBus.connect(endpoint, tls=files) for name, files in robots.items()}
+    buses = {name: Bus.connect(endpoint, tls=files) for name, files in robots.items()}
     for name, bus in buses.items():
         decode_message(bus.get(robot_key(SITE, name, "wanted"), timeout_s=60.0), WantedVersion)
     said.put([])

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.fleet.service_clients import SITE
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.mapformat import Tile
 from fleetmap.messages import robot_key
 from locclient.maps.map_client import MapClient
@@ -267,7 +267,7 @@ def measure_fleet(folder: Path, clients: int, processes: int) -> dict[str, dict[
 def announced(endpoint: str) -> Iterator[None]:
     """Waits until a robot is told of what the block publishes, as robots do before they fetch."""
     heard = threading.Event()
-    with ZenohBus.connect(endpoint) as bus:
+    with Bus.connect(endpoint) as bus:
         bus.subscribe(robot_key(SITE, "robot-0", "wanted"), lambda *_: heard.set())
         while not bus.connected():
             time.sleep(0.05)
@@ -291,7 +291,7 @@ def republish(store: MapStore) -> None:
 
 def measure_outage(folder: Path, cache_folder: Path, outage_s: float) -> dict[str, float]:
     """A robot's fetch over a server that is killed in the middle and comes back."""
-    with serving(folder) as (process, _, endpoint), ZenohBus.connect(endpoint) as bus:
+    with serving(folder) as (process, _, endpoint), Bus.connect(endpoint) as bus:
         cache = TileCache(cache_folder)
         link = MapClient(bus, cache, SITE, "patient", timeout_s=2.0, patience_s=outage_s + 60)
         wanted = link.wanted()

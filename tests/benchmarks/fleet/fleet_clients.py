@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fleetmap.bus import Handle, ZenohBus
+from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import (
     FailureAck,
@@ -37,7 +37,7 @@ class Client:
             SITE, name, np.random.default_rng(seed), known, rate_per_robot_day=60.0, tiles=TILES, bad_tile=seed % TILES,
             ahead_s=(seed % 7) - 3.0, cause=("dark", "blur", "covered")[seed % 3], suspected_share=0.2,
         )  # fmt: skip
-        self.bus = ZenohBus.connect(endpoint)
+        self.bus = Bus.connect(endpoint)
         self.alive: Handle = self.bus.declare_alive(robot_key(SITE, name, "alive"))
         self.acknowledged = 0
 

@@ -6,7 +6,7 @@ import threading
 import time
 from pathlib import Path
 
-from fleetmap.bus import TlsFiles, ZenohBus
+from fleetmap.bus import Bus, TlsFiles
 from fleetmap.mapformat import Manifest, decode_manifest, verified
 from fleetmap.messages import WantedVersion, blob_key, decode_message, manifest_key, robot_key
 from locclient.maps.chunked_download import ChunkReader
@@ -24,7 +24,7 @@ class Robot:
     """One client: its connection, its manifest, what it received."""
 
     def __init__(self, endpoint: str, name: str, tls: TlsFiles | None) -> None:
-        self._bus = ZenohBus.connect(endpoint, tls=tls)
+        self._bus = Bus.connect(endpoint, tls=tls)
         self._name = name
         self._parts = ChunkReader(self._bus, timeout_s=_TIMEOUT_S, patience_s=_PATIENCE_S)
         self._manifest: Manifest | None = None

@@ -25,7 +25,7 @@ import numpy as np
 import psutil
 from mcap.reader import make_reader
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.ros2.graph import key_layout
@@ -45,7 +45,7 @@ class Driver:
     """A recording's topics on a zenoh router, again and again, each lap's stamps behind those of the lap before."""
 
     def __init__(self, recording: Path) -> None:
-        self.bus = ZenohBus.listen("tcp/127.0.0.1:0")
+        self.bus = Bus.listen("tcp/127.0.0.1:0")
         self.recording, self.stop = recording, threading.Event()
         self._thread = threading.Thread(target=self._run, name="driver", daemon=True)
         self._thread.start()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
@@ -40,13 +40,13 @@ def intake() -> Intake:
 
 
 @pytest.fixture
-def buses() -> Iterator[tuple[ZenohBus, ZenohBus]]:
+def buses() -> Iterator[tuple[Bus, Bus]]:
     """A driver's router and a robot's session."""
-    with ZenohBus.listen("tcp/127.0.0.1:0") as driver, ZenohBus.connect(driver.endpoint) as robot:
+    with Bus.listen("tcp/127.0.0.1:0") as driver, Bus.connect(driver.endpoint) as robot:
         yield driver, robot
 
 
-def test_topics_of_a_driver_become_moments(buses: tuple[ZenohBus, ZenohBus]) -> None:
+def test_topics_of_a_driver_become_moments(buses: tuple[Bus, Bus]) -> None:
     driver, robot = buses
     queue, sent = intake(), 0
 

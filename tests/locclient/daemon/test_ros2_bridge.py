@@ -8,7 +8,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.recordings import Topics
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2.graph import BridgedDdsKeys
@@ -39,7 +39,7 @@ def intake() -> Intake:
 
 
 def test_nav2_on_dds_reaches_the_localizer() -> None:
-    with bridge() as dds, ZenohBus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
+    with bridge() as dds, Bus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
         commands = intake()
         section = OutputSection(format="ros2", keys="ros2dds", autostart=False)
         localizer = open_publisher(PublisherInputs(bus, "hall", "r1", calibration(), commands), section)
@@ -89,7 +89,7 @@ def test_nav2_on_dds_reaches_the_localizer() -> None:
 
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_images_come_under_bare_names(is_compressed: bool) -> None:
-    with bridge() as dds, ZenohBus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
+    with bridge() as dds, Bus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
         queue, topics = intake(), Topics(left="/rig/left", right="/rig/right")
         handles = Ros2Source(bus, BridgedDdsKeys(), topics, calibration()).subscribe(queue)
         grey = np.arange(48, dtype=np.uint8).reshape(6, 8)

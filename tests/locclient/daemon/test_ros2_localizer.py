@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.geometry import se3
 from fleetmap.messages import Status
@@ -54,7 +54,7 @@ class Robot:
     localizer: Ros2Localizer
     intake: Intake
     open: Callable[[], LifecycleManager]
-    bus: ZenohBus
+    bus: Bus
 
     def tell(self, *estimates: object) -> None:
         odom = ContinuousOdom(np.eye(4))
@@ -66,7 +66,7 @@ class Robot:
 def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
     settings = {"format": "ros2", "autostart": False, "is_map_server": True} | getattr(request, "param", {})
     programs: list[LifecycleManager] = []
-    with rmw_router(free_port()) as endpoint, ZenohBus.connect(endpoint, is_ros=True) as bus:
+    with rmw_router(free_port()) as endpoint, Bus.connect(endpoint, is_ros=True) as bus:
         intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
         inputs = PublisherInputs(bus, "hall", "r1", calibration(), intake)
         localizer = open_publisher(inputs, OutputSection(**settings))

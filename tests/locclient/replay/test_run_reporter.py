@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.delivery.failure_file import read_failure_file
@@ -41,7 +41,7 @@ class Server:
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    with MapStore.open(tmp_path / "store", create=True) as store, ZenohBus.listen("tcp/127.0.0.1:0") as bus:
+    with MapStore.open(tmp_path / "store", create=True) as store, Bus.listen("tcp/127.0.0.1:0") as bus:
         robot_world.save(store)
         fleet = Fleet(store)
         init_here(store)

@@ -17,7 +17,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.cli_options import Program
 from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
@@ -57,7 +57,7 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
     with MapStore.open(tmp_path / "store", create=True) as store:
         save_sample_draft(store)
         releases.publish(store, "lab")
-    with serving(tmp_path / "store") as (process, http, zenoh), ZenohBus.connect(zenoh) as bus:
+    with serving(tmp_path / "store") as (process, http, zenoh), Bus.connect(zenoh) as bus:
         link = MapClient(bus, TileCache(tmp_path / "cache"), "lab", "r1")
         heard: list[WantedVersion] = []
         link.on_wanted(heard.append)
@@ -122,7 +122,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
         releases.publish(store, "lab")
     with ExitStack() as servers:
         process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))
-        bus = servers.enter_context(ZenohBus.connect(zenoh))
+        bus = servers.enter_context(Bus.connect(zenoh))
         through, asked, failed = bus.get, [], []
 
         def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from mapserver import releases
 from mapserver.store import MapStore
@@ -16,7 +16,7 @@ from support.fleet.dashboard_scene import SITE, Served, change, fill_store, open
 
 def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
     heard: list[InitialPoseMessage] = []
-    with talking(served.zenoh, 8), ZenohBus.connect(served.zenoh) as bus:
+    with talking(served.zenoh, 8), Bus.connect(served.zenoh) as bus:
         bus.subscribe(
             robot_key(SITE, "tug-5", "initial_pose"),
             lambda _, data: heard.append(decode_message(data, InitialPoseMessage)),

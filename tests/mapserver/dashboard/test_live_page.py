@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.live_survey import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from mapserver.store import MapStore
@@ -33,7 +33,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
     seen = watch(page)
-    with ZenohBus.connect(served.zenoh) as bus:
+    with Bus.connect(served.zenoh) as bus:
         deadline_s = time.monotonic() + 20
         while time.monotonic() < deadline_s:  # the subscription is known everywhere after a moment
             bus.publish(live_key("yard"), encode_message(STATE))

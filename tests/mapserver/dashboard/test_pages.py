@@ -9,7 +9,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (
@@ -155,7 +155,7 @@ def test_what_robots_say_is_shown_as_words_and_never_runs(page: Page, served: Se
 def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures", robot="tug-12")
     expect(page.locator(".nicegui-content")).to_contain_text("No failure")
-    with ZenohBus.connect(served.zenoh) as bus:
+    with Bus.connect(served.zenoh) as bus:
         answer = bus.get(
             robot_key(SITE, "tug-12", "failures"), encode_message(failure("tug-12", "live", cause="glare"))
         )

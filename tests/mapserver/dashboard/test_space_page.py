@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
@@ -127,7 +127,7 @@ def test_a_robots_view_has_the_angles_and_the_mounting_of_its_own_camera() -> No
 
 def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Served) -> None:
     report = msgspec.structs.replace(failure("tug-3", "f7"), camera=told_camera())
-    with ZenohBus.connect(served.zenoh) as bus:
+    with Bus.connect(served.zenoh) as bus:
         ack = decode_message(bus.get(robot_key(SITE, "tug-3", "failures"), encode_message(report)), FailureAck)
     assert not ack.refused
     seen = opened(page, served, "space")

@@ -8,7 +8,7 @@ import threading
 import time
 from pathlib import Path
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureAck, FailureReport, Thumbnail, decode_message, encode_message, robot_key
 from mapserver import releases
@@ -44,7 +44,7 @@ class Robot(threading.Thread):
         self._endpoint, self._name, self._acknowledged = endpoint, name, acknowledged
 
     def run(self) -> None:
-        with ZenohBus.connect(self._endpoint) as bus:
+        with Bus.connect(self._endpoint) as bus:
             for number in range(FAILURES):
                 report = FailureReport(
                     site="lab", robot=self._name, id=f"f{number}", stamp_ns=number, wall_ns=time.time_ns(), duration_s=3.0,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.foxglove import ViewerAddress
 from fleetmap.foxglove.server import FoxgloveServer
@@ -127,7 +127,7 @@ def test_a_server_shows_what_robots_say_on_the_bus(store: MapStore, tmp_path: Pa
         told = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(3))
         assert process.stdout.readline() == "ready\n"
         assert told["foxglove"].startswith("ws://127.0.0.1:")
-        with ZenohBus.connect(told["zenoh"]) as bus, FoxgloveClient(told["foxglove"], within_s=60.0) as viewer:
+        with Bus.connect(told["zenoh"]) as bus, FoxgloveClient(told["foxglove"], within_s=60.0) as viewer:
             viewer.subscribe(["/map", "/robots"])
             assert viewer.wait_for("/map")[0][1].frame_id == "map"
             entities = []

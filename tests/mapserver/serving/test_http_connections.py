@@ -16,7 +16,7 @@ import pytest
 import uvicorn
 from websockets.sync.client import connect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.messages import RobotHealth, encode_message, robot_key
 from mapserver.operators.operators import Operators
 from mapserver.serving import http_connections as module
@@ -213,7 +213,7 @@ def test_a_robot_is_served_while_strangers_do_their_worst(tmp_path: Path) -> Non
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
     try:
-        with serving(tmp_path) as served, ZenohBus.connect(served.zenoh) as robot, ExitStack() as stack:
+        with serving(tmp_path) as served, Bus.connect(served.zenoh) as robot, ExitStack() as stack:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             port, number = int(served.http.rpartition(":")[2]), 0
 

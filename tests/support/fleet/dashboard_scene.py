@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.geometry import se3
 from fleetmap.mapformat import Tile
 from fleetmap.messages import (
@@ -183,7 +183,7 @@ def place_of(number: int) -> tuple[float, float]:
 
 
 def speak(
-    bus: ZenohBus,
+    bus: Bus,
     robot: str,
     stamp_ns: int,
     place_m: tuple[float, float],
@@ -204,7 +204,7 @@ def speak(
 
 
 def speak_all(
-    bus: ZenohBus,
+    bus: Bus,
     count: int,
     stamp_ns: int,
     *,
@@ -226,7 +226,7 @@ def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]
     """Robots that speak every second, as real ones do; what is put into the dictionary moves them there."""
     moved: dict[str, tuple[float, float]] = {}
     ended = threading.Event()
-    with ZenohBus.connect(endpoint) as bus:
+    with Bus.connect(endpoint) as bus:
 
         def talk() -> None:
             stamp_ns = time.time_ns()

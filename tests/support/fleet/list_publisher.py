@@ -19,7 +19,7 @@ from tuf.api.metadata import (
     Timestamp,
 )
 
-from fleetmap.bus import Bus, ZenohBus
+from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import sha256_hex
 from fleetmap.messages import WantedVersion, part_of, trust_key
@@ -151,7 +151,7 @@ def bus_pair(kind: str) -> Iterator[tuple[Bus, Bus]]:
         with MemoryBus(hub) as server, MemoryBus(hub) as robot:
             yield server, robot
     else:
-        with ZenohBus.listen("tcp/127.0.0.1:0") as server, ZenohBus.connect(server.endpoint) as robot:
+        with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
             yield server, robot
 
 

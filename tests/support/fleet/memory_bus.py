@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from fleetmap.access import Access, Act, Direction, _rules
-from fleetmap.bus.protocol import (
+from fleetmap.bus.zenoh_bus import (
     Answer,
     Attach,
     Bus,
@@ -122,7 +122,7 @@ class MemoryBus(Bus):
         return sorted(key for key in shown if key_includes(key_expr, key))
 
     def reopen(self, access: Access) -> None:
-        """Other rules for the hub; as ZenohBus, whose session is opened anew."""
+        """Other rules for the hub; as Bus, whose session is opened anew."""
         self._hub.access = access
 
     def certificates(self) -> list[str]:
