@@ -16,41 +16,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
-from mapserver.api import describe, problems
+from mapserver.api import describe, problems, views
+from mapserver.api import parameters as p
 from mapserver.api.bytes_response import bytes_response
-from mapserver.api.exact_json import ExactJson
 from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
-from mapserver.api.parameters import (
-    Limit,
-    NameCursor,
-    Number,
-    NumberCursor,
-    Sha256,
-    Since,
-    Site,
-    SiteFilter,
-    Until,
-    Version,
-    known_parameters,
-    page,
-    time_range,
-)
 from mapserver.api.request_limits import RequestLimits
 from mapserver.api.version_routes import ApiSettings, install_version_routes
-from mapserver.api.views import (
-    EventList,
-    JobList,
-    RobotList,
-    ServerVersion,
-    ServiceState,
-    SiteList,
-    VersionList,
-    VersionView,
-    version_view,
-)
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
 from mapserver.serving.robot_placing import RobotPlacing
@@ -78,8 +52,8 @@ def create_app(
         redoc_url=None,
         lifespan=lifespan,
         responses=problems.PROBLEM_RESPONSES,
-        dependencies=[Depends(known_parameters)],
-        default_response_class=ExactJson,
+        dependencies=[Depends(p.known_parameters)],
+        default_response_class=describe.ExactJson,
     )
     problems.install(app)
     guard = settings.guard
@@ -106,24 +80,24 @@ def fleetmap_version() -> str:
 
 def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics: Metrics, bus: Bus | None) -> None:
     @app.get("/healthz")
-    def healthz() -> ServiceState:
+    def healthz() -> views.ServiceState:
         """The process runs."""
-        return ServiceState("ok")
+        return views.ServiceState("ok")
 
     @app.get("/readyz")
-    def readyz() -> ServiceState:
+    def readyz() -> views.ServiceState:
         """The store answers, robots' reports can be stored, and the bus is open."""
         store.sites()
         if fleet.storage_fault:
             raise HTTPException(503, f"reports of robots cannot be stored: {fleet.storage_fault}")
         if bus is not None and bus.closed():
             raise HTTPException(503, "the bus is closed; the server is stopping")
-        return ServiceState("ok")
+        return views.ServiceState("ok")
 
     @app.get("/version")
-    def version() -> ServerVersion:
+    def version() -> views.ServerVersion:
         """What runs here."""
-        return ServerVersion(fleetmap_version(), TILE_FORMAT, MANIFEST_FORMAT)
+        return views.ServerVersion(fleetmap_version(), TILE_FORMAT, MANIFEST_FORMAT)
 
     @app.get("/metrics", response_class=Response)
     def metrics_text() -> Response:
@@ -133,69 +107,69 @@ def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics
 
 def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
     @app.get("/v1/sites")
-    def sites(limit: Limit = 100, cursor: NameCursor = None) -> SiteList:
+    def sites(limit: p.Limit = 100, cursor: p.NameCursor = None) -> views.SiteList:
         """Sites by name."""
         found = [info for info in store.sites() if cursor is None or info.site > cursor]
-        return SiteList(*page(found, limit, lambda info: info.site))
+        return views.SiteList(*p.page(found, limit, lambda info: info.site))
 
     @app.get("/v1/sites/{site}/versions")
-    def versions(site: Site, limit: Limit = 100, cursor: NumberCursor = None) -> VersionList:
+    def versions(site: p.Site, limit: p.Limit = 100, cursor: p.NumberCursor = None) -> views.VersionList:
         """Versions of a site, oldest first, drafts too."""
         found = store.versions(site, after=cursor or 0, limit=limit + 1)
-        shown, following = page(found, limit, lambda info: str(info.version))
-        return VersionList([version_view(store, info) for info in shown], following)
+        shown, following = p.page(found, limit, lambda info: str(info.version))
+        return views.VersionList([views.version_view(store, info) for info in shown], following)
 
     @app.get("/v1/sites/{site}/events")
     def events(
-        site: Site, since: Since = None, until: Until = None, limit: Limit = 100, cursor: NumberCursor = None
-    ) -> EventList:
+        site: p.Site, since: p.Since = None, until: p.Until = None, limit: p.Limit = 100, cursor: p.NumberCursor = None
+    ) -> views.EventList:
         """What happened to a site, oldest first: who did what, when and why."""
         store.current(site)  # an unknown site is not an empty one
-        found = store.events(site, time_range(since, until), after=cursor or 0, limit=limit + 1)
-        return EventList(*page(found, limit, lambda event: str(event.id)))
+        found = store.events(site, p.time_range(since, until), after=cursor or 0, limit=limit + 1)
+        return views.EventList(*p.page(found, limit, lambda event: str(event.id)))
 
     @app.get("/v1/jobs")
     def jobs(
-        site: SiteFilter = None,
-        since: Since = None,
-        until: Until = None,
-        limit: Limit = 100,
-        cursor: NumberCursor = None,
-    ) -> JobList:
+        site: p.SiteFilter = None,
+        since: p.Since = None,
+        until: p.Until = None,
+        limit: p.Limit = 100,
+        cursor: p.NumberCursor = None,
+    ) -> views.JobList:
         """Jobs (of a site) that began in a time, newest first."""
-        found = store.jobs(site, time_range(since, until), before=cursor, limit=limit + 1)
-        return JobList(*page(found, limit, lambda job: str(job.id)))
+        found = store.jobs(site, p.time_range(since, until), before=cursor, limit=limit + 1)
+        return views.JobList(*p.page(found, limit, lambda job: str(job.id)))
 
     @app.get("/v1/jobs/{job}")
-    def job(job: Number) -> JobInfo:
+    def job(job: p.Number) -> JobInfo:
         """One job."""
         return store.job(job)
 
     @app.get("/v1/robots")
-    def robots(site: SiteFilter = None, limit: Limit = 100, cursor: NameCursor = None) -> RobotList:
+    def robots(site: p.SiteFilter = None, limit: p.Limit = 100, cursor: p.NameCursor = None) -> views.RobotList:
         """Robots (of a site) by site and name: the version that each runs and should run, and its last messages.
 
         A page ends early where these are long.
         """
         found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
         found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
-        shown, following = page(found, limit, lambda robot: f"{robot.site}/{robot.robot}")
+        shown, following = p.page(found, limit, lambda robot: f"{robot.site}/{robot.robot}")
         sizes = accumulate(len(to_json(robot)) for robot in shown)
         fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
         if fitting < len(shown):
-            return RobotList(*page(shown, fitting, lambda robot: f"{robot.site}/{robot.robot}"))
-        return RobotList(shown, following)
+            return views.RobotList(*p.page(shown, fitting, lambda robot: f"{robot.site}/{robot.robot}"))
+        return views.RobotList(shown, following)
 
 
 def _install_map_routes(app: FastAPI, store: MapStore) -> None:
     @app.get("/v1/sites/{site}/versions/{version}", response_class=Response)
-    def manifest(request: Request, site: Site, version: Version) -> Response:
+    def manifest(request: Request, site: p.Site, version: p.Version) -> Response:
         """The manifest of a version, byte by byte as robots verify it."""
         sha256 = store.version(site, version).manifest_sha256
         return bytes_response(request, store.blob(sha256), sha256, "application/json", immutable=True)
 
     @app.get("/v1/sites/{site}/current")
-    def current(site: Site) -> VersionView:
+    def current(site: p.Site) -> views.VersionView:
         """The current version of a site."""
         info = store.current(site)
         if info is None:
@@ -204,17 +178,17 @@ def _install_map_routes(app: FastAPI, store: MapStore) -> None:
                 f"site {site} has no published version; "
                 f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(store.folder))}`",
             )
-        return version_view(store, info)
+        return views.version_view(store, info)
 
     @app.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
     @app.get("/v1/tiles/{sha256}", response_class=Response)
-    def tile(request: Request, sha256: Sha256) -> Response:
+    def tile(request: Request, sha256: p.Sha256) -> Response:
         """The bytes of a tile."""
         return _blob(request, store, sha256, "tile")
 
     @app.head("/v1/vocabularies/{sha256}", response_class=Response, include_in_schema=False)
     @app.get("/v1/vocabularies/{sha256}", response_class=Response)
-    def vocabulary(request: Request, sha256: Sha256) -> Response:
+    def vocabulary(request: Request, sha256: p.Sha256) -> Response:
         """The bytes of a vocabulary."""
         return _blob(request, store, sha256, "vocabulary")
 

@@ -7,39 +7,10 @@ from fastapi import Depends, FastAPI, Query, Request, Response
 
 from fleetmap.mapformat import sha256_hex
 from fleetmap.messages import InitialPoseMessage, finite, report_dict
+from mapserver.api import parameters as p
+from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
 from mapserver.api.guard import actor_of
-from mapserver.api.parameters import (
-    Axis,
-    FailureQuery,
-    Hours,
-    KeyFilter,
-    Limit,
-    NameCursor,
-    Number,
-    NumberCursor,
-    PictureNumber,
-    RequestId,
-    Robot,
-    Since,
-    Site,
-    SiteFilter,
-    Until,
-    page,
-    time_range,
-)
-from mapserver.api.views import (
-    Act,
-    FailureList,
-    FailureView,
-    HourList,
-    HourView,
-    KpisList,
-    KpisView,
-    PlaceAct,
-    ServiceState,
-    SurveyAct,
-)
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
@@ -56,8 +27,8 @@ class Span(NamedTuple):
     end: int
 
 
-def _span(hours: Hours = 24, since: Since = None, until: Until = None) -> Span:
-    since_ns, until_ns = time_range(since, until)
+def _span(hours: p.Hours = 24, since: p.Since = None, until: p.Until = None) -> Span:
+    since_ns, until_ns = p.time_range(since, until)
     end = hour_of(time.time_ns()) + 1 if until_ns is None else hour_of(until_ns - 1) + 1
     return Span(end - hours if since_ns is None else hour_of(since_ns), end)
 
@@ -69,7 +40,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     """Adds the endpoints."""
 
     @app.post("/v1/sites/{site}/robots/{robot}/initial_pose")
-    def initial_pose(request: Request, site: Site, robot: Robot, act: PlaceAct) -> ServiceState:
+    def initial_pose(request: Request, site: p.Site, robot: p.Robot, act: views.PlaceAct) -> views.ServiceState:
         """A person's word of where a robot stands: it believes it over what it tracks, until fixes outweigh it. `ok`: it was told."""
         told = InitialPoseMessage(
             site=site,
@@ -80,16 +51,16 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
             sigma_m=act.sigma_m,
         )
         placing.tell(told, actor_of(request, act.actor, act.reason))
-        return ServiceState("ok")
+        return views.ServiceState("ok")
 
     @app.get("/v1/fleet/measures")
     def fleet_measures(
         span: Asked,
-        by: Axis = "site",
-        site: SiteFilter = None,
-        limit: Limit = 100,
-        cursor: NameCursor = None,
-    ) -> KpisList:
+        by: p.Axis = "site",
+        site: p.SiteFilter = None,
+        limit: p.Limit = 100,
+        cursor: p.NameCursor = None,
+    ) -> views.KpisList:
         """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause.
 
         Whole hours are counted: those that `since` and `until` lie in, too.
@@ -97,45 +68,45 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
         chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
         chosen = sorted(item for item in chosen if cursor is None or item[0] > cursor)
-        shown, following = page(chosen, limit, lambda item: item[0])
-        return KpisList(by, [KpisView(*key, kpis(counts)) for _, key, counts in shown], following)
+        shown, following = p.page(chosen, limit, lambda item: item[0])
+        return views.KpisList(by, [views.KpisView(*key, kpis(counts)) for _, key, counts in shown], following)
 
     @app.get("/v1/sites/{site}/hours")
     def fleet_hours(
-        site: Site,
+        site: p.Site,
         span: Asked,
-        by: Axis = "site",
-        key: KeyFilter = None,
-        limit: Limit = 100,
-        cursor: NumberCursor = None,
-    ) -> HourList:
+        by: p.Axis = "site",
+        key: p.KeyFilter = None,
+        limit: p.Limit = 100,
+        cursor: p.NumberCursor = None,
+    ) -> views.HourList:
         """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
         store.current(site)  # an unknown site is not an empty one
         first = max(span.first, (cursor or -1) + 1)
         found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
-        shown, following = page(list(found.items()), limit, lambda item: str(item[0]))
-        return HourList([HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
+        shown, following = p.page(list(found.items()), limit, lambda item: str(item[0]))
+        return views.HourList([views.HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
 
     @app.get("/v1/failures")
-    def failures(query: Annotated[FailureQuery, Query()]) -> FailureList:
+    def failures(query: Annotated[p.FailureQuery, Query()]) -> views.FailureList:
         """Failures, the last to arrive first; kind `suspected` are estimates of silent ones."""
         found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
-        return FailureList(*page(found, query.limit, lambda failure: str(failure.number)))
+        return views.FailureList(*p.page(found, query.limit, lambda failure: str(failure.number)))
 
     @app.get("/v1/failures/{number}")
-    def failure(number: Number) -> FailureView:
+    def failure(number: p.Number) -> views.FailureView:
         """One failure with the robot's report."""
         found = store.fleet.failure(number)
-        return FailureView(found.failure, finite(report_dict(found.report)), found.pictures)
+        return views.FailureView(found.failure, finite(report_dict(found.report)), found.pictures)
 
     @app.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
-    def picture(number: Number, place: PictureNumber) -> Response:
+    def picture(number: p.Number, place: p.PictureNumber) -> Response:
         """A picture of a failure, as JPEG."""
         headers = {"Cache-Control": "private, max-age=86400", **PICTURE_HEADERS}
         return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
 
     @app.get("/v1/failures/{number}/replay.mcap", response_class=Response)
-    def replay(request: Request, number: Number) -> Response:
+    def replay(request: Request, number: p.Number) -> Response:
         """The recording of the seconds around a failure, as MCAP: `mapserver fleet replay` and Foxglove open it."""
         data = store.fleet.replay(number)
         response = bytes_response(request, data, sha256_hex(data), "application/octet-stream", immutable=False)
@@ -143,29 +114,29 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         return response
 
     @app.get("/v1/sites/{site}/areas")
-    def areas(site: Site) -> dict[str, Any]:
+    def areas(site: p.Site) -> dict[str, Any]:
         """The named areas of a site as GeoJSON, metres in `map` in the place of degrees."""
         store.current(site)  # an unknown site is not an empty one
         return store.areas(site).geojson(site)
 
     @app.get("/v1/sites/{site}/resurvey")
-    def resurvey(site: Site) -> ResurveyList:
+    def resurvey(site: p.Site) -> ResurveyList:
         """Tiles to survey again, the worst first, each with its reasons, and a route through them."""
         return resurvey_list(store, site, settings, time.time_ns())
 
     @app.post("/v1/sites/{site}/resurvey/requests")
-    def ask(request: Request, site: Site, act: SurveyAct) -> SurveyRequest:
+    def ask(request: Request, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
         """Asks for a survey of a polygon; its tiles are on the list until the request is ended."""
         return ask_for_survey(store, site, act.corners_map_m, actor_of(request, act.actor, act.reason))
 
     @app.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
-    def end(request: Request, site: Site, asked: RequestId, act: Act) -> ServiceState:
+    def end(request: Request, site: p.Site, asked: p.RequestId, act: views.Act) -> views.ServiceState:
         """Takes a request off the list: it was surveyed, or is not wanted any more."""
         end_request(store, site, asked, actor_of(request, act.actor, act.reason))
-        return ServiceState("ok")
+        return views.ServiceState("ok")
 
     @app.get("/v1/sites/{site}/resurvey/route")
-    def resurvey_route(site: Site) -> dict[str, Any]:
+    def resurvey_route(site: p.Site) -> dict[str, Any]:
         """The route as GeoJSON, metres in `map` in the place of degrees."""
         found = resurvey_list(store, site, settings, time.time_ns())
         return route_geojson(site, found.version or 0, found.route)

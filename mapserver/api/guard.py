@@ -63,7 +63,6 @@ class GuardSettings:
 
     @property
     def is_sign_in_on(self) -> bool:
-        """Whether a request must show who it comes from."""
         return self.must_sign_in or (self.operators is not None and self.operators.is_sign_in_on)
 
     def identify(self, scope: Scope, *, uses: bool = True) -> Identity | None:
@@ -134,7 +133,6 @@ class Guard:
         self._hashes = " ".join(f"'sha256-{digest}'" for digest in hashes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, or one socket."""
         if scope["type"] not in {"http", "websocket"}:
             return await self._app(scope, receive, send)
         refusal = self._refused_place(scope) or await to_thread.run_sync(self._refused_person, scope)
@@ -231,7 +229,6 @@ class _Answer:
             self.scope = {**scope, "headers": kept}
 
     async def send(self, message: Message) -> None:
-        """One message of the application."""
         if message["type"] == "http.response.start":
             message = {**message, "headers": self._added(message["headers"])}
             if dict(message["headers"]).get(b"content-type", b"").startswith(b"text/html"):

@@ -5,7 +5,7 @@ dozens) and statuses.
 """
 
 from collections import Counter as Counts
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from fleetmap.errors import FleetmapError, StateError, StoreError
 from fleetmap.messages import Status
-from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
 from mapserver.floor_plan.areas import OUTSIDE
@@ -26,50 +26,43 @@ _SEEN_WITHIN_S = 60.0
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 Family = TypeVar("Family", CounterMetricFamily, GaugeMetricFamily)
 
-_SITE_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
-    ("reports", "Health reports.", lambda counts: counts.reports),
-    ("failures", "Position failures that robots reported.", lambda counts: counts.failures),
-    ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
-    ("unreported_blindness", "Stretches of blindness without a reported failure.", lambda c: c.unreported_blindness),
-    ("observed_seconds", "Time that reports cover.", lambda counts: counts.observed_ms / 1e3),
-    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", lambda counts: counts.driving_ms / 1e3),
-    ("driving_judged_seconds", "Driving, also at an unknown speed.", lambda counts: counts.judged_ms / 1e3),
-    ("driving_localised_seconds", "Of that localised.", lambda counts: counts.found_ms / 1e3),
-    ("usable_seconds", "Of it with a usable position.", lambda counts: counts.usable_ms / 1e3),
-    ("after_first_fix_seconds", "Of it since the run's first fix.", lambda counts: counts.after_fix_ms / 1e3),
-    ("localised_seconds", "Of that TRACKING.", lambda counts: counts.localised_ms / 1e3),
-    ("frames", "Frames that were worked on.", lambda counts: counts.frames),
-    ("frames_dropped", "Frames that were not.", lambda counts: counts.frames_dropped),
-    ("docks", "Arrivals at docks.", lambda counts: counts.docks),
-    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", lambda counts: counts.docks_wrong),
+# Of counters: name of the metric, its help, and the column.
+_SITE_SUMS = (
+    ("reports", "Health reports.", "reports"),
+    ("failures", "Position failures that robots reported.", "failures"),
+    ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
+    ("unreported_blindness", "Stretches of blindness without a reported failure.", "unreported_blindness"),
+    ("observed_seconds", "Time that reports cover.", "observed_ms"),
+    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", "driving_ms"),
+    ("driving_judged_seconds", "Driving, also at an unknown speed.", "judged_ms"),
+    ("driving_localised_seconds", "Of that localised.", "found_ms"),
+    ("usable_seconds", "Of it with a usable position.", "usable_ms"),
+    ("after_first_fix_seconds", "Of it since the run's first fix.", "after_fix_ms"),
+    ("localised_seconds", "Of that TRACKING.", "localised_ms"),
+    ("frames", "Frames that were worked on.", "frames"),
+    ("frames_dropped", "Frames that were not.", "frames_dropped"),
+    ("docks", "Arrivals at docks.", "docks"),
+    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", "docks_wrong"),
 )
-_VERSION_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
-    ("failures", "Failures on a version.", lambda counts: counts.failures),
-    ("silent_failures_estimated", "Silent failures, an estimate.", lambda counts: counts.silent_estimated),
-    ("driving_seconds", "Driving with a version.", lambda counts: counts.driving_ms / 1e3),
+_VERSION_SUMS = (
+    ("failures", "Failures on a version.", "failures"),
+    ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
+    ("driving_seconds", "Driving with a version.", "driving_ms"),
 )
-_AREA_SUMS: tuple[tuple[str, str, Callable[[Counters], float]], ...] = (
-    ("failures", "Failures in a named area.", lambda counts: counts.failures),
-    ("driving_seconds", "Driving in a named area.", lambda counts: counts.driving_ms / 1e3),
-    ("driving_localised_seconds", "Of that localised.", lambda counts: counts.found_ms / 1e3),
+_AREA_SUMS = (
+    ("failures", "Failures in a named area.", "failures"),
+    ("driving_seconds", "Driving in a named area.", "driving_ms"),
+    ("driving_localised_seconds", "Of that localised.", "found_ms"),
 )
-_SITE_ROBOTS: tuple[tuple[str, str, Callable[[list[RobotStatus]], float]], ...] = (
-    ("robots", "Robots that ever reported.", len),
-    ("robots_seen", "Robots that reported in the last minute.", lambda robots: len(_seen(robots))),
-    ("robots_current", "Robots on the wanted version.", lambda robots: sum(map(_is_current, robots))),
-    ("robots_present", "Robots on the bus now.", lambda robots: sum(robot.is_present is True for robot in robots)),
-    ("robots_copied", "Robots that were connected twice.", lambda robots: sum(robot.is_copied for robot in robots)),
-    (
-        "clock_skew_max_seconds",
-        "The most that a robot's clock is wrong.",
-        lambda robots: max(map(_skew_s, robots), default=0.0),
-    ),
-    (
-        "map_word_hours_max",
-        "The oldest proof of what may be run, of robots heard in the last minute.",
-        lambda robots: max(map(_word_hours, _seen(robots)), default=0.0),
-    ),
-)
+_ROBOTS = {
+    "robots": "Robots that ever reported.",
+    "robots_seen": "Robots that reported in the last minute.",
+    "robots_current": "Robots on the wanted version.",
+    "robots_present": "Robots on the bus now.",
+    "robots_copied": "Robots that were connected twice.",
+    "clock_skew_max_seconds": "The most that a robot's clock is wrong.",
+    "map_word_hours_max": "The oldest proof of what may be run, of robots heard in the last minute.",
+}
 
 
 class Metrics:
@@ -94,12 +87,10 @@ class Metrics:
         self._seconds.labels(route).observe(seconds_s)
 
     def count_bus(self, what: str, result: str, sent_bytes: int) -> None:
-        """One question or message on the bus."""
         self._bus_messages.labels(what, result).inc()
         self._bus_bytes.labels(what).inc(sent_bytes)
 
     def text(self) -> bytes:
-        """The exposition format."""
         return generate_latest(self._registry)
 
 
@@ -148,23 +139,34 @@ class _FleetCollector(Collector):
 
     def _robots(self, sites: list[str]) -> Iterator[Metric]:
         robots = self._fleet.robots()
-        of_site = {site: [robot for robot in robots if robot.site == site] for site in sites}
-        for name, words, value in _SITE_ROBOTS:
-            yield _filled(_gauge(f"site_{name}", words), (((site,), value(own)) for site, own in of_site.items()))
+        gauges = {name: _gauge(f"site_{name}", words) for name, words in _ROBOTS.items()}
         statuses = _gauge("site_robots_status", "Robots heard in the last minute.", "status")
-        for site, own in of_site.items():
-            counts = Counts(_status(robot) for robot in _seen(own))
-            _filled(statuses, (((site, status), counts[status]) for status in (*Status, "other")))
-        yield statuses
         drifting = _gauge(
             "site_robots_calibration", "Robots heard in the last minute that drift, by parameter.", "parameter"
         )
-        for site, own in of_site.items():
-            drifts = Counts(
-                f.name for robot in _seen(own) for f in calibration_figures(robot.last_health) if f.is_drifted
-            )
-            _filled(drifting, (((site, name), drifts[name]) for name in PARAMETERS))
-        yield drifting
+        for site in sites:
+            own = [robot for robot in robots if robot.site == site]
+            seen = [robot for robot in own if robot.seconds_since <= _SEEN_WITHIN_S]
+            health = [robot.last_health or {} for robot in seen]
+            proofs = [each.get("metrics", {}).get("map_word_hours") for each in health]
+            figures = {
+                "robots": len(own),
+                "robots_seen": len(seen),
+                "robots_current": sum(robot.version == robot.wanted_version is not None for robot in own),
+                "robots_present": sum(robot.is_present is True for robot in own),
+                "robots_copied": sum(robot.is_copied for robot in own),
+                "clock_skew_max_seconds": max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0),
+                "map_word_hours_max": max((hours for hours in proofs if isinstance(hours, int | float)), default=0.0),
+            }
+            for name, figure in figures.items():
+                gauges[name].add_metric([site], figure)
+            counts = Counts(each.get("status") for each in health)
+            other = len(health) - sum(counts[status] for status in Status)
+            _filled(statuses, [((site, status), counts[status]) for status in Status])
+            _filled(statuses, [((site, "other"), other)])
+            drifts = Counts(f.name for each in health for f in calibration_figures(each) if f.is_drifted)
+            _filled(drifting, [((site, name), drifts[name]) for name in PARAMETERS])
+        yield from (*gauges.values(), statuses, drifting)
 
 
 def _trust(store: MapStore) -> Iterator[Metric]:
@@ -186,44 +188,23 @@ def _trust(store: MapStore) -> Iterator[Metric]:
     yield days
 
 
-def _word_hours(robot: RobotStatus) -> float:
-    hours = (robot.last_health or {}).get("metrics", {}).get("map_word_hours")
-    return float(hours) if isinstance(hours, int | float) else 0.0
-
-
 def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:
     return GaugeMetricFamily(f"fleetmap_{name}", words, labels=["site", *labels])
 
 
 def _sums(
     prefix: str,
-    sums: Iterable[tuple[str, str, Callable[[Counters], float]]],
+    sums: Iterable[tuple[str, str, str]],
     labels: list[str],
     counters: Sequence[tuple[tuple[str, ...], Counters]],
 ) -> Iterator[Metric]:
-    for name, words, value in sums:
+    for name, words, column in sums:
         family = CounterMetricFamily(f"fleetmap_{prefix}_{name}", words, labels=labels)
-        yield _filled(family, ((key, value(counts)) for key, counts in counters))
+        per = 1e3 if column.endswith("_ms") else 1  # seconds
+        yield _filled(family, ((key, getattr(counts, column) / per) for key, counts in counters))
 
 
 def _filled(family: Family, values: Iterable[tuple[tuple[str, ...], float]]) -> Family:
     for labels, value in values:
         family.add_metric(labels, value)
     return family
-
-
-def _is_current(robot: RobotStatus) -> bool:
-    return robot.version == robot.wanted_version is not None
-
-
-def _skew_s(robot: RobotStatus) -> float:
-    return abs(robot.clock_ahead_s or 0.0)
-
-
-def _seen(robots: list[RobotStatus]) -> list[RobotStatus]:
-    return [robot for robot in robots if robot.seconds_since <= _SEEN_WITHIN_S]
-
-
-def _status(robot: RobotStatus) -> str:
-    status = (robot.last_health or {}).get("status")
-    return status if status in tuple(Status) else "other"

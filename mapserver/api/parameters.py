@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, TypeVar
 
 from fastapi import Path, Query
-from fastapi.dependencies.models import Dependant
+from fastapi.dependencies.utils import get_flat_params
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
@@ -80,26 +80,11 @@ async def known_parameters(request: HTTPConnection) -> None:
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute) or not route.include_in_schema:
         return
-    known = _query_names(route)
+    known = {asked.alias for asked in get_flat_params(route.dependant)} - route.param_convertors.keys()
     unknown = [name for name in request.query_params if name not in known]
     if unknown:
         words = f"this address knows {', '.join(sorted(known))}" if known else "this address has none"
         raise HTTPException(422, f"unknown query parameter {unknown[0][:40]!r}; {words}")
-
-
-def _query_names(route: APIRoute) -> set[str]:
-    found: set[str] = set()
-
-    def look(dependant: Dependant) -> None:
-        for asked in dependant.query_params:
-            kind: object = asked.field_info.annotation
-            fields = kind.model_fields if isinstance(kind, type) and issubclass(kind, BaseModel) else {asked.alias}
-            found.update(fields)
-        for inner in dependant.dependencies:
-            look(inner)
-
-    look(route.dependant)
-    return found
 
 
 class FailureQuery(BaseModel):
@@ -118,7 +103,6 @@ class FailureQuery(BaseModel):
     cursor: NumberCursor = None
 
     def filter(self) -> FailureFilter:
-        """As the store takes it."""
         since_ns, until_ns = time_range(self.since, self.until)
         named = self.model_dump(exclude={"limit", "cursor", "since", "until"})
         return FailureFilter(**named, since_ns=since_ns, until_ns=until_ns)

@@ -25,7 +25,6 @@ class RequestLimits:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
         if scope["type"] not in {"http", "websocket"}:
             return await self._app(scope, receive, send)
         if "://" in scope["path"][:8]:  # the absolute form of an address, which h11 leaves as it is

@@ -74,7 +74,6 @@ class ProxiedPeople:
         self._app, self._proxy = app, proxy
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request, one socket, or the lifespan."""
         if scope["type"] in {"http", "websocket"}:
             named = [
                 (name, value.decode("latin-1").strip()) for name, value in scope["headers"] if name in (USER, GROUPS)

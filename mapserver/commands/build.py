@@ -70,9 +70,7 @@ def build(
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     check_output("--trajectory-out", options.trajectory_out)
-    check_output("--picture", options.picture)
-    if options.picture is not None and options.picture.suffix.lower() != ".png":
-        raise UsageError(f"--picture {options.picture} must end in .png")
+    check_output("--picture", options.picture, ".png")
     options.check()
     from mapserver import BuildOptions, build_map
     from mapserver.drafting.sensor_subset import named_sensor_set

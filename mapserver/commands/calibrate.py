@@ -1,15 +1,17 @@
 """`mapserver calibrate`: a rig's calibration measured from its recordings."""
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, config_path, expand_options
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, UsageError, disk_errors
 from mapserver.commands.options import Calibration, check_output, topics_of
 
 if TYPE_CHECKING:
@@ -105,18 +107,12 @@ def _shown() -> "Iterator[SurveyTools]":
 
 
 def _write(out: Path, text: str, advice: str) -> None:
-    from fleetmap.errors import UsageError, disk_errors
-
     with disk_errors(f"--out {out} cannot be written", "check folder and space", UsageError):
         out.write_text(text, encoding="utf-8")
     typer.echo(f"{out}: written; {advice}")
 
 
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
-    import re
-    from tempfile import TemporaryDirectory
-
-    from fleetmap.errors import UsageError
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
     from mapserver.calibration.calibration_file import guessed_file, guessed_in_words
     from mapserver.calibration.from_guess import calibration_from_guess, first_rig

@@ -1,13 +1,19 @@
 """`mapserver fleet`: fleet health as a page, as files for other programs, and as a route for the next survey."""
 
+import sys
+import time
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, Group, settings_of
-from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
+from fleetmap.errors import StateError, UsageError
+from fleetmap.log_lines import printable
+from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_json, write_output
 
 if TYPE_CHECKING:
     from mapserver.fleet.resurvey_list import ResurveyList
@@ -29,19 +35,14 @@ def report(
     config: ConfigFile = None,
 ) -> None:
     """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
-    import time
-
-    from fleetmap.errors import disk_errors
     from mapserver.dashboard.pages.shift_page import html_page
     from mapserver.fleet.shift_summary import SummarySettings, summarise
-    from mapserver.store import MapStore
 
     settings = settings_of(context)
     judged_by = SummarySettings(settings.canary, settings.resurvey)
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
-    with disk_errors(f"{out} cannot be written", "choose another place"):
-        out.write_text(page, "utf-8")
+    write_output(out, page.encode())
     typer.echo(str(out))
 
 
@@ -55,17 +56,14 @@ def export(
     ] = None,
 ) -> None:
     """Write failures as JSON lines, or as MCAP with log, places and pictures, which Foxglove opens."""
-    import time
-
-    from fleetmap.errors import UsageError
     from mapserver.fleet.exports import write_json_lines, write_mcap
-    from mapserver.store import FailureFilter, MapStore
+    from mapserver.store import FailureFilter
 
     chosen = format_ or next((known for known in ExportFormat if out.suffix == f".{known}"), None)
     if chosen is None:
         raise UsageError(f"{out}: name it .jsonl or .mcap, or name --format")
     since_ns = None if hours is None else time.time_ns() - hours * 3_600_000_000_000
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         if site is not None:
             maps.current(site)  # raises for an unknown site
         write = write_mcap if chosen is ExportFormat.MCAP else write_json_lines
@@ -84,13 +82,10 @@ def resurvey(
     config: ConfigFile = None,
 ) -> None:
     """List the tiles that should be surveyed again and why, those that people asked for first; with --route a way through them."""
-    import time
-
     from mapserver.fleet.resurvey_list import resurvey_list
-    from mapserver.store import MapStore
 
     settings = settings_of(context).resurvey
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = resurvey_list(maps, site, settings, time.time_ns())
     if route is not None:
         _write_route(found, route)
@@ -109,15 +104,13 @@ def resurvey(
 def _write_route(found: "ResurveyList", path: Path) -> None:
     import json as json_text
 
-    from fleetmap.errors import disk_errors
     from mapserver.fleet_statistics.resurvey_decision import route_csv, route_geojson
 
     if path.suffix == ".csv":
         text = route_csv(found.route)
     else:
         text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
-    with disk_errors(f"{path} cannot be written", "choose another place"):
-        path.write_text(text, "utf-8")
+    write_output(path, text.encode())
 
 
 def replay(
@@ -129,21 +122,13 @@ def replay(
     json: Json = False,
 ) -> None:
     """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
-    import sys
-    from importlib.util import find_spec
-    from pathlib import Path
-    from tempfile import TemporaryDirectory
-
-    from fleetmap.errors import StateError
-    from fleetmap.log_lines import printable
     from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
-    from mapserver.store import MapStore
 
     if find_spec("locclient") is None:
         raise StateError(
             "the client of the robots is not installed here; install the distribution `fleetmap` as a whole"
         )
-    with MapStore.open(store, read_only=True) as maps, TemporaryDirectory() as folder:
+    with open_store(store, read_only=True) as maps, TemporaryDirectory() as folder:
         path = Path(folder) / f"failure-{failure}.mcap"
         path.write_bytes(maps.fleet.replay(failure))
         site = maps.fleet.failure(failure).failure.site

@@ -1,5 +1,6 @@
 """`mapserver live`: a survey is mapped while it drives, seen by everybody who looks, and stored as a draft at its end."""
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -9,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, config_path, expand_options
-from fleetmap.errors import UsageError
-from mapserver.commands.options import SurveyOptions
+from fleetmap.errors import LinkError, UsageError
+from mapserver.commands.options import SurveyOptions, open_store
 
 if TYPE_CHECKING:
     from fleetmap.bus import Bus
@@ -127,8 +128,6 @@ def _driven(given: "MapserverConfig", record: Path, build: "BuildOptions") -> "I
 
 def _stopping() -> Callable[[], bool]:
     """Whether Ctrl-C or SIGTERM has ended the drive; a second one ends the build too."""
-    import signal
-
     stopped = False
 
     def stop(*_: object) -> None:
@@ -149,10 +148,9 @@ def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]
         return nullcontext(None)
     if not has_tls(check_endpoint(server)):
         return Bus.connect(server)
-    from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         tls = RobotRegister(maps).survey_tls()
     return Bus.connect(server, tls=tls)
 
@@ -174,7 +172,6 @@ def _viewer(server: "FoxgloveServer", drive: "Drive") -> "LiveViewer":
 
 
 def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":
-    from fleetmap.errors import LinkError
     from fleetmap.live_survey import live_key
     from fleetmap.messages import encode_message
 

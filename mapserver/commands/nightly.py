@@ -1,5 +1,6 @@
 """`mapserver nightly`: new recordings become the site's next version."""
 
+import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,6 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     Status 0 also with an empty inbox, 4 if the gate refuses, 5 if another run is at work.
     """
     options.check()
-    import time
 
     from fleetmap.console import plain_console
     from fleetmap.recordings import FrameSelection

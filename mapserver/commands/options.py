@@ -1,5 +1,7 @@
 """Options that several commands share."""
 
+import getpass
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleetmap.cli_options import TopicNames, settings_of
-from fleetmap.errors import UsageError
+from fleetmap.errors import UsageError, disk_errors
 
 if TYPE_CHECKING:
     from fleetmap.recordings import Topics
@@ -38,9 +40,6 @@ class ActorOptions:
 
     def named(self) -> "Actor":
         """The actor for the store's log."""
-        import getpass
-        import os
-
         from mapserver.store import Actor
 
         name = self.actor
@@ -92,6 +91,13 @@ def topics_of(context: typer.Context, words: list[str] | None) -> "Topics":
     return named_topics(words, topics)
 
 
+def open_store(folder: Path, *, create: bool = False, read_only: bool = False) -> "MapStore":
+    """The store in a folder. Its module comes when it is opened: options are checked before."""
+    from mapserver.store import MapStore
+
+    return MapStore.open(folder, create=create, read_only=read_only)
+
+
 def version_named(maps: "MapStore", site: str, version: int | None) -> int:
     """The version that is asked for, the current one for None; UsageError for a site without one."""
     if version is not None:
@@ -102,10 +108,18 @@ def version_named(maps: "MapStore", site: str, version: int | None) -> int:
     return current.version
 
 
-def check_output(option: str, path: Path | None) -> None:
-    """Raises UsageError unless `path` can be a file."""
+def check_output(option: str, path: Path | None, *suffixes: str) -> None:
+    """Raises UsageError unless `path` can be a file, with one of these suffixes where there are some."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         raise UsageError(f"{option} {path}: name a file in a folder that exists")
+    if path is not None and suffixes and path.suffix.lower() not in suffixes:
+        raise UsageError(f"{option} {path} must end in {' or '.join(suffixes)}")
+
+
+def write_output(path: Path, data: bytes) -> None:
+    """Replaces the file that a command was asked to write; StoreError where the disk refuses."""
+    with disk_errors(f"{path} cannot be written", "choose another place"):
+        path.write_bytes(data)
 
 
 def print_json(value: object) -> None:

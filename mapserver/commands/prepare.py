@@ -1,6 +1,10 @@
 """`mapserver prepare`: the kernels of builds are compiled before the first recording comes."""
 
+import io
+import math
+import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import typer
@@ -8,8 +12,6 @@ import typer
 
 def prepare() -> None:
     """Compile everything that `build`, `nightly`, `calibrate` and `doctor` compute with; at once where that was done before."""
-    import tempfile
-
     import fleetmap
     import mapserver
     from fleetmap.preparation.kernel_cache import prepare_kernels
@@ -21,10 +23,6 @@ def prepare() -> None:
 
 def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
     """Surveys of a painted room, each with what it adds to those before it."""
-    import io
-    import math
-    from contextlib import redirect_stderr
-
     import cv2
     import msgspec
     import numpy as np

@@ -1,7 +1,14 @@
 """`mapserver serve`: a store on HTTP and on the bus."""
 
+import atexit
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
 from collections.abc import AsyncIterator
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,7 +17,9 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.options import StoreFolder
+from fleetmap.errors import UsageError
+from fleetmap.log_lines import log_to_stderr
+from mapserver.commands.options import StoreFolder, open_store
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -72,7 +81,6 @@ class HttpOptions:
 
     def viewers(self) -> "AbstractContextManager[FoxgloveServer | None]":
         """The server of viewers, None without one; UsageError as `viewer_address`, `require_foxglove` and `FoxgloveServer`."""
-        from fleetmap.errors import UsageError
         from fleetmap.foxglove import require_foxglove, viewer_address
         from fleetmap.mapformat import check_name
 
@@ -90,8 +98,6 @@ class HttpOptions:
 
     def viewed_site(self, store: "MapStore") -> str:
         """The site that viewers see; UsageError where none is named and there is not one alone."""
-        from fleetmap.errors import UsageError
-
         sites = [info.site for info in store.sites()]
         if self.foxglove_site is None and len(sites) != 1:
             raise UsageError(f"--foxglove shows one site and the store has {len(sites)}; name it with --foxglove-site")
@@ -99,8 +105,6 @@ class HttpOptions:
 
     def host_and_port(self) -> tuple[str, int]:
         """Where to listen; UsageError for what is no address."""
-        from fleetmap.errors import UsageError
-
         host, _, port = self.http.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise UsageError(f"--http {self.http!r}: write it like 127.0.0.1:8080")
@@ -108,7 +112,6 @@ class HttpOptions:
 
     def load_certificate(self) -> "HttpCertificate | None":
         """The certificate, None without one; UsageError for half of a pair, and as `HttpCertificate`."""
-        from fleetmap.errors import UsageError
         from mapserver.trust.http_certificate import HttpCertificate
 
         if (self.http_cert is None) != (self.http_key is None):
@@ -119,7 +122,6 @@ class HttpOptions:
 
     def load_proxy(self) -> "SignInProxy | None":
         """The proxy that signs people in, None without one; UsageError as `SignInProxy.of`, and for half of the two options."""
-        from fleetmap.errors import UsageError
         from mapserver.api.sign_in_proxy import SignInProxy
 
         if self.sign_in_proxy:
@@ -134,23 +136,14 @@ class HttpOptions:
         """Who is let in. warning: about something else, for every page.
 
         UsageError where the server must not be reached like this."""
-        from fleetmap.errors import UsageError
         from mapserver.api.guard import GuardSettings
         from mapserver.dashboard.layout import HANDLERS
-        from mapserver.operators.binding import HttpBinding, binding_fault, is_loopback_name
         from mapserver.operators.operators import Operators
+        from mapserver.serving.http_connections import binding_fault, is_loopback_name
 
         given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
         has_operators = proxy is not None or store.operators.may_sign_in()
-        fault = binding_fault(
-            HttpBinding(
-                address=self.http,
-                host=host,
-                names=given,
-                has_tls=certificate is not None,
-                has_operators=has_operators,
-            )
-        )
+        fault = binding_fault(self.http, host, given, has_tls=certificate is not None, has_operators=has_operators)
         if fault and not self.insecure:
             raise UsageError(fault)
         if certificate is not None:
@@ -187,7 +180,6 @@ def serve(
     from mapserver.serving.bus_access import check_binding, prepare_bus
 
     is_open = check_binding(check_endpoint(zenoh), insecure=at.insecure)
-    from mapserver.store import MapStore
     from mapserver.trust import prepare_lists
 
     certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
@@ -196,7 +188,7 @@ def serve(
     with (
         _listening(host, port, proxies) as listener,
         at.viewers() as viewers,
-        MapStore.open(store) as maps,
+        open_store(store) as maps,
     ):
         shown = None if viewers is None else _Shown(viewers, at.viewed_site(maps))
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
@@ -210,10 +202,6 @@ def serve(
 
 def _end_process() -> None:
     """Ends with status 0 now. Taking two thousand modules apart changes nothing outside and takes 0.65 s of CPU: 20 s when it is busy."""
-    import atexit
-    import os
-    import sys
-
     atexit._run_exitfuncs()
     with suppress(OSError):  # nobody reads them any more
         sys.stdout.flush()
@@ -237,15 +225,9 @@ class _Http(NamedTuple):
 def _run(
     maps: "MapStore", guarded_bus: "tuple[Bus, BusGuard | None]", http: _Http, settings: "MapserverConfig"
 ) -> None:
-    import logging
-    import signal
-    import sys
-    from contextlib import asynccontextmanager
-
     import uvicorn
     from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-    from fleetmap.log_lines import log_to_stderr
     from fleetmap.threads import ended_by_threads
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
@@ -351,8 +333,6 @@ def _bound_the_end(fleet: "Fleet") -> None:
 
     Reports of robots are kept first; a write of the store is whole or none.
     """
-    import logging
-    import threading
 
     def end() -> None:
         others = [thread.name for thread in threading.enumerate() if not thread.daemon]
@@ -368,9 +348,6 @@ def _bound_the_end(fleet: "Fleet") -> None:
 
 
 def _listening(host: str, port: int, proxies: frozenset[str]) -> "BoundedListener":
-    import socket
-
-    from fleetmap.errors import UsageError
     from mapserver.serving.http_connections import BACKLOG, BoundedListener
 
     listener = BoundedListener(socket.AF_INET6 if ":" in host else socket.AF_INET, proxies)

@@ -50,7 +50,6 @@ class Alert:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """The same for as long as it is the same trouble."""
         return self.name, self.site, self.about
 
 

@@ -25,7 +25,6 @@ class ProcessLimits:
     open_files: int = 256
 
     def apply(self) -> None:
-        """Sets those of this process, for good."""
         for kind, wanted in (
             (resource.RLIMIT_AS, self.memory_bytes),
             (resource.RLIMIT_CPU, self.cpu_s),

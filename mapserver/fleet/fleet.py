@@ -25,11 +25,11 @@ from fleetmap.messages import (
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.fleet.rejected_reports import RejectedReports, rejection
+from mapserver.fleet.rejected_reports import rejection, set_aside
 from mapserver.fleet.replay_intake import ReplayIntake
-from mapserver.fleet.version_assignment import VersionAssignment, read_assignment
+from mapserver.fleet_statistics.canary_decision import number_of
 from mapserver.fleet_statistics.clock_skew import ClockSkew
-from mapserver.store import MapStore
+from mapserver.store import CanaryRow, MapStore
 
 MAX_ROBOTS = 10_000
 MAX_STAMP_NS = 1 << 62  # what the store can hold
@@ -80,6 +80,32 @@ class _Robot:
     copied_ns: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Assignment:
+    """A site's current version, and the one that some robots try before the others."""
+
+    current: WantedVersion
+    canary: CanaryRow | None = None
+    tried: WantedVersion | None = None
+
+    def is_canary(self, robot: str) -> bool:
+        canary = self.canary
+        return canary is not None and number_of(canary.site, canary.version, robot) < canary.threshold
+
+    def wanted(self, robot: str) -> WantedVersion:
+        return self.tried if self.tried is not None and self.is_canary(robot) else self.current
+
+
+def _assignment(store: MapStore, site: str) -> _Assignment:
+    info, running = store.current(site), store.canaries(site, running=True)
+    number, address = (None, None) if info is None else (info.version, info.manifest_sha256)
+    current = WantedVersion(site=site, version=number, manifest_sha256=address)
+    if not running:
+        return _Assignment(current)
+    number, address = running[0].version, store.version(site, running[0].version).manifest_sha256
+    return _Assignment(current, running[0], WantedVersion(site=site, version=number, manifest_sha256=address))
+
+
 class Fleet:
     """Takes the robots' messages from any thread.
 
@@ -95,7 +121,6 @@ class Fleet:
         self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
-        self._rejected = RejectedReports(store.folder / "refused")
         self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)
         self._failures = RateLimit(FAILURE_BURST, FAILURES_PER_S, clock_ns)
         self._robots: dict[tuple[str, str], _Robot] = {}
@@ -110,11 +135,11 @@ class Fleet:
 
         Raises UsageError for an unknown site.
         """
-        return read_assignment(self._store, site).wanted(robot)
+        return _assignment(self._store, site).wanted(robot)
 
     def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
         """The same for all robots of a site that ever asked or said something."""
-        assignment = read_assignment(self._store, site)
+        assignment = _assignment(self._store, site)
         return {robot: assignment.wanted(robot) for robot in self.known_robots(site)}
 
     def take_question(self, site: str, robot: str) -> WantedVersion:
@@ -156,7 +181,6 @@ class Fleet:
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
-        """Keeps an estimate in memory."""
         now_ns = self._clock_ns()
         with self._lock:
             self._entry(site, robot, now_ns, message.map_version).last_estimate = message
@@ -197,7 +221,8 @@ class Fleet:
         except LinkError as error:
             ack = rejection(payload, str(error))
         if ack.refused:
-            self._rejected.keep(site, robot, payload[:MAX_FAILURE_BYTES], ack.refused, self._clock_ns())
+            folder, payload = self._store.folder / "refused", payload[:MAX_FAILURE_BYTES]
+            set_aside(folder, f"{self._clock_ns():020d}", (site, robot), payload, ack.refused)
         return ack
 
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
@@ -233,7 +258,6 @@ class Fleet:
         return self._ingest.prune()
 
     def known_robots(self, site: str) -> list[str]:
-        """Names of the site's robots that ever asked or said something."""
         with self._lock:
             return sorted(robot for key_site, robot in self._robots if key_site == site)
 
@@ -244,10 +268,7 @@ class Fleet:
             for robot in self._robots.values():
                 robot.seen_ns = min(robot.seen_ns, now_ns)  # the clock was set back: from now on silence counts
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
-        assignments: dict[str, VersionAssignment] = {}
-        for key, _ in chosen:
-            if key[0] not in assignments:
-                assignments[key[0]] = read_assignment(self._store, key[0])
+        assignments = {site: _assignment(self._store, site) for site in {key[0] for key, _ in chosen}}
         return [_status(key, robot, assignments[key[0]], now_ns) for key, robot in chosen]
 
     @contextmanager
@@ -274,7 +295,7 @@ class Fleet:
         return entry
 
 
-def _status(key: tuple[str, str], robot: _Robot, assignment: VersionAssignment, now_ns: int) -> RobotStatus:
+def _status(key: tuple[str, str], robot: _Robot, assignment: _Assignment, now_ns: int) -> RobotStatus:
     return RobotStatus(
         site=key[0],
         robot=key[1],

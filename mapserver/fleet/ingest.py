@@ -42,7 +42,6 @@ class IngestSettings(Section, frozen=True):
     presence_every_s: Positive = 5.0  # between looks at the robots on the bus
 
     def retention(self) -> FleetRetention:
-        """What stays in the store."""
         days = (self.tally_days, self.failure_days)
         return FleetRetention(*days, self.picture_bytes, self.trace_days, self.trace_rows, self.failures_per_robot)
 
@@ -63,7 +62,6 @@ class _Grid:
     cells: frozenset[tuple[int, int]]
 
     def key(self, x_m: float, y_m: float) -> str:
-        """Key of the tile at a place."""
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             return OUTSIDE
         return self.cell_key((math.floor(x_m / self.size_m), math.floor(y_m / self.size_m)))
@@ -90,7 +88,6 @@ class Ingest:
         self._causes: dict[str, set[str]] = {}
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
-        """Follows a robot's estimate, for its speed."""
         with self._lock:
             self._streams.setdefault((site, robot), _Stream()).health.take_pose(message)
 
@@ -152,7 +149,6 @@ class Ingest:
         return self._store.fleet.add_failure(report, times_ns, counters, self._settings.retention(), area)
 
     def has_counted(self) -> bool:
-        """Whether there is something to bring to the disk."""
         with self._lock:
             return bool(self._batch.counters or self._batch.last_reports)
 

@@ -20,7 +20,6 @@ class RateLimit:
         self._searched_ns: int | None = None
 
     def admits(self, key: Hashable) -> bool:
-        """Whether it may happen now; counts it if so."""
         now_ns = self._clock_ns()
         with self._lock:
             if key not in self._buckets and len(self._buckets) >= _MAX_KEYS:

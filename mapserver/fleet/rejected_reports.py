@@ -28,30 +28,22 @@ def rejection(payload: bytes, reason: str) -> FailureAck:
     return FailureAck(id=known.id, refused=reason[:2000])
 
 
-class RejectedReports:
-    """A folder of the last rejected reports, each as far as the limit goes, beside its reason. A full disk loses only these."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def keep(self, site: str, robot: str, payload: bytes, reason: str, now_ns: int) -> None:
-        _log.warning("a failure of robot %r of site %r is refused for good: %s", robot[:80], site[:80], reason)
-        try:
-            check_no_link(self._folder.parent, self._folder)
-            make_folder(self._folder)
-            path = self._folder / f"{now_ns:020d}-{_sender(site, robot)}.msgpack"
-            write_atomically(path, [payload])
-            write_atomically(path.with_suffix(".reason.txt"), [f"{reason}\n".encode("utf-8", "replace")])
-            for old in sorted(self._folder.glob("*.msgpack"))[:-_MAX_KEPT]:
-                old.unlink()
-                old.with_suffix(".reason.txt").unlink(missing_ok=True)
-        except (OSError, StoreError) as error:
-            _log.warning("it could not be kept in %s: %s", self._folder, error)
-
-
-def _sender(site: str, robot: str) -> str:
-    """Part of a file's name."""
+def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes, reason: str) -> None:
+    """Keeps a rejected report beside its reason, the last ones alone. A full disk loses only these. robot: site and name."""
+    site, name = robot
+    _log.warning("a failure of robot %r of site %r is refused for good: %s", name[:80], site[:80], reason)
     try:
-        return f"{check_name(site, 'site')}-{check_name(robot, 'robot')}"
+        sender = f"{check_name(site, 'site')}-{check_name(name, 'robot')}"
     except UsageError:
-        return "unknown"
+        sender = "unknown"
+    try:
+        check_no_link(folder.parent, folder)
+        make_folder(folder)
+        path = folder / f"{moment}-{sender}.msgpack"
+        write_atomically(path, [payload])
+        write_atomically(path.with_suffix(".reason.txt"), [f"{reason}\n".encode("utf-8", "replace")])
+        for old in sorted(folder.glob("*.msgpack"))[:-_MAX_KEPT]:
+            old.unlink()
+            old.with_suffix(".reason.txt").unlink(missing_ok=True)
+    except (OSError, StoreError) as error:
+        _log.warning("it could not be kept in %s: %s", folder, error)

@@ -16,7 +16,6 @@ class ClockSkew:
         self._best_ns: list[int | None] = [None, None]
 
     def take(self, robot_ns: int, server_ns: int) -> None:
-        """One message's stamp and when it came."""
         ahead_ns = robot_ns - server_ns
         if self._begun_ns is None or not 0 <= server_ns - self._begun_ns < _WINDOW_NS:
             # What was compared with a clock that was set back since is worth nothing.

@@ -182,7 +182,6 @@ class HealthStream:
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:
-    """The metrics that are plausible numbers."""
     return {
         name: float(value)
         for name, value in health.metrics.items()

@@ -57,7 +57,6 @@ class Counters:
     continued: int = 0
 
     def add(self, other: Self) -> None:
-        """Adds what another one holds."""
         for name in COUNTER_COLUMNS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
@@ -67,7 +66,6 @@ class Counters:
 
     @property
     def robot_days(self) -> float:
-        """Days of 16 h driving."""
         return self.driving_ms / 1e3 / ROBOT_DAY_S
 
     @property

@@ -87,12 +87,10 @@ class RecordedDrive:
         return 0
 
     def check(self) -> list[str]:
-        """See Drive."""
         refuse_hopeless(self._recording)
         return [f"issue: {issue.what}: {issue.detail}" for issue in self._recording.issues]
 
     def warm_up(self) -> tuple[RectifiedFrame, ...]:
-        """See Drive."""
         return tuple(self._frame(int(index)) for index in self._indices[:_WARM_UP_FRAMES])
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
@@ -109,7 +107,6 @@ class RecordedDrive:
             yield DueFrame(frame, imu, list(wheel), due_s)
 
     def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
-        """See Drive."""
         if count == len(self._indices):
             return self._path, replace(options, frames=self._given)
         seen = self._indices[: max(count, 1)]
@@ -150,7 +147,6 @@ class SensorDrive:
         return []
 
     def warm_up(self) -> tuple[RectifiedFrame, ...]:
-        """See Drive."""
         return ()
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
@@ -179,7 +175,6 @@ class SensorDrive:
                 writer.discard()
 
     def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
-        """See Drive."""
         if not count:
             self._refuse_silence()
             raise RecordingError(

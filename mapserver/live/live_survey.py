@@ -63,7 +63,6 @@ class LiveFigures(NamedTuple):
     mapping_failed: str
 
     def words(self) -> str:
-        """A sentence."""
         failed = self.mapping_failed
         kept = "played as fast as it went"
         if self.latency_ms is not None:
@@ -192,7 +191,6 @@ class _Survey:
         self._most_behind, self._lag_s = max(self._most_behind, self._behind), mapping.longest_lag_s
 
     def figures(self) -> LiveFigures:
-        """How the survey has kept up until now."""
         latency = None
         if self._latencies_s:
             median, high = np.percentile(self._latencies_s, [50, 99]) * 1e3
@@ -222,7 +220,6 @@ class _Survey:
         return int(np.sum(latencies_s > float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed))
 
     def say(self, phase: str, *, version: int | None = None, words: str = "") -> None:
-        """Tells the state."""
         figures, sketch = self.figures(), self._sketch
         qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
         self._tell(

@@ -21,7 +21,6 @@ class LiveViewer:
         self._image_ns = -(2**62)
 
     def tell(self, state: LiveSurveyState) -> None:
-        """The survey's state."""
         self._server.show(self._survey.shown(state))
 
     def see(self, tracked: Tracked) -> None:

@@ -7,7 +7,7 @@ import queue
 import signal
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from multiprocessing.connection import Connection
 from typing import NamedTuple, Self
 
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.live_survey import MAX_ARRAY_BYTES, NO_PART, LiveMissing, LivePart, LiveRevisit
+from fleetmap.live_survey import COVERAGE_CELL_M, MAX_ARRAY_BYTES, NO_PART, LiveMissing, LivePart, LiveRevisit
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.live.drive_quality import covered_cells, missing_directions
+from mapserver.quality.directions import tile_directions
 from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -30,6 +30,8 @@ MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 _LOOK_EVERY_S = 2.0  # at what the drive lacks
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
 _SHOW_WITHIN_S = 0.5  # a map that is behind is shown so often; one that is not, after every keyframe
+_FEW = 10  # landmarks below which a cell is not covered
+_MOST_MISSING = 64
 _NICENESS = 5  # below tracking, which answers frames
 
 
@@ -210,7 +212,6 @@ def _map(pipe: Connection) -> None:
 
 
 def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
-    """Coverage and missing directions of the part that is the map."""
     labels = growing.parts().labels
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
@@ -259,3 +260,34 @@ def thinning(count: int, most: int) -> NDArray[np.int64]:
     """At most `most` of `count` numbers, evenly, the last one included."""
     step = max(1, -(-count // most))
     return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)
+
+
+class _Cell(NamedTuple):
+    """Keyframes of a square, as `tile_directions` takes a tile."""
+
+    tile_x: int
+    tile_y: int
+    map_from_cam: Array
+
+
+def missing_directions(map_from_cam: Array) -> list[LiveMissing]:
+    """Headings that nothing looks at, where keyframes (K, 4, 4) passed the other way; by square, as `quality.directions` has it."""
+    cells_of = np.floor(map_from_cam[:, :2, 3] / COVERAGE_CELL_M).astype(np.int64)
+    cells = [
+        _Cell(int(x), int(y), map_from_cam[(cells_of == (x, y)).all(axis=1)])
+        for x, y in np.unique(cells_of, axis=0).tolist()
+    ]
+    middles = {(cell.tile_x, cell.tile_y): cell.map_from_cam[:, :2, 3].mean(axis=0).tolist() for cell in cells}
+    found = []
+    for directions in tile_directions(cells):
+        x_m, y_m = middles[directions.tile]
+        for heading, count in directions.missing.items():
+            found.append(LiveMissing(x_m=x_m, y_m=y_m, heading=heading, places=count))
+    return sorted(found, key=lambda each: -each.places)[:_MOST_MISSING]
+
+
+def covered_cells(points_map: Array, most: int) -> Array:
+    """(T, 3) x and y of squares that hold landmarks (N, 3), and how many; those with most of them."""
+    counts = Counter(map(tuple, np.floor(points_map[:, :2] / COVERAGE_CELL_M).astype(np.int64).tolist()))
+    rows = [(x, y, count) for (x, y), count in counts.most_common(most) if count >= _FEW]
+    return np.array(sorted(rows), np.float64).reshape(-1, 3)

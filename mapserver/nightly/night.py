@@ -207,7 +207,6 @@ class _Night:
         return next((info for info in reversed(drafts) if info.parent == parent), None)
 
     def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
-        """Those that no version was made of; the others are put away."""
         site = self._request.site
         known: dict[str, int] = {}
         if _has_site(self._maps, site):
@@ -292,7 +291,6 @@ class _Night:
         self._report.recordings.append({**told, "sha256": sha256, "fate": where})
 
     def _wait(self, name: str, reason: str) -> None:
-        """Says why something is left where it is."""
         self._say(f"{name}: {reason}")
         if len(self._report.waiting) < _MOST_A_NIGHT:
             self._report.waiting.append({"name": printable(name), "reason": printable(reason)})

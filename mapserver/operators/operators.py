@@ -112,7 +112,6 @@ class Operators:
         return SignIn(session)
 
     def sign_out(self, who: Identity) -> None:
-        """Ends the session that a request came with."""
         if who.proof:
             self._store.operators.end_session(who.proof, who.actor())
 

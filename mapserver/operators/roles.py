@@ -52,7 +52,6 @@ class Identity:
     is_token: bool = False
 
     def actor(self, reason: str = "") -> "Actor":
-        """As the store keeps who acts."""
         from mapserver.store import Actor
 
         return Actor(self.name, reason, f"token of {self.name}" if self.is_token else self.name, self.address)

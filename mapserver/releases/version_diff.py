@@ -89,7 +89,6 @@ def manifest_difference(
 
 
 def _landmarks(entries: Iterable[TileEntry], read_tile: TileReader) -> tuple[np.ndarray, np.ndarray]:
-    """Ids and points_map of all tiles, an id once."""
     tiles = [read_tile(entry.sha256) for entry in sorted(entries, key=lambda entry: (entry.x, entry.y))]
     ids = np.concatenate([np.zeros(0, np.uint32), *(tile.landmark_ids for tile in tiles)])
     points_map = np.concatenate([np.zeros((0, 3)), *(tile.points_map for tile in tiles)])

@@ -105,12 +105,10 @@ class BusService:
         return sorted(set(changed))
 
     def look_for_robots(self) -> None:
-        """Notes which robots are present on the bus now."""
         keys = (split_key(key) for key in self._bus.alive(robot_key("*", "*", "alive")))
         self._fleet.take_presence((site, robot) for site, robot, _ in keys)
 
     def close(self) -> None:
-        """Answers no more."""
         for handle in self._handles:
             handle.close()
 

@@ -53,7 +53,6 @@ class ByteCache:
 
     @property
     def total_bytes(self) -> int:
-        """What is held, the entries' own size included."""
         with self._lock:
             return self._bytes
 

@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import ip_address
 from operator import itemgetter
@@ -148,3 +149,31 @@ def plain_address(address: str) -> str:
     """Of IPv4 addresses in IPv6 the former, as sockets of both kinds write them."""
     found = ip_address(address.partition("%")[0])
     return str(getattr(found, "ipv4_mapped", None) or found)
+
+
+def binding_fault(
+    address: str, host: str, names: Sequence[str] = (), *, has_tls: bool = False, has_operators: bool = False
+) -> str:
+    """Why HTTP must not be served like this, and what to do: on this machine to everybody, beyond it with TLS to operators alone.
+
+    Empty where it may. address: of --http; host: its host; names: others that the server goes by, as a proxy passes them on.
+    """
+    is_local = is_loopback_name(host)
+    steps = []
+    if not is_local and not has_tls:
+        steps.append("give it a certificate with --http-cert and --http-key")
+    beyond = [name for name in names if not is_loopback_name(name)]
+    if (not is_local or beyond) and not has_operators:
+        steps.append("name who may sign in with `mapserver operators add NAME --role admin`")
+    if not steps:
+        return ""
+    where = f"--http {address}" if not is_local else f"--http-name {beyond[0]}"
+    return f"{where} is reached from other machines; {', and '.join(steps)} (or let everybody in with --insecure)"
+
+
+def is_loopback_name(host: str) -> bool:
+    """Whether a host's name or address is the machine itself."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -19,7 +19,6 @@ class LiveSurvey(NamedTuple):
 
     @property
     def is_silent(self) -> bool:
-        """Whether a survey that should still speak does not."""
         return self.state.phase == "tracking" and self.seconds_since > SILENT_S
 
 
@@ -41,7 +40,6 @@ class LiveSurveys:
                 del self._states[next(iter(self._states))]
 
     def sites(self) -> list[str]:
-        """Names of the sites of which something was heard."""
         with self._lock:
             return sorted(self._states)
 

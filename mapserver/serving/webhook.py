@@ -21,7 +21,7 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
 from mapserver.fleet.alerts import Alert, AlertSettings
-from mapserver.operators.binding import is_loopback_name
+from mapserver.serving.http_connections import is_loopback_name
 
 _ATTEMPT_S = 5.0
 _PAUSES_S = (2.0, 10.0, 60.0)  # between four attempts
@@ -49,14 +49,12 @@ class Webhook:
         self._thread.start()
 
     def put(self, body: Body) -> None:
-        """Takes a message to send; never waits."""
         try:
             self._waiting.put_nowait(to_json(body))
         except queue.Full:
             self._refusals.warning("full", "an alert is dropped: %d wait for the webhook", _MOST_WAITING)
 
     def close(self) -> None:
-        """Ends the thread; what still waits is not sent."""
         self._ended.set()
         self._thread.join(_ATTEMPT_S + 1.0)
 
@@ -81,7 +79,6 @@ class Webhook:
         )
 
     def _attempt(self, body: bytes) -> str:
-        """What went wrong, empty where it was taken."""
         made = http.client.HTTPConnection(self._host, self._port or (443 if self._secure else 80), timeout=_ATTEMPT_S)
         # A timeout of sockets begins anew with each byte: who sends them one by one would hold us for ever.
         watch = threading.Timer(_ATTEMPT_S, _cut, (made,))

@@ -28,58 +28,31 @@ MAX_ARCHIVE_PAYLOAD_BYTES = (1 << 32) - 1
 _FREE_BYTES, _MOST_TIMES_SMALLER = 64 << 20, 64
 _LEVEL = 3  # written once, hardly ever read, and large: speed counts more than size
 _HEAD_SIZE = struct.Struct("<I")
-_DTYPES = {
-    "body_from_cam": "<f8",
-    "keyframe_stamps_ns": "<i8",
-    "map_from_body": "<f8",
-    "landmark_ids": "<u4",
-    "points_map": "<f8",
-    "descriptors": "|u1",
-    "point_sigma_m": "<f8",
-    "obs_keyframe": "<i4",
-    "obs_landmark": "<i4",
-    "obs_pixels": "<f8",
-    "obs_octave": "|i1",
-    "obs_sigma_px": "<f8",
-    "trajectory_estimated": "|b1",
-    "patches": "|u1",
-    "trajectory_stamps_ns": "<i8",
-    "trajectory_frame_from_body": "<f8",
+# Dtype and shape by docs of SurveyMap: letters are lengths that arrays share. Patches are square, of any side.
+_ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "body_from_cam": ("<f8", (4, 4)),
+    "keyframe_stamps_ns": ("<i8", ("K",)),
+    "map_from_body": ("<f8", ("K", 4, 4)),
+    "landmark_ids": ("<u4", ("N",)),
+    "points_map": ("<f8", ("N", 3)),
+    "descriptors": ("|u1", ("N", 32)),
+    "point_sigma_m": ("<f8", ("N",)),
+    "obs_keyframe": ("<i4", ("M",)),
+    "obs_landmark": ("<i4", ("M",)),
+    "obs_pixels": ("<f8", ("M", 3)),
+    "obs_octave": ("|i1", ("M",)),
+    "obs_sigma_px": ("<f8", ("M", 2)),
+    "patches": ("|u1", ("N", "P", "P")),
+    "trajectory_estimated": ("|b1", ("F",)),
+    "trajectory_stamps_ns": ("<i8", ("F",)),
+    "trajectory_frame_from_body": ("<f8", ("F", 4, 4)),
+    "keyframe_ids": ("<u4", ("K",)),
+    "is_place": ("|b1", ("K",)),
+    "landmark_expected": ("<u4", ("N",)),
+    "landmark_seen": ("<u4", ("N",)),
+    "landmark_missed": ("<u4", ("N",)),
 }
-_HISTORY_DTYPES = {
-    "keyframe_ids": "<u4",
-    "is_place": "|b1",
-    "landmark_expected": "<u4",
-    "landmark_seen": "<u4",
-    "landmark_missed": "<u4",
-}
-_ALL_DTYPES = {1: _DTYPES, 2: _DTYPES | _HISTORY_DTYPES}
-
-
-# Shapes by docs of SurveyMap: letters are lengths that arrays share. Patches are square, of any side.
-_SHAPES: dict[str, tuple[int | str, ...]] = {
-    "body_from_cam": (4, 4),
-    "keyframe_stamps_ns": ("K",),
-    "map_from_body": ("K", 4, 4),
-    "landmark_ids": ("N",),
-    "points_map": ("N", 3),
-    "descriptors": ("N", 32),
-    "point_sigma_m": ("N",),
-    "obs_keyframe": ("M",),
-    "obs_landmark": ("M",),
-    "obs_pixels": ("M", 3),
-    "obs_octave": ("M",),
-    "obs_sigma_px": ("M", 2),
-    "trajectory_estimated": ("F",),
-    "trajectory_stamps_ns": ("F",),
-    "trajectory_frame_from_body": ("F", 4, 4),
-    "patches": ("N", "P", "P"),
-    "keyframe_ids": ("K",),
-    "is_place": ("K",),
-    "landmark_expected": ("N",),
-    "landmark_seen": ("N",),
-    "landmark_missed": ("N",),
-}
+_HISTORY = frozenset(list(_ARRAYS)[-5:])  # format 1 knew none
 
 
 class _ArrayHead(msgspec.Struct, frozen=True):
@@ -98,15 +71,15 @@ class _Head(msgspec.Struct, frozen=True):
 
 def encode_archive(survey: SurveyMap) -> bytes:
     """The survey's bytes, without loss."""
-    dtypes, history = _ALL_DTYPES[ARCHIVE_FORMAT], history_of(survey)
-    arrays = {name: np.ascontiguousarray(values, dtypes[name]) for name, values in _arrays(survey, history).items()}
+    history = history_of(survey)
+    arrays = {name: np.ascontiguousarray(_array(survey, history, name), dtype) for name, (dtype, _) in _ARRAYS.items()}
     head = to_json(
         {
             "camera": asdict(survey.camera),
             "scale_known": survey.scale_known,
             "next_keyframe_id": history.next_keyframe_id,
             "next_landmark_id": history.next_landmark_id,
-            "arrays": [{"name": n, "dtype": dtypes[n], "shape": list(a.shape)} for n, a in arrays.items()],
+            "arrays": [{"name": n, "dtype": _ARRAYS[n][0], "shape": list(a.shape)} for n, a in arrays.items()],
         }
     )
     body = [array.tobytes() for array in arrays.values()]
@@ -127,10 +100,10 @@ def decode_archive(data: bytes) -> SurveyMap:
     limit = min(MAX_ARCHIVE_PAYLOAD_BYTES, _FREE_BYTES + _MOST_TIMES_SMALLER * len(data))
     number, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", limit)
     head, offset = _read_head(payload)
-    dtypes = _ALL_DTYPES[number]
+    expected = _ARRAYS.keys() - (_HISTORY if number == 1 else set())
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
-        if dtypes.get(entry.name) != entry.dtype or entry.name in arrays:
+        if entry.name not in expected or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
             reason = f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
             raise MapFormatError(reason)
         count = prod(entry.shape)
@@ -139,8 +112,8 @@ def decode_archive(data: bytes) -> SurveyMap:
             raise MapFormatError(f"archive: array {entry.name} of {entry.shape} does not fit in {len(payload)} bytes")
         arrays[entry.name] = np.frombuffer(payload, entry.dtype, count, offset).reshape(entry.shape).copy()
         offset = end
-    if offset != len(payload) or len(arrays) != len(dtypes):
-        missing = sorted(set(dtypes) - set(arrays))
+    if offset != len(payload) or len(arrays) != len(expected):
+        missing = sorted(expected - arrays.keys())
         reason = f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
         raise MapFormatError(reason)
     if number == 1:
@@ -148,20 +121,21 @@ def decode_archive(data: bytes) -> SurveyMap:
     _check(arrays)
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
     fields: dict[str, Any] = {"camera": head.camera, "scale_known": head.scale_known, "trajectory": trajectory}
-    fields |= {name: values for name, values in arrays.items() if name not in _HISTORY_DTYPES}
-    remembered: dict[str, Any] = {name: values for name, values in arrays.items() if name in _HISTORY_DTYPES}
+    remembered: dict[str, Any] = {name: arrays.pop(name) for name in _HISTORY & arrays.keys()}
     if remembered:
-        fields["history"] = History(
-            **remembered, next_keyframe_id=head.next_keyframe_id, next_landmark_id=head.next_landmark_id
-        )
-    return SurveyMap(**fields)
+        next_ids: dict[str, Any] = {
+            "next_keyframe_id": head.next_keyframe_id,
+            "next_landmark_id": head.next_landmark_id,
+        }
+        fields["history"] = History(**remembered, **next_ids)
+    return SurveyMap(**fields | arrays)
 
 
 def _check(arrays: dict[str, AnyArray]) -> None:
     """Raises MapFormatError for arrays that do not fit each other: an archive may come from elsewhere, and builds index by it."""
     lengths: dict[int | str, int] = {}
     for name, array in arrays.items():
-        shape = _SHAPES[name]
+        shape = _ARRAYS[name][1]
         expected = tuple(
             size if isinstance(size, int) else lengths.setdefault(size, length)
             for size, length in zip(shape, array.shape, strict=False)
@@ -175,14 +149,12 @@ def _check(arrays: dict[str, AnyArray]) -> None:
             raise MapFormatError(f"archive: {name} is beyond 0 to {most - 1}; it is damaged")
 
 
-def _arrays(survey: SurveyMap, history: History) -> dict[str, AnyArray]:
-    arrays = {name: getattr(survey, name) for name in _DTYPES if not name.startswith("trajectory_")}
-    return arrays | {
-        "trajectory_estimated": survey.trajectory_estimated,
-        "trajectory_stamps_ns": survey.trajectory.stamps_ns,
-        "trajectory_frame_from_body": survey.trajectory.frame_from_body,
-        **{name: getattr(history, name) for name in _HISTORY_DTYPES},
-    }
+def _array(survey: SurveyMap, history: History, name: str) -> AnyArray:
+    source: Any = history if name in _HISTORY else survey
+    if name in ("trajectory_stamps_ns", "trajectory_frame_from_body"):
+        source, name = survey.trajectory, name.removeprefix("trajectory_")
+    values: AnyArray = getattr(source, name)
+    return values
 
 
 def _read_head(payload: bytes) -> tuple[_Head, int]:

@@ -63,11 +63,9 @@ class BlobFolder:
         return digest.hexdigest() == sha256
 
     def path(self, sha256: str) -> Path:
-        """The file of an address."""
         return self._root / blob_path(sha256)
 
     def addresses(self) -> set[str]:
-        """The addresses of all files, whatever they hold."""
         return {path.name for path in self._files() if _is_address(path)}
 
     def unreferenced(self) -> list[Path]:
@@ -97,7 +95,6 @@ class BlobFolder:
                 write_atomically(path, chunks)
 
     def links(self) -> list[Path]:
-        """Symbolic links where files and folders should be."""
         folder = self._root / _FOLDER
         candidates = [folder] if folder.is_symlink() else [*folder.glob("*"), *self._inner(os.DirEntry.is_symlink)]
         return sorted(path for path in candidates if path.is_symlink())

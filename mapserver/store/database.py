@@ -12,7 +12,7 @@ from urllib.parse import quote
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
-from mapserver.store.access.chain import COLUMNS, AuditLine, line_sha256
+from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sha256
 from mapserver.store.files import sync_folder
 from mapserver.store.rows import LogEntry
 from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
@@ -50,7 +50,6 @@ class Transactions:
             raise StoreError(f"the store {path} cannot be read ({error}); check its disk") from error
 
     def close(self) -> None:
-        """Closes the database; nothing here must be used afterwards."""
         with self._lock, self._reading:
             self._reader.close()
             self._database.close()  # the last one tidies up the write-ahead log
@@ -91,16 +90,18 @@ class Transactions:
     def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
         """One line of the log, chained to the one before it, within a transaction; site: empty where it is about none."""
         actor = entry.actor
-        last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone() or (0, "")
-        values: tuple[object, ...] = (last[0] + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
+        last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone()
+        number, before = last or (0, "")
+        if number and not before:  # all lines are from before the chain: the first chained one covers them
+            before = chain_head(self.audit_lines())
+        values: tuple[object, ...] = (number + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
         values += (actor.name, actor.reason, actor.operator, actor.address)
         connection.execute(
             f"INSERT INTO events ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, line_sha256(last[1], values)),
+            (*values, line_sha256(before, values)),
         )
 
     def audit_lines(self, last: int | None = None) -> list[AuditLine]:
-        """The whole log, oldest line first, or the last lines of it."""
         rows = self.rows(
             AuditLine, f"SELECT {COLUMNS} FROM events ORDER BY id DESC LIMIT ?", (-1 if last is None else last,)
         )
@@ -108,7 +109,6 @@ class Transactions:
 
 
 def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:
-    """A prepared connection, usable from any thread under one lock."""
     connection = sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?{options}",
         timeout=_BUSY_TIMEOUT_MS / 1000,

@@ -141,7 +141,6 @@ def locked(path: Path, *, shared: bool) -> Iterator[None]:
 
 
 def _open_own(path: Path, flags: int) -> int:
-    """A file that is made if it is not there, for its owner alone."""
     return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE)
 
 

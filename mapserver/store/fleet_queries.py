@@ -57,7 +57,6 @@ class FleetBatch:
     last_reports: LastReports = field(default_factory=dict)
 
     def add(self, site: str, axis: str, key: str, hour: int, counts: Counters) -> None:
-        """Adds to one sum."""
         self.counters.setdefault((site, axis, key, hour), Counters()).add(counts)
 
 
@@ -141,7 +140,6 @@ class FleetQueries:
         return {row.pop("hour"): Counters(**row) for row in rows}
 
     def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
-        """Failures, the last to arrive first, of numbers below `before`."""
         return self._transactions.rows(
             FailureRow,
             f"""SELECT {_FAILURE_COLUMNS} FROM failures
@@ -206,7 +204,6 @@ class FleetQueries:
         return bytes(rows[0]["mcap"])
 
     def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
-        """Where a robot was, oldest first."""
         return self._transactions.rows(
             TraceRow,
             f"""SELECT k.site, k.key robot, {_TRACE_COLUMNS}
@@ -284,11 +281,16 @@ def _add_counters(
     connection.executemany(_ADD, [(ids[key[:3]], key[3], *counts.values()) for key, counts in ordered])
 
 
+def _newest_beyond(rows: list[tuple[int, int]], keep: float) -> int | None:
+    """The newest number whose size, with those of all newer ones, is beyond `keep`. rows: number and size, the newest first."""
+    sums = accumulate(size for _, size in rows)
+    return next((number for (number, _), kept in zip(rows, sums, strict=True) if kept > keep), None)
+
+
 def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
     """Whole hours go, the oldest first, until at most `keep` rows stay (the running hour stays whatever it holds)."""
     hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
-    sums = accumulate(count for _, count in hours)
-    last = next((hour for (hour, _), kept in [*zip(hours, sums, strict=True)][1:] if kept > keep), None)
+    last = _newest_beyond(hours[1:], keep - hours[0][1]) if hours else None
     return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
 
 
@@ -308,8 +310,7 @@ def _sum_of_pictures(connection: sqlite3.Connection) -> int:
 def _prune_replays(connection: sqlite3.Connection, keep_bytes: int, newest: int) -> None:
     """The oldest recordings go until keep_bytes stay."""
     sizes = connection.execute("SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC").fetchall()
-    sums = accumulate(size for _, size in sizes)
-    last = next((number for (number, _), kept in zip(sizes, sums, strict=True) if kept > keep_bytes), None)
+    last = _newest_beyond(sizes, keep_bytes)
     connection.execute("DELETE FROM failure_replays WHERE number <= ? AND number <> ?", (last, newest))
 
 
@@ -317,6 +318,5 @@ def _prune_pictures(connection: sqlite3.Connection, keep_bytes: float) -> int:
     sizes = connection.execute(
         "SELECT number, sum(length(jpeg)) FROM failure_pictures GROUP BY number ORDER BY number DESC"
     ).fetchall()
-    sums = accumulate(size for _, size in sizes)
-    last = next((number for (number, _), kept in zip(sizes, sums, strict=True) if kept > keep_bytes), None)
+    last = _newest_beyond(sizes, keep_bytes)
     return connection.execute("DELETE FROM failure_pictures WHERE number <= ?", (last,)).rowcount

@@ -9,16 +9,17 @@
 Bytes are on the disk before the transaction that mentions them, so a crash leaves at most files that nothing mentions.
 """
 
+import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import NewerFormatError, StateError, StoreError
+from fleetmap.errors import MapFormatError, NewerFormatError, StateError, StoreError, disk_errors
 from fleetmap.mapformat import (
     BlobEntry,
     Manifest,
@@ -31,10 +32,10 @@ from fleetmap.mapformat import (
     encode_tile,
 )
 from fleetmap.mapformat.building import BUILDING_KEY
-from fleetmap.mapformat.version_file import ExportHead, open_export
+from fleetmap.mapformat.version_file import BlobKind, ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
+from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import is_older
-from mapserver.store.export_import import export_chunks, export_head, write_export
 from mapserver.store.files import (
     check_no_link,
     is_plain_file,
@@ -43,7 +44,6 @@ from mapserver.store.files import (
     make_folder,
     make_own_file,
     read_file,
-    release_reserve,
     sync_folder,
     write_atomically,
 )
@@ -121,13 +121,7 @@ class MapStore(StoreQueries):
             reason = f"the store {path} cannot be opened ({error}); check the path, its rights and space"
             raise StoreError(reason) from error
 
-    @classmethod
-    def release_reserve(cls, path: Path) -> bool:
-        """Gives back the space that the store in folder `path` holds for a full disk; False where there is none any more."""
-        return release_reserve(path)
-
     def close(self) -> None:
-        """Closes the database; the store must not be used afterwards."""
         self._transactions.close()
 
     def __enter__(self) -> Self:
@@ -137,7 +131,6 @@ class MapStore(StoreQueries):
         self.close()
 
     def save_draft(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> int:
-        """The number of a new draft; as `save`."""
         return self.save(site, content, actor=actor).version
 
     def save(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> VersionInfo:
@@ -248,7 +241,6 @@ class MapStore(StoreQueries):
             self._blobs.get(sha256)
 
     def verify(self) -> StoreFindings:
-        """What is wrong with the store; reads all of it."""
         with self._disk_errors():
             return verify(self._root, self._transactions, self._blobs)
 
@@ -266,19 +258,31 @@ class MapStore(StoreQueries):
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Writes a version into one file and returns its size; errors as of `manifest`, StoreError for the disk."""
-        return write_export(path, self._export_head(site, version, archive=archive), self._blobs)
+        head = self._export_head(site, version, archive=archive)
+        with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
+            write_atomically(path, _export_chunks(head, self._blobs))
+            return path.stat().st_size
 
     def version_file(self, site: str, version: int) -> tuple[ExportHead, Callable[[], Iterator[bytes]]]:
         """The file of a version without its archive: its head, and its bytes in pieces, the same ones every time."""
         head = self._export_head(site, version, archive=False)
-        return head, lambda: export_chunks(head, self._blobs)
+        return head, lambda: _export_chunks(head, self._blobs)
 
     def _export_head(self, site: str, version: int, *, archive: bool) -> ExportHead:
-        info = self.version(site, version)
+        info, manifest = self.version(site, version), self.manifest(site, version)
+        entries = [ExportBlob(kind="manifest", sha256=info.manifest_sha256, bytes=info.manifest_bytes)]
+        entries.append(
+            ExportBlob(kind="vocabulary", sha256=manifest.vocabulary.sha256, bytes=manifest.vocabulary.bytes)
+        )
+        tiles = {tile.sha256: tile.bytes for tile in manifest.tiles}
+        entries += [ExportBlob(kind="tile", sha256=sha256, bytes=size) for sha256, size in tiles.items()]
         kept = extras(self._transactions, site, version) if archive else []
         if archive and info.archive_sha256 is not None:
             kept.append(("archive", info.archive_sha256))
-        return export_head(info, self.manifest(site, version), self._blobs, kept)
+        for kind, sha256 in kept:
+            size = sum(len(chunk) for chunk in self._blobs.chunks(sha256))
+            entries.append(ExportBlob(kind=cast(BlobKind, kind), sha256=sha256, bytes=size))
+        return ExportHead(site=site, version=version, blobs=tuple(entries))
 
     def import_version(self, path: Path, *, actor: Actor = NOBODY) -> VersionInfo:
         """Takes a version out of an export file, as a draft of its site with its own number; publishing comes after.
@@ -384,3 +388,20 @@ class MapStore(StoreQueries):
             yield
         except OSError as error:
             raise StoreError(f"{error.filename or self._root}: {error.strerror}; check the store's disk") from error
+
+
+def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
+    """The bytes of the file in pieces; MapFormatError, before its end, for damaged bytes in the store."""
+    start = head.start()
+    whole = hashlib.sha256(start)
+    yield start
+    for blob in head.blobs:
+        own, size = hashlib.sha256(), 0
+        for chunk in blobs.chunks(blob.sha256):
+            own.update(chunk)
+            whole.update(chunk)
+            size += len(chunk)
+            yield chunk
+        if own.hexdigest() != blob.sha256 or size != blob.bytes:
+            raise MapFormatError(f"{blob.kind} {blob.sha256} in the store is damaged; run `mapserver verify`")
+    yield whole.digest()

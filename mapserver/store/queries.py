@@ -55,15 +55,12 @@ class StoreQueries:
 
     @property
     def folder(self) -> Path:
-        """Where the store is."""
         return self._root
 
     def now_ns(self) -> int:
-        """The store's clock, nanoseconds since 1970."""
         return self._clock_ns()
 
     def robot_names(self) -> set[tuple[str, str]]:
-        """Site and name of every robot that is kept."""
         return {(row["site"], row["robot"]) for row in self._transactions.query("SELECT site, robot FROM robots")}
 
     def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
@@ -82,7 +79,6 @@ class StoreQueries:
         return removed
 
     def sites(self) -> list[SiteInfo]:
-        """All sites by name."""
         return self._transactions.rows(
             SiteInfo,
             """SELECT s.site, (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
@@ -152,12 +148,10 @@ class StoreQueries:
         return None if sha256 is None else self._blobs.get(sha256)
 
     def site_file_kinds(self, site: str) -> list[str]:
-        """What kinds of files a site keeps, in order."""
         rows = self._transactions.query("SELECT kind FROM site_files WHERE site = ? ORDER BY kind", (site,))
         return [row["kind"] for row in rows]
 
     def site_file_sha256(self, site: str, kind: str) -> str | None:
-        """The address of what `site_file` reads."""
         rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))
         return rows[0]["sha256"] if rows else None
 
@@ -237,7 +231,6 @@ class StoreQueries:
         return canaries(self._transactions, site, running=running)
 
     def last_events(self, site: str, limit: int) -> list[Event]:
-        """The last of a site's history, newest first."""
         return self._transactions.rows(
             Event, f"SELECT {_EVENT} FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit)
         )
@@ -279,7 +272,6 @@ class StoreQueries:
             )
 
     def running_jobs(self) -> list[JobInfo]:
-        """Jobs whose row says that they run, oldest first."""
         return self._jobs("WHERE state = 'running' ORDER BY id", ())
 
     def last_night(self, site: str) -> JobInfo | None:
@@ -308,7 +300,6 @@ class StoreQueries:
             keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
 
     def begin_job(self, site: str, kind: str) -> int:
-        """The number of a new running job."""
         with self._transactions.write() as connection:
             done = connection.execute(
                 "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",

@@ -172,7 +172,6 @@ class FailureRow:
 
     @property
     def where(self) -> str | None:
-        """The area's name, or the tile where no area is."""
         return self.area or (None if self.tile is None else f"tile {self.tile}")
 
 

@@ -63,7 +63,6 @@ def _links(folder: Path) -> list[Path]:
 
 
 def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
-    """The addresses whose bytes are whole."""
     rows = transactions.query(
         """SELECT sha256 FROM version_blobs UNION SELECT sha256 FROM site_files
            UNION SELECT sha256 FROM grid_blobs UNION SELECT sha256 FROM surfel_blobs"""
@@ -111,7 +110,6 @@ def _figures_of(manifest: Manifest) -> tuple[object, ...]:
 
 
 def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteReleases) -> list[str]:
-    """Faults of a site's row and of the record of what was current."""
     faults, name = [], f"site {rows.site}"
     if rows.versions and max(rows.versions) > site["last_version"]:
         faults.append(f"{name}: version {max(rows.versions)} is beyond the last number {site['last_version']}")

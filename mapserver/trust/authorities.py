@@ -68,22 +68,18 @@ class Authorities:
 
     @property
     def are_there(self) -> bool:
-        """Whether a server can speak mutual TLS from here."""
         return all(path.is_file() for path in (self.tls.authority, self.tls.own))
 
     @property
     def tls(self) -> TlsFiles:
-        """Files of the server."""
         return TlsFiles(self._path(f"{ROBOTS_CA}.crt"), self._path(f"{SERVER}.pem"))
 
     @property
     def servers(self) -> str:
-        """PEM of who signs servers."""
         return self._read(f"{SERVERS_CA}.crt").decode()
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """The names that robots may reach the server by."""
         certificate = x509.load_pem_x509_certificate(self._read(f"{SERVER}.pem"))
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         return tuple(str(name.value) for name in names)
@@ -133,7 +129,6 @@ class Authorities:
         return key_pem(key, None) + self._robots_ca().sign(key.public_key(), name, DAYS[purpose])
 
     def days_left(self) -> dict[str, float]:
-        """By file, how long each certificate lasts."""
         files = [f"{SERVERS_CA}.crt", f"{ROBOTS_CA}.crt", f"{SERVER}.pem"]
         ends = {file: certificate_info(self._read(file)).ends for file in files}
         return {file: (end - self._now).total_seconds() / 86_400 for file, end in ends.items()}

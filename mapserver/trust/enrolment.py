@@ -52,7 +52,6 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def certificate(self) -> str:
-        """Name in its certificates."""
         return self._named(self.mark)
 
     @property
@@ -102,7 +101,6 @@ class RobotRegister:
 
     @property
     def authorities(self) -> Authorities:
-        """Who signs the robots' certificates and the server's."""
         return Authorities(self._keys, datetime.fromtimestamp(self._store.now_ns() / 1e9, UTC))
 
     @property
@@ -144,7 +142,6 @@ class RobotRegister:
         return (_stamp(self._path), self.tls_state())
 
     def tls_state(self) -> object:
-        """The same of the certificates alone."""
         tls = self.authorities.tls
         return (_stamp(tls.authority), _stamp(tls.own))
 

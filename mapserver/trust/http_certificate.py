@@ -104,7 +104,6 @@ def check_times(path: Path, certificate: "x509.Certificate", now: datetime, step
 
 
 def _names(certificate: "x509.Certificate") -> frozenset[str]:
-    """The DNS names and addresses that a certificate is for."""
     from cryptography import x509
 
     try:

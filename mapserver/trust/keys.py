@@ -84,7 +84,6 @@ class KeyFolder:
         self.folder = folder
 
     def has(self, name: str) -> bool:
-        """Whether the key is here, for this account."""
         return os.access(self.path(name), os.R_OK)
 
     def signer(self, name: str) -> "CryptoSigner | None":
@@ -108,7 +107,6 @@ class KeyFolder:
                 path.replace(path.with_suffix(f".{secrets.token_hex(4)}.old"))
 
     def path(self, name: str) -> Path:
-        """The key's file."""
         return self.folder / f"{name}.pem"
 
 

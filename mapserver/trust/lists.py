@@ -76,7 +76,6 @@ class SignedLists:
 
     @property
     def are_there(self) -> bool:
-        """Whether the store's maps are signed at all."""
         return (self.folder / "1.root.json").is_file()
 
     def file(self, site: str, name: str) -> bytes:
@@ -91,11 +90,9 @@ class SignedLists:
             return b""
 
     def newest(self, role: str) -> int:
-        """Number of the newest file of a role, 0 where there is none."""
         return max(self.numbers(role), default=0)
 
     def numbers(self, role: str) -> list[int]:
-        """Numbers of a role's files, in order."""
         found = (_NUMBERED.fullmatch(path.name) for path in self.folder.glob(f"*.{role}.json"))
         return sorted(int(name[1]) for name in found if name is not None and name[2] == role)
 
@@ -147,7 +144,6 @@ class SignedLists:
         return found
 
     def path(self, role: str, number: int) -> Path:
-        """The file of a role's number."""
         return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
 
     def site_list(self, site: str, number: int) -> SiteList:

@@ -1,11 +1,13 @@
 """`mapserver versions`, `inspect` and `diff`: the versions of a site, the content of one, the differences between two."""
 
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapserver.commands.options import Json, SiteName, StoreFolder, print_json
+from fleetmap.errors import UsageError
+from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_json
 
 if TYPE_CHECKING:
     from fleetmap.mapformat import Manifest
@@ -18,9 +20,8 @@ def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from mapserver.store import MapStore
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         infos = maps.versions(site)
         trusted = {info.version: maps.trusted(info) for info in infos}
     if json:
@@ -47,9 +48,7 @@ def inspect(
     json: Json = False,
 ) -> None:
     """Show a version: sizes, recordings and what was found in them, the gate's verdicts, history. --json has the whole manifest."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         info = _chosen(maps, site, version)
         manifest = maps.manifest(site, info.version)
         verdicts = maps.verdicts(site, info.version)
@@ -61,8 +60,6 @@ def inspect(
 
 
 def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
-    from fleetmap.errors import UsageError
-
     if version is not None:
         return maps.version(site, version)
     infos = maps.versions(site)
@@ -141,8 +138,6 @@ def _print_words(
 
 
 def _moment(stamp_ns: int) -> str:
-    from datetime import UTC, datetime
-
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="seconds")
 
 
@@ -155,9 +150,8 @@ def diff(
 ) -> None:
     """Show the differences from version A to version B: tiles, landmarks, bytes to fetch, quality side by side."""
     from mapserver import releases
-    from mapserver.store import MapStore
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = releases.difference(maps, site, before, after)
     if json:
         print_json(found)

@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from mapserver.commands.options import ActorOptions, SiteName, SiteOptions, StoreFolder
+from fleetmap.errors import UsageError
+from mapserver.commands.options import ActorOptions, SiteName, SiteOptions, StoreFolder, open_store
 
 
 @expand_options
@@ -32,10 +33,9 @@ def publish(
     from mapserver.quality.directions import one_way_words
     from mapserver.quality.probes import lookalike_words
     from mapserver.releases import rules
-    from mapserver.store import MapStore
 
     gate = settings_of(context).gate
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         draft = rules.chosen_draft(maps.releases(where.site), version)
         if trust:
             draft = releases.trust_calibration(maps, draft, by.named())
@@ -73,11 +73,10 @@ def promote(
     With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or rolls it back.
     """
     from mapserver import releases
-    from mapserver.store import MapStore
 
     share = None if canary is None else _share(canary)
     gate = settings_of(context).gate
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         if share is None:
             releases.promote(maps, where.site, version, actor=by.named())
             typer.echo(f"site {where.site}: version {version} is current")
@@ -90,8 +89,6 @@ def promote(
 
 
 def _share(text: str) -> float:
-    from fleetmap.errors import UsageError
-
     try:
         share = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
     except ValueError:
@@ -105,8 +102,7 @@ def _share(text: str) -> float:
 def rollback(site: SiteName, store: StoreFolder, by: ActorOptions) -> None:
     """Make the previous version current again; the current one retires."""
     from mapserver import releases
-    from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         version = releases.roll_back(maps, site, actor=by.named())
     typer.echo(f"site {site}: version {version} is current again")

@@ -9,7 +9,7 @@ import typer
 
 from fleetmap.cli_options import expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, open_store, print_json
 
 if TYPE_CHECKING:
     from fleetmap.geometry import Array
@@ -54,12 +54,11 @@ def align(
     """Find where the map lies in the drawing of its building, and keep it; robots learn it by the signed list."""
     from fleetmap.mapformat.building import ALIGNMENT
     from mapserver.floor_plan.alignment import PLAN, encode_alignment
-    from mapserver.store import MapStore
 
     named = given.plan is not None or bool(given.pin)
     if shown.show + forget + named != 1:
         raise UsageError("name --pin (and --plan) to align, --show to print what is kept, or --forget")
-    with MapStore.open(where.store, read_only=shown.show) as maps:
+    with open_store(where.store, read_only=shown.show) as maps:
         corners = _corners(maps, where.site)
         if forget:
             maps.keep_site_files(where.site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=by.named())

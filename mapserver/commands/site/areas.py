@@ -7,7 +7,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, check_output, print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, check_output, open_store, print_json
 
 
 @expand_options
@@ -20,13 +20,12 @@ def import_(
     from fleetmap.mapformat.building import AREAS
     from mapserver.floor_plan.areas import MAX_AREAS_BYTES, read_areas
     from mapserver.grid.masks import check_masks_on_map
-    from mapserver.store import MapStore
 
     with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
         data = opened.read(MAX_AREAS_BYTES + 1)
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         alignment, current = maps.alignment(where.site), maps.current(where.site)
         if current is not None:
             areas = read_areas(data, None if alignment is None else alignment.frame)
@@ -40,9 +39,8 @@ def import_(
 def remove(where: SiteOptions, by: ActorOptions) -> None:
     """Forget the areas of a site; what was counted for them stays."""
     from fleetmap.mapformat.building import AREAS
-    from mapserver.store import MapStore
 
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         maps.keep_site_files(where.site, {AREAS: None}, "no areas", actor=by.named())
     typer.echo(f"site {where.site} has no areas")
 
@@ -50,9 +48,7 @@ def remove(where: SiteOptions, by: ActorOptions) -> None:
 @expand_options
 def list_(where: SiteOptions, json: Json = False) -> None:
     """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(where.store, read_only=True) as maps:
+    with open_store(where.store, read_only=True) as maps:
         maps.current(where.site)  # an unknown site is not an empty one
         areas = maps.areas(where.site)
     if json:
@@ -78,16 +74,13 @@ def export(
     from fleetmap.occupancy_grid import write_grid
     from mapserver.floor_plan.areas import MaskKind
     from mapserver.grid.masks import mask_grid
-    from mapserver.store import MapStore
 
     asked = {MaskKind.KEEP_OUT: keep_out, MaskKind.SPEED: speed}
     if not any(asked.values()):
         raise UsageError("name a file by --keep-out or --speed")
     for kind, file in asked.items():
-        check_output(f"--{kind.value}", file)
-        if file is not None and file.suffix != ".yaml":
-            raise UsageError(f"--{kind.value} {file} must end in .yaml")
-    with MapStore.open(where.store, read_only=True) as maps:
+        check_output(f"--{kind.value}", file, ".yaml")
+    with open_store(where.store, read_only=True) as maps:
         maps.current(where.site)
         areas = maps.areas(where.site)
     grids = {file: mask_grid(areas, kind) for kind, file in asked.items() if file is not None}

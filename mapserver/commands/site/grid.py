@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import Group
-from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import SiteName, StoreFolder, check_output, version_named
+from fleetmap.errors import disk_errors
+from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, version_named
 
 RobotHeight = Annotated[
     float, typer.Option(metavar="METRES", help="Height of the tallest robot: what hangs higher is no obstacle.")
@@ -28,19 +28,16 @@ def export(
     ] = None,
 ) -> None:
     """Write the occupancy grid of a version as nav2's map_server reads it, in the frame of the map that robots use."""
-    check_output("OUT.yaml", file)
+    check_output("OUT.yaml", file, ".yaml")
     check_output("--heights", heights)
-    if file.suffix != ".yaml":
-        raise UsageError(f"{file} must end in .yaml")
     import numpy as np
 
     from fleetmap.mapformat.grid_tile import CELL_M
     from fleetmap.occupancy_grid import FREE, OCCUPIED, write_grid
     from fleetmap.version_grid import grid_of, occupancy
     from mapserver.grid.site_grid import area_m2, height_map
-    from mapserver.store import MapStore
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         version = version_named(maps, site, version)
         tiles = grid_of(maps.manifest(site, version), maps.blob)
     grid = occupancy(tiles, robot_height)

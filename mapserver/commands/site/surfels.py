@@ -7,34 +7,33 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import Group, TopicNames, expand_options
-from fleetmap.errors import StateError, UsageError, disk_errors
-from mapserver.commands.options import SiteName, StoreFolder, check_output
+from fleetmap.errors import StateError, UsageError
+from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, write_output
+
+SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")]
+SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")]
 
 
 def splats(
-    version: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
+    version: SurfelVersion,
+    file: SplatFile,
     site: SiteName,
     store: StoreFolder,
 ) -> None:
     """Write the surfels of a version as 3D Gaussians, in the frame of the map, for viewers of Gaussian splats."""
-    check_output("FILE", file)
-    if file.suffix not in (".ply", ".spz"):
-        raise UsageError(f"{file} must end in .ply or .spz")
-    from mapserver.store import MapStore
+    check_output("FILE", file, ".ply", ".spz")
     from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
     from mapserver.surfels.surfel_map import surfels_of
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         surfels = surfels_of(maps.manifest(site, version), maps.blob)
     data = (splat_spz if file.suffix == ".spz" else splat_ply)(Splats.of(surfels))
-    with disk_errors(f"{file} cannot be written", "choose another place"):
-        file.write_bytes(data)
+    write_output(file, data)
     typer.echo(f"site {site}: {len(surfels)} surfels of version {version} are in {file}, {len(data) / 1e6:.1f} MB")
 
 
 def changes(
-    before: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
+    before: SurfelVersion,
     after: Annotated[int, typer.Argument(min=1, help="Another one.")],
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="File to write, .png or .geojson; replaced if it exists.")
@@ -43,20 +42,15 @@ def changes(
     store: StoreFolder,
 ) -> None:
     """Write what appeared and what vanished between two versions, as a plan in the frame of the map or as GeoJSON."""
-    check_output("FILE", file)
-    if file.suffix not in (".png", ".geojson"):
-        raise UsageError(f"{file} must end in .png or .geojson")
-
+    check_output("FILE", file, ".png", ".geojson")
     from fleetmap.encoding import to_json
     from mapserver.serving.expected_views import SurfelChanges
-    from mapserver.store import MapStore
     from mapserver.surfels.changes import APPEARED, CELL_M, VANISHED, changes_geojson, changes_png
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = SurfelChanges(maps).between(site, before, after)
     data = changes_png(found) if file.suffix == ".png" else to_json(changes_geojson(found))
-    with disk_errors(f"{file} cannot be written", "choose another place"):
-        file.write_bytes(data)
+    write_output(file, data)
     x, y = found.corner_m
     said = ", ".join(
         f"{sum(patch.kind == kind for patch in found.patches)} patches {kind} ({found.area_m2(kind):.2f} m2)"
@@ -79,28 +73,25 @@ class RefineOptions:
 
 @expand_options
 def refine(
-    version: Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")],
+    version: SurfelVersion,
     recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")],
+    file: SplatFile,
     site: SiteName,
     store: StoreFolder,
     options: RefineOptions,
 ) -> None:
     """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
-    check_output("FILE", file)
-    if file.suffix not in (".ply", ".spz"):
-        raise UsageError(f"{file} must end in .ply or .spz")
+    check_output("FILE", file, ".ply", ".spz")
     import numpy as np
 
     from fleetmap.recordings import OpenOptions, named_topics, open_recording
-    from mapserver.store import MapStore
     from mapserver.store.archive import decode_archive
     from mapserver.surfels.refinement import looks_of
     from mapserver.surfels.refinement import refine as refined_by
     from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
     from mapserver.surfels.surfel_map import surfels_of
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         manifest = maps.manifest(site, version)
         surfels, archive = surfels_of(manifest, maps.blob), maps.archive(site, version)
     if archive is None:
@@ -124,8 +115,7 @@ def refine(
             "they are"
         )
     data = (splat_spz if file.suffix == ".spz" else splat_ply)(done.splats)
-    with disk_errors(f"{file} cannot be written", "choose another place"):
-        file.write_bytes(data)
+    write_output(file, data)
     typer.echo(f"{said}, from {done.learned} other views; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
 
 

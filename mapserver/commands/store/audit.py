@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapserver.commands.options import Json, StoreFolder, print_json
+from mapserver.commands.options import Json, StoreFolder, open_store, print_json
 from mapserver.commands.store.verify import EXIT_STATUS_FAULTS
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ def audit(
     json: Json = False,
 ) -> None:
     """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
-    from mapserver.store import MapStore, chain_faults
+    from mapserver.store import chain_faults
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         if not verify:
             _print(maps.audit_lines(last), json=json)
             return

@@ -6,8 +6,15 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import expand_options
-from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, NewStoreFolder, SiteName, StoreFolder, version_named
+from mapserver.commands.options import (
+    ActorOptions,
+    NewStoreFolder,
+    SiteName,
+    StoreFolder,
+    check_output,
+    open_store,
+    version_named,
+)
 
 
 def export(
@@ -20,11 +27,9 @@ def export(
     ] = False,
 ) -> None:
     """Write a version into FILE, which `mapserver import` takes into another store."""
-    if file.is_dir() or not file.parent.is_dir():
-        raise UsageError(f"{file}: name a file in a folder that exists")
-    from mapserver.store import MapStore
+    check_output("FILE", file)
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         version = version_named(maps, site, version)
         size = maps.export_version(site, version, file, archive=not without_archive)
     typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
@@ -37,8 +42,6 @@ def import_(
     by: ActorOptions,
 ) -> None:
     """Take the version in FILE into a store, as a draft of its site under its own number."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(store, create=True) as maps:
+    with open_store(store, create=True) as maps:
         info = maps.import_version(file, actor=by.named())
     typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")

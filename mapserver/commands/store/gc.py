@@ -7,7 +7,7 @@ import typer
 
 from fleetmap.cli_options import expand_options
 from fleetmap.errors import StoreError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, print_json
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
 
 if TYPE_CHECKING:
     from mapserver.store.garbage_collection import Garbage
@@ -37,18 +37,23 @@ def gc(
 
     Current versions, targets of a rollback and versions that robots run are always kept.
     """
-    from mapserver.store import MapStore, Retention
+    from mapserver.store import Retention
+    from mapserver.store.files import keep_reserve, release_reserve
 
     def collect() -> "Garbage":
-        with MapStore.open(store, read_only=dry_run) as maps:
+        with open_store(store, read_only=dry_run) as maps:
             return maps.collect_garbage(Retention(**vars(retention)), dry_run=dry_run, actor=by.named())
 
     try:
         garbage = collect()
     except StoreError:
-        if dry_run or not MapStore.release_reserve(store):
+        open_store(store, read_only=True).close()  # a store that is refused keeps its reserve
+        if dry_run or not release_reserve(store):
             raise
-        garbage = collect()  # the disk was full
+        try:
+            garbage = collect()  # the disk was full
+        finally:
+            keep_reserve(store)
     if json:
         print_json(garbage)
         return

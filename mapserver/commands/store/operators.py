@@ -6,7 +6,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, print_json
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
 from mapserver.operators.roles import Role, Scope
 
 if TYPE_CHECKING:
@@ -21,9 +21,8 @@ Asked = Annotated[bool, typer.Option("--ask", help="Ask for a password instead o
 def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.VIEWER, ask: Asked = False) -> None:
     """Name an operator; prints the password once. From the first one on, a server answers only who signs in."""
     from mapserver.operators.operators import Operators
-    from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         password, shown = _password(ask=ask)
         Operators(maps).add(name, role.value, password, by.named())
     typer.echo(f"operator {name} is a {role.value}{shown}")
@@ -33,9 +32,8 @@ def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.V
 def password(name: Name, store: StoreFolder, by: ActorOptions, ask: Asked = False) -> None:
     """Give an operator another password, a disabled one too; ends the sessions that there are."""
     from mapserver.operators.operators import Operators
-    from mapserver.store import MapStore
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         _check_person(maps, name)
         made, shown = _password(ask=ask)
         Operators(maps).set_password(name, made, by.named())
@@ -50,9 +48,7 @@ def role(
     by: ActorOptions,
 ) -> None:
     """Give an operator another role, at once."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         _check_person(maps, name)
         maps.operators.set_role(name, role.value, by.named())
     typer.echo(f"operator {name} is a {role.value}")
@@ -61,9 +57,7 @@ def role(
 @expand_options
 def disable(name: Name, store: StoreFolder, by: ActorOptions) -> None:
     """End the sessions and tokens of a name at once, and let nobody sign in by it."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         maps.operators.disable(name, by.named())
     typer.echo(f"operator {name} is disabled")
 
@@ -78,12 +72,11 @@ def token(
 ) -> None:
     """Make a token for a program, which shows it as `Authorization: Bearer TOKEN`; prints it once."""
     from mapserver.operators.operators import Operators
-    from mapserver.store import MapStore
 
     wrong = [word for word in scope or () if word not in set(Scope)]
     if wrong or not scope:
         raise UsageError(f"--scope {wrong[0] if wrong else ''}: say what the token may: {', '.join(Scope)}")
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         made = Operators(maps).make_token(name, scope, days, by.named())
     typer.echo(made)
 
@@ -93,9 +86,8 @@ def list_(store: StoreFolder, json: Json = False) -> None:
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from mapserver.store import MapStore
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = maps.operators.all(maps.now_ns())
     if json:
         shown = ("name", "role", "is_disabled", "sessions", "tokens")

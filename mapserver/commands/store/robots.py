@@ -8,7 +8,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder, print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder, open_store, print_json
 
 Robots = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots.")]
 
@@ -23,9 +23,7 @@ def remove(
 
     A server that runs forgets them within seconds; a robot that speaks again is known again.
     """
-    from mapserver.store import MapStore
-
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         removed = maps.remove_robots(where.site, robots, actor=by.named())
     for robot in removed:
         typer.echo(f"site {where.site}: robot {robot} is removed")
@@ -50,11 +48,10 @@ def enrol(
     A bundle is a secret until it was used: carry it on a stick or over SSH.
     """
     from fleetmap.bus import check_endpoint
-    from mapserver.store import MapStore
     from mapserver.store.files import write_atomically
     from mapserver.trust.enrolment import LISTENING, RobotRegister
 
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         register = RobotRegister(maps)
         reached = check_endpoint(endpoint) if endpoint is not None else register.default_endpoint(LISTENING)
         with disk_errors(f"{out} cannot be written", "name another folder by --out", UsageError):
@@ -70,10 +67,9 @@ def enrol(
 @expand_options
 def revoke(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
     """Take robots off the bus at once, such as stolen ones; a server that runs follows within two seconds."""
-    from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
-    with MapStore.open(where.store) as maps:
+    with open_store(where.store) as maps:
         gone = RobotRegister(maps).revoke(where.site, robots, actor=by.named())
     for robot in gone:
         typer.echo(f"site {where.site}: robot {robot} is revoked")
@@ -91,10 +87,9 @@ def list_(
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from mapserver.store import MapStore
     from mapserver.trust.enrolment import RobotRegister
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         rows = [entry.row(maps.now_ns()) for entry in RobotRegister(maps).robots(site)]
     if json:
         print_json(rows)

@@ -1,5 +1,7 @@
 """`mapserver trust`: which keys sign maps, and what is signed."""
 
+import getpass
+import socket
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -9,7 +11,7 @@ import typer
 
 from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, StoreFolder, print_json
+from mapserver.commands.options import Json, StoreFolder, open_store, print_json
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
@@ -47,9 +49,6 @@ def init(
     host: Hosts = None,
 ) -> None:
     """Make the keys of a store: its maps are signed from now on, and its server can tell robots apart by certificates."""
-    import socket
-
-    from mapserver.store import MapStore
     from mapserver.trust import SignedLists, init_here
     from mapserver.trust.enrolment import RobotRegister
     from mapserver.trust.keys import make_passphrase
@@ -62,7 +61,7 @@ def init(
             f"--stick names {len(stick)} folders, and there is one root key; name one, and copy the key yourself"
         )
     folder, hosts, made = _not_a_token(stick[0]) if stick else None, host or [socket.gethostname()], []
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         authorities = RobotRegister(maps).authorities
         # A store that was served on loopback has lists already, and no certificates.
         if authorities.are_there or not SignedLists(maps.folder).are_there:
@@ -81,10 +80,9 @@ def init(
 
 def admit(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
     """Make a key of this server that signs the lists of SITE, in the place of the one that did."""
-    from mapserver.store import MapStore
     from mapserver.trust.signing import admit_site
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         admit_site(maps, site, _root_key(maps, key))
     typer.echo(f"site {site}: its lists are signed by this server's new key")
 
@@ -112,10 +110,9 @@ def rotate(
         raise UsageError("--stick is for `trust rotate root`, --host for `trust rotate server`")
     if stolen and what is not Rotated.ROBOTS_CA:
         raise UsageError("--stolen is for `trust rotate robots-ca`")
-    from mapserver.store import MapStore
     from mapserver.trust import signing
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         if what in {Rotated.SERVER, Rotated.ROBOTS_CA}:
             _rotate_certificates(maps, what, key, host or (), is_stolen=stolen)
             return
@@ -147,10 +144,9 @@ def _rotate_certificates(
 
 def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
     """Replace the keys of SITE and the server's together, after a theft of the key that signs its maps."""
-    from mapserver.store import MapStore
     from mapserver.trust.signing import revoke_site
 
-    with MapStore.open(store) as maps:
+    with open_store(store) as maps:
         revoke_site(maps, site, _root_key(maps, key))
     typer.echo(f"site {site}: the old keys sign nothing any more; robots follow with their next question")
 
@@ -160,10 +156,9 @@ def status(store: StoreFolder, json: Json = False) -> None:
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from mapserver.store import MapStore
     from mapserver.trust.status import trust_status
 
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = trust_status(maps)
     if json:
         print_json(found)
@@ -201,8 +196,6 @@ def _not_a_token(path: Path) -> Path:
 
 
 def _passphrase(path: Path) -> str:
-    import getpass
-
     return getpass.getpass(f"passphrase of {path}: ").strip()
 
 

@@ -4,16 +4,14 @@ import shlex
 
 import typer
 
-from mapserver.commands.options import Json, StoreFolder, print_json
+from mapserver.commands.options import Json, StoreFolder, open_store, print_json
 
 EXIT_STATUS_FAULTS = 3
 
 
 def verify(store: StoreFolder, json: Json = False) -> None:
     """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
-    from mapserver.store import MapStore
-
-    with MapStore.open(store, read_only=True) as maps:
+    with open_store(store, read_only=True) as maps:
         found = maps.verify()
     if json:
         print_json(found)

@@ -30,6 +30,14 @@ def line_sha256(before: str, values: Sequence[object]) -> str:
     return hashlib.sha256(json.dumps([before, *values], separators=(",", ":")).encode()).hexdigest()
 
 
+def chain_head(lines: Iterable[AuditLine]) -> str:
+    """What the line behind these, oldest first, is chained to."""
+    before = ""
+    for line in lines:
+        before = line.sha256 or line_sha256(before, astuple(line)[:-1])
+    return before
+
+
 def chain_faults(lines: Iterable[AuditLine]) -> list[str]:
     """Lines that were changed or are missing, oldest first. A log that was written anew from some line on has no fault."""
     faults: list[str] = []

@@ -53,20 +53,17 @@ class OperatorQueries:
         return bool(self._transactions.query("SELECT 1 FROM operators LIMIT 1"))
 
     def may_sign_in(self) -> bool:
-        """Whether there is anybody who can sign in."""
         return bool(
             self._transactions.query("SELECT 1 FROM operators WHERE password IS NOT NULL AND is_disabled = 0 LIMIT 1")
         )
 
     def find(self, name: str) -> OperatorRow | None:
-        """One operator, disabled or not."""
         found = self._transactions.rows(
             OperatorRow, "SELECT name, role, password, is_disabled FROM operators WHERE name = ?", (name,)
         )
         return found[0] if found else None
 
     def all(self, now_ns: int) -> list[OperatorRow]:
-        """All by name, with the tokens and sessions that have not ended."""
         return self._transactions.rows(
             OperatorRow,
             """SELECT name, role, password, is_disabled,
@@ -111,7 +108,6 @@ class OperatorQueries:
             self._transactions.log(connection, "", LogEntry("operator disabled", name, None, actor))
 
     def begin_session(self, sha256: str, name: str, actor: Actor) -> None:
-        """A new session of an operator who has just signed in."""
         now_ns = self._transactions.now_ns()
         with self._transactions.write() as connection:
             values = (sha256, name, now_ns, now_ns)
@@ -129,12 +125,10 @@ class OperatorQueries:
         return found[0] if found else None
 
     def use_session(self, sha256: str, now_ns: int) -> None:
-        """Notes that a session was used."""
         with self._transactions.write(durable=False) as connection:
             connection.execute("UPDATE sessions SET used_ns = ? WHERE sha256 = ?", (now_ns, sha256))
 
     def end_session(self, sha256: str, actor: Actor) -> None:
-        """Ends a session that its operator signs out of."""
         with self._transactions.write() as connection:
             connection.execute("DELETE FROM sessions WHERE sha256 = ?", (sha256,))
             self._transactions.log(connection, "", LogEntry("signed out", actor.name, None, actor))

@@ -1,6 +1,8 @@
 """The commands that change and check a store, from the command line."""
 
 import json
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 from fleetmap.mapformat import blob_path
@@ -40,6 +42,14 @@ def test_verify_ends_with_a_status_of_its_own(run, tmp_path: Path) -> None:
     (tmp_path / blob_path(tile)).write_bytes(b"other")
     assert f"{tile} is damaged" in run("verify", "--store", tmp_path, status=3)
     assert len(json.loads(run("verify", "--store", tmp_path, "--json", status=3))["faults"]) == 1
+
+
+def test_gc_leaves_a_store_that_it_refuses_as_it_is(run, tmp_path: Path) -> None:
+    MapStore.open(tmp_path, create=True).close()
+    with closing(sqlite3.connect(tmp_path / "store.sqlite3")) as connection:
+        connection.execute("PRAGMA user_version = 1")
+    assert "earlier fleetmap" in run("gc", "--store", tmp_path, status=3)
+    assert (tmp_path / "reserve").is_file()
 
 
 def test_a_reason_is_asked_for(run, tmp_path: Path) -> None:

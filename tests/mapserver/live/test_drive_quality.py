@@ -5,7 +5,7 @@ import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.live_survey import COVERAGE_CELL_M
-from mapserver.live.drive_quality import covered_cells, missing_directions
+from mapserver.live.mapping_process import covered_cells, missing_directions
 
 
 def looking(positions_m: Array, yaw_rad: float) -> Array:

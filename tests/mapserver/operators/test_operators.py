@@ -10,8 +10,8 @@ import pytest
 
 from fleetmap.errors import UsageError
 from mapserver.operators import operators as module
-from mapserver.operators.binding import HttpBinding, binding_fault
 from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S, Operators
+from mapserver.serving.http_connections import binding_fault
 from mapserver.store import Actor, MapStore
 from support.fleet.quick_passwords import use_quick_passwords
 
@@ -205,27 +205,26 @@ def test_a_damaged_hash_lets_nobody_in(operators: Operators, tmp_path: Path) -> 
     assert operators.sign_in("ada", "nonsense", "").refusal
 
 
-BEYOND = {"address": "0.0.0.0:8080", "host": "0.0.0.0"}
-LOCAL = {"address": "127.0.0.1:8080", "host": "127.0.0.1"}
+LOCAL, BEYOND = ("127.0.0.1:8080", "127.0.0.1"), ("0.0.0.0:8080", "0.0.0.0")
 
 
 @pytest.mark.parametrize(
-    ("binding", "words"),
+    ("where", "how", "words"),
     [
-        (HttpBinding(**LOCAL), []),
-        (HttpBinding(address="localhost:1", host="localhost"), []),
-        (HttpBinding(address="[::1]:1", host="::1"), []),
-        (HttpBinding(**LOCAL, names=("localhost",)), []),
-        (HttpBinding(**LOCAL, names=("maps.example",)), ["--http-name maps.example", "operators add"]),
-        (HttpBinding(**LOCAL, names=("maps.example",), has_operators=True), []),
-        (HttpBinding(**BEYOND), ["--http 0.0.0.0:8080", "--http-cert", "operators add", "--insecure"]),
-        (HttpBinding(**BEYOND, has_operators=True), ["--http-cert"]),
-        (HttpBinding(**BEYOND, has_tls=True), ["operators add"]),
-        (HttpBinding(**BEYOND, has_tls=True, has_operators=True), []),
-        (HttpBinding(address="maps.example:1", host="maps.example"), ["--http-cert"]),
+        (LOCAL, {}, []),
+        (("localhost:1", "localhost"), {}, []),
+        (("[::1]:1", "::1"), {}, []),
+        ((*LOCAL, ["localhost"]), {}, []),
+        ((*LOCAL, ["maps.example"]), {}, ["--http-name maps.example", "operators add"]),
+        ((*LOCAL, ["maps.example"]), {"has_operators": True}, []),
+        (BEYOND, {}, ["--http 0.0.0.0:8080", "--http-cert", "operators add", "--insecure"]),
+        (BEYOND, {"has_operators": True}, ["--http-cert"]),
+        (BEYOND, {"has_tls": True}, ["operators add"]),
+        (BEYOND, {"has_tls": True, "has_operators": True}, []),
+        (("maps.example:1", "maps.example"), {}, ["--http-cert"]),
     ],
 )
-def test_where_http_may_be_served(binding: HttpBinding, words: list[str]) -> None:
-    fault = binding_fault(binding)
+def test_where_http_may_be_served(where: tuple[str, ...], how: dict[str, bool], words: list[str]) -> None:
+    fault = binding_fault(*where, **how)
     assert bool(fault) is bool(words)
     assert all(word in fault for word in words)

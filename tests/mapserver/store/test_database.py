@@ -86,7 +86,8 @@ def test_a_store_of_before_is_refused_and_stays_as_it_is(tmp_path: Path, number:
     assert [found.name for found in tmp_path.iterdir() if found.is_file()] == [path.name]
 
 
-def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Path) -> None:
+@pytest.mark.parametrize("unchained", [2, 1 << 30])
+def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Path, unchained: int) -> None:
     golden = Path(__file__).parents[2] / "golden"
     path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{LAST_UNNAMED}.sqlite3"
     shutil.copy(golden / f"store-{LAST_UNNAMED}.sqlite3", path)
@@ -96,7 +97,7 @@ def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Pa
         connection,
     ):  # as one that began before the chain and the moments of traces
         connection.execute("DROP TRIGGER events_stay_as_they_are")
-        connection.execute("UPDATE events SET sha256 = '' WHERE id <= 2")
+        connection.execute("UPDATE events SET sha256 = '' WHERE id <= ?", (unchained,))
         connection.execute("INSERT INTO traces (hour, key_id, stamp_ns, status) VALUES (0, 1, 1, 'LOST')")
     before = path.read_bytes()
     with MapStore.open(tmp_path, read_only=True) as store:
