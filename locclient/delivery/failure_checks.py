@@ -1,7 +1,7 @@
 """Checks a decoded failure recording before any kernel sees it: robots write it, and a robot may be anybody's.
 
-Every array of the record is in ARRAYS by its field's name, with dtype, shape and a check of its values. Letters in a shape are lengths
-that all arrays of one record share.
+Every array is in ARRAYS by its field's name, or by class and field, with dtype, shape and a check of its values. Letters in a shape are
+lengths that all arrays of one object share.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,6 @@ from fleetmap.config import Section
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import PositionPrior
 
 MAX_ROWS = 10_000  # of an array, and members of a list
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
@@ -67,8 +66,10 @@ def _within(pixels: AnyArray, camera: StereoCamera) -> bool:
     return bool(np.all((pixels > -1) & (pixels < (camera.width_px + 1, camera.height_px + 1))))
 
 
-def _columns(right_px: AnyArray, camera: StereoCamera) -> bool:
-    return bool(np.all(np.isnan(right_px) | (np.abs(right_px) <= 2 * camera.width_px)))
+def _stereo_pixels(pixels: AnyArray, camera: StereoCamera) -> bool:
+    right_px = pixels[:, 2]
+    is_column = np.isnan(right_px) | (np.abs(right_px) <= 2 * camera.width_px)
+    return _within(pixels[:, :2], camera) and bool(np.all(is_column))
 
 
 def _octaves(octaves: AnyArray, _: StereoCamera) -> bool:
@@ -81,23 +82,21 @@ _TRANSFORM, _COVARIANCE, _VECTOR = (
     Kind("<f8", (3,), _finite),
 )
 _TRANSFORMS = (
-    "body_from_cam base_from_body odom_from_body previous_from_body new_odom_from_old_odom map_from_body map_from_base"
+    "body_from_cam base_from_body body_from_now odom_from_body previous_from_body new_odom_from_old_odom "
+    "map_from_body map_from_base"
 )
 ARRAYS: Mapping[str, Kind] = {
     **dict.fromkeys(_TRANSFORMS.split(), _TRANSFORM),
     **dict.fromkeys(("cov_rot_trans", "cov_bias_cam"), _COVARIANCE),
     **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), _VECTOR),
-    # a map query: features
-    "pixels": Kind("<f8", ("n", 2), _within),
-    "octaves": Kind("|i1", ("n",), _octaves),
-    "angles_deg": Kind("<f4", ("n",), _finite),
-    "descriptors": Kind("|u1", ("n", 32), _any),
-    "right_px": Kind("<f8", ("n",), _columns),
-    # tracks of the odometry, which no recording keeps
-    "track_ids": Kind("<i8", (0,), _any),
-    "track_pixels": Kind("<f8", (0, 3), _any),
+    "PositionPrior.cov_rot_trans": _COVARIANCE._replace(is_good=_prior_covariance),
+    "Features.pixels": Kind("<f8", ("n", 2), _within),
+    "Features.octaves": Kind("|i1", ("n",), _octaves),
+    "Features.angles_deg": Kind("<f4", ("n",), _finite),
+    "Features.descriptors": Kind("|u1", ("n", 32), _any),
+    "FrameFeatures.pixels": Kind("<f8", ("n", 3), _stereo_pixels),
+    "track_ids": Kind("<i8", (0,), _any),  # of the odometry, whose tracks no recording keeps
 }
-_MOTION = {0: _TRANSFORM, 1: _COVARIANCE}
 
 
 def check_record(record: Any) -> None:
@@ -110,17 +109,19 @@ def check_record(record: Any) -> None:
     if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
         raise _refused("camera", f"focal length, centre and baseline {numbers}")
     _Walk(camera).check(record, "")
-    stamps = [frame.odometry.stamp_ns for frame in record.frames]
+    stamps = [percept.odometry.stamp_ns for _, percept in record.frames]
     if any(later <= earlier for earlier, later in pairwise(stamps)):
         raise _refused("frames", "stamps that do not increase")
-    for place, frame in enumerate(record.frames):
-        if (query := frame.query) is None:
+    for place, (_, percept) in enumerate(record.frames):
+        if (query := percept.query) is None:
             continue
         if not 0 <= query.slices <= MAX_ROWS:
             raise _refused(f"frames[{place}].query.slices", f"{query.slices} of them")
-        given = [getattr(query, name) is None for name in query.__struct_fields__[1:]]
-        if any(given) and not all(given):
-            raise _refused(f"frames[{place}].query", "some arrays of a map query without the others")
+        found = query.features
+        if found is not None and (found.frame is not None or found.is_tried is not None):
+            raise _refused(f"frames[{place}].query", "features with images")
+        if found is not None and len(found.pixels) != len(found.features):
+            raise _refused(f"frames[{place}].query", f"{len(found.pixels)} pixels of {len(found.features)} features")
     if (record.start.map_from_body is None) != (record.start.cov_rot_trans is None):
         raise _refused("start", "a pose without its covariance, or the other way round")
 
@@ -142,12 +143,10 @@ class _Walk:
             self._members(value, value.__struct_fields__, where)
         elif is_dataclass(value):
             self._members(value, [field.name for field in fields(value)], where)
-        elif isinstance(value, Mapping):
-            self._many(list(value.items()), where)
         elif hasattr(value, "_fields"):
             self._members(value, value._fields, where)
-        elif isinstance(value, list | tuple):
-            self._many(value, where)
+        elif isinstance(value, Mapping | list | tuple):
+            self._many(list(value.items()) if isinstance(value, Mapping) else value, where)
         else:
             self._number(value, where)
 
@@ -156,9 +155,7 @@ class _Walk:
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
             if isinstance(member, np.ndarray):
-                kind = ARRAYS.get(name)
-                if isinstance(value, PositionPrior) and name == "cov_rot_trans":
-                    kind = _COVARIANCE._replace(is_good=_prior_covariance)
+                kind = ARRAYS.get(f"{type(value).__name__}.{name}") or ARRAYS.get(name)
                 self._array(member, kind, at, lengths)
             else:
                 self.check(member, at)
@@ -166,13 +163,8 @@ class _Walk:
     def _many(self, values: Sequence[Any], where: str) -> None:
         if len(values) > MAX_ROWS:
             raise _refused(where, f"{len(values)} of them, at most {MAX_ROWS} are read")
-        name = where.rpartition(".")[2].partition("[")[0]
         for place, value in enumerate(values):
-            at = f"{where}[{place}]"
-            if isinstance(value, np.ndarray):
-                self._array(value, _MOTION.get(place) if name == "motions" else None, at, {})
-            else:
-                self.check(value, at)
+            self.check(value, f"{where}[{place}]")
 
     def _array(self, array: AnyArray, kind: Kind | None, where: str, lengths: dict[str, int]) -> None:
         if kind is None:

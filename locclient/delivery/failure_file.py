@@ -20,24 +20,24 @@ from fleetmap.encoding import to_msgpack
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import FailureSummary, decode_summary
 from fleetmap.features import stereo
-from fleetmap.features.orb import Features
-from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3
 from fleetmap.messages import FailureReport
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.delivery.failure_checks import MAX_ROWS, check_record
-from locclient.localization.localizer import Start
+from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.pose_tracker import Start
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.failure_report import RobotProfile, without_detail
-from locclient.robot.failure_ring import FailureCut, HeldFrame, KeptFrame, KeptQuery, UsedMap
+from locclient.robot.failure_ring import Commands, FailureCut, RingFrame, UsedMap
 
 PICTURES = ("full", "blurred")
-_FORMAT = 2
+_FORMAT = 3
 _WIDTH_PX = 320  # of pictures
 _QUALITIES, _PICTURE_BYTES = (70, 50, 30), 24 << 10
 _MAX_UNPACKED_BYTES = 64 << 20
@@ -46,7 +46,7 @@ _ARRAYS = ("<f8", "<f4", "<i8", "<u8", "<u4", "|u1", "|i1", "|b1")
 
 
 class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the localizer began, in which map, and what it perceived since."""
+    """Where the localizer began, in which map, and for each frame since what came before it and what was perceived."""
 
     format: Annotated[int, msgspec.Meta(ge=_FORMAT, le=_FORMAT)] = _FORMAT
     settings: LocalizerSettings
@@ -55,13 +55,13 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
     base_from_body: Array
     start: Start
     used: UsedMap | None
-    frames: Annotated[list[KeptFrame], msgspec.Meta(min_length=1, max_length=2000)]
+    frames: Annotated[list[tuple[Commands, Percept]], msgspec.Meta(min_length=1, max_length=2000)]
 
 
 def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, pictures: str) -> bytes:
     """The MCAP file of a cut that is complete. pictures: one of PICTURES."""
     assert cut.frames
-    used = cut.used or next((f.kept.used for f in cut.frames if f.kept.used is not None), None)
+    used = cut.used or next((f.commands.used for f in cut.frames if f.commands.used is not None), None)
     summary = FailureSummary(
         site=report.site,
         robot=report.robot,
@@ -80,7 +80,7 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
         base_from_body=profile.base_from_body,
         start=cut.start,
         used=cut.used,
-        frames=[_with_features(frame, profile) for frame in cut.frames],
+        frames=[(frame.commands, _with_depth(frame, profile)) for frame in cut.frames],
     )
     packed = zstandard.ZstdCompressor(level=3).compress(msgspec.msgpack.encode(record, enc_hook=_encoded_array))
     with TemporaryDirectory() as folder:
@@ -89,10 +89,10 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
             writer.attach(SUMMARY, "application/msgpack", to_msgpack(summary))
             writer.attach(LOCALIZER, "application/zstd", packed)
             for frame in cut.frames:
-                for samples in frame.inputs.imu if profile.imu is not None else ():
+                for samples in frame.imu if profile.imu is not None else ():
                     writer.write_imu(samples)
-                writer.write_wheel(frame.inputs.wheel)
-                writer.write_prior(frame.inputs.priors)
+                writer.write_wheel(frame.wheel)
+                writer.write_prior(frame.commands.priors)
                 if frame.picture is not None:
                     writer.write_frame(_reduced(frame.picture, pictures))
         return path.read_bytes()
@@ -129,7 +129,7 @@ def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
             "Foxglove opens the recording"
         ) from error
     check_record(record)
-    if [frame.odometry.stamp_ns for frame in record.frames] != [each.stamp_ns for each in summary.moments]:
+    if [percept.odometry.stamp_ns for _, percept in record.frames] != [each.stamp_ns for each in summary.moments]:
         raise RecordingError("the summary is of other frames than the localizer's part; fetch it again")
     return record
 
@@ -137,20 +137,19 @@ def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
 # --- the localizer's part ---------------------------------------------------------------------------------------------
 
 
-def _with_features(frame: HeldFrame, profile: RobotProfile) -> KeptFrame:
+def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
     """With the depth of every feature where the images were kept: another version matches others of them."""
-    kept, query, found = frame.kept, frame.kept.query, frame.features
-    if query is None or found is None:
-        return kept
-    features: Features = found.features
-    right_px = found.pixels[:, 2].copy()
+    query = frame.percept.query
+    if query is None or query.features is None:
+        return frame.percept
+    found, pixels = query.features.features, query.features.pixels.copy()
     if frame.picture is not None:
-        untried = np.ones(len(features), bool) if found.is_tried is None else ~found.is_tried
-        settings: StereoSettings = profile.settings.stereo
-        disparities = stereo.disparities(frame.picture, profile.camera, features.pixels[untried], settings)[:, 0]
-        right_px[untried] = features.pixels[untried, 0] - disparities
-    arrays = (features.pixels, features.octaves, features.angles_deg, features.descriptors, right_px)
-    return msgspec.structs.replace(kept, query=KeptQuery(query.slices, *arrays))
+        is_tried = query.features.is_tried
+        untried = np.ones(len(found), bool) if is_tried is None else ~is_tried
+        left = found.pixels[untried]
+        disparities = stereo.disparities(frame.picture, profile.camera, left, profile.settings.stereo)[:, 0]
+        pixels[untried, 2] = left[:, 0] - disparities
+    return replace(frame.percept, query=QueryInput(query.slices, FrameFeatures(found, pixels)))
 
 
 def _encoded_array(value: Any) -> Any:
@@ -180,7 +179,7 @@ def _step(width_px: int) -> int:
     return max(1, width_px // _WIDTH_PX)
 
 
-def _reduced_rig(frames: Sequence[HeldFrame], profile: RobotProfile) -> RigCalibration:
+def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalibration:
     """The rectified rig at the pictures' size."""
     camera, step = profile.camera, _step(profile.camera.width_px)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]

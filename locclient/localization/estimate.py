@@ -69,35 +69,35 @@ class QueryResult(NamedTuple):
     fix_stamp_ns: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class LocalizationState:
-    """confirmed: the pose that is tracked; candidates: competing ones while there is none. prior: the pose by the prior and the motion
-    since. has_failed: the last map query found no fix."""
+def assemble(
+    estimate: Estimate,
+    settings: TrackSettings,
+    *,
+    confirmed: PoseHypothesis | None,
+    candidates: HypothesisSet,
+    prior: PoseHypothesis | None,
+    has_failed: bool,
+    was_tracking: bool,
+) -> Estimate:
+    """`estimate`, whose cause is that of its images, with status, pose and cause.
 
-    confirmed: PoseHypothesis | None
-    candidates: HypothesisSet
-    prior: PoseHypothesis | None
-    has_failed: bool
-    was_tracking: bool
-
-
-def assemble(estimate: Estimate, state: LocalizationState, settings: TrackSettings) -> Estimate:
-    """`estimate`, whose cause is that of its images, with status, pose and cause by the state."""
-    if state.confirmed is not None:
-        return _of_confirmed(estimate, state.confirmed, state.has_failed, settings)
-    ranking, competitors = state.candidates.ranking()
-    is_open = bool(competitors) or (bool(ranking) and state.candidates.may_be_lookalike(ranking[0]))
-    status = Status.AMBIGUOUS if is_open else Status.LOST if state.was_tracking else Status.INITIALISING
+    prior: the pose by the prior and the motion since. has_failed: the last map query found no fix.
+    """
+    if confirmed is not None:
+        return _of_confirmed(estimate, confirmed, has_failed, settings)
+    ranking, competitors = candidates.ranking()
+    is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
+    status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
     if ranking:
         return estimate if is_open else _with_pose(estimate, ranking[0], settings)
-    if state.prior is None or estimate.map_version is None:
+    if prior is None or estimate.map_version is None:
         return estimate
     # Nothing in the map agrees: the prior and the odometry since, as far as that goes.
-    if radius_95_m(state.prior.now_cov) <= settings.lost_radius_m:
+    if radius_95_m(prior.now_cov) <= settings.lost_radius_m:
         status = Status.DEGRADED
     estimate = replace(estimate, status=status, cause=estimate.cause or Cause.UNMATCHED)
-    return _with_pose(estimate, state.prior, settings)
+    return _with_pose(estimate, prior, settings)
 
 
 def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: bool, settings: TrackSettings) -> Estimate:

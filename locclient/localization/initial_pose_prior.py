@@ -17,7 +17,7 @@ from locclient.localization.hypothesis_set import (
     vote,
 )
 from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
-from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
+from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 _SIGMA_M = 0.05  # added to any prior: it is of a moment between two frames
@@ -71,11 +71,10 @@ class InitialPosePrior:
         """True if no frame has come since."""
         return self._since is None
 
-    def propagate(self, tracker: Motion, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
-        """To the present frame, by `step` (4, 4) from the last one. The caller propagates `hypothesis` with the others."""
+    def propagate(self, odometry: OdometryEstimate, step: Array) -> None:
+        """To the present frame, by `step` (4, 4) from the last one. The caller propagates `tracked` with other hypotheses."""
         self.travelled_m += float(np.linalg.norm(step[:3, 3]))
         if self._since is not None:
-            self._since.propagate(tracker, odometry, step, settings)
             return
         self._since = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
         if np.isfinite(self._prior.cov_rot_trans).all():
@@ -86,7 +85,7 @@ class InitialPosePrior:
 
     def tracked(self) -> list[PoseHypothesis]:
         """All that must be propagated by the odometry."""
-        return [*([self.hypothesis] if self.hypothesis else []), *self.contradictions]
+        return [*filter(None, (self.hypothesis, self._since)), *self.contradictions]
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
         """Whether the robot's motion leads back from a present pose to within the bound of the prior's position."""

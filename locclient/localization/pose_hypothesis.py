@@ -1,7 +1,8 @@
 """Pose hypotheses that the odometry propagates from frame to frame. Pure."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +17,13 @@ _MEASURED_DRIFT, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can turn the motion
 
 
-class Motion(Protocol):
-    """The odometry's answers about frames that it still knows."""
+class Motion(NamedTuple):
+    """The odometry's motion from a frame to the present one: body_from_now (4, 4), its covariance (6, 6), a left perturbation in the
+    body's axes; is_last: it forgets the frame with the next one."""
 
-    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """As `Odometry.motion_since`."""
-
-    def will_forget(self, frame_index: int) -> bool:
-        """As `Odometry.will_forget`."""
+    body_from_now: Array
+    cov_rot_trans: Array
+    is_last: bool
 
 
 @dataclass
@@ -121,27 +121,28 @@ class PoseHypothesis:
         self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans
         self.now_map_from_body, self.now_cov = other.now_map_from_body, other.now_cov
 
-    def propagate(self, tracker: Motion, odometry: OdometryEstimate, step: Array, settings: TrackSettings) -> None:
+    def propagate(
+        self, motions: Mapping[int, Motion], odometry: OdometryEstimate, step: Array, settings: TrackSettings
+    ) -> None:
         """To the present frame: by the motion since its own frame while the odometry holds that, else by `step` (4, 4) from the last.
 
         Moves to the present frame before the odometry forgets its own.
         """
         step_m = length(step[:3, 3])
         self.travelled_m += step_m
-        motion = tracker.motion_since(self.frame_index)
+        motion = motions.get(self.frame_index)
         if motion is None:
             # The robot stood so long that its frame was forgotten, or the odometry restarted: one step by its estimates alone.
             is_sure = odometry.new_odom_from_old_odom is None and odometry.status is not OdometryStatus.DEGRADED
             cov_step = _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m)
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
         else:
-            body_from_now, cov_motion = motion
-            distance_m = length(body_from_now[:3, 3])
+            distance_m = length(motion.body_from_now[:3, 3])
             drift = (0.0, settings.drift_floor_m, settings.drift_share) if odometry.inertial else _VISION_ONLY
-            cov_motion = cov_motion + _step_cov(drift, distance_m)
-            now = compose_cov(self.map_from_body, self.cov_rot_trans, body_from_now, cov_motion)
+            cov_motion = motion.cov_rot_trans + _step_cov(drift, distance_m)
+            now = compose_cov(self.map_from_body, self.cov_rot_trans, motion.body_from_now, cov_motion)
             self.now_map_from_body, self.now_cov = now
-        if motion is None or tracker.will_forget(self.frame_index):
+        if motion is None or motion.is_last:
             self.frame_index = odometry.frame_index
             self.map_from_body, self.cov_rot_trans = self.now_map_from_body, self.now_cov
 

@@ -12,116 +12,21 @@ from itertools import groupby
 from math import dist, pi, remainder
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.bow import decode_vocabulary
-from fleetmap.errors import LinkError, RecordingError, UsageError
+from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_definition import BLIND_S, is_blind
 from fleetmap.failure_summary import FailureSummary, Moment
-from fleetmap.features.orb import Features
-from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import check_sha256, decode_manifest
 from fleetmap.messages import WantedVersion
-from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import OdometryEstimate
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.delivery.failure_file import LocalizerRecord
-from locclient.localization.calibration.monitor import FinishedQuery, with_calibration
-from locclient.localization.calibration.watch import Mounting
-from locclient.localization.estimate import Estimate
-from locclient.localization.image_quality import ImageQuality
 from locclient.localization.localizer import Localizer
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
-from locclient.robot.failure_ring import KeptFrame, KeptQuery, UsedMap, moment_of
+from locclient.robot.failure_ring import UsedMap, moment_of
 
-_NO_IMAGE = np.zeros((0, 0), np.uint8)
 SAME_M, SAME_RAD = 0.01, np.radians(0.5)  # of poses that count as the same
-
-
-class KeptFeatures(FrameFeatures):
-    """Features of a frame whose images are gone; the depth that is asked for is the one that was kept."""
-
-    kept_px: Array
-
-    def measured(
-        self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings, prior_px: Array | None = None
-    ) -> Array:
-        self.pixels[rows, 2] = self.kept_px[rows]
-        return self.pixels[rows]
-
-
-class KeptPerception:
-    """The perception that was kept, frame by frame."""
-
-    def __init__(self, record: LocalizerRecord) -> None:
-        self._rig = Mounting(se3_inverse(record.body_from_cam), record.base_from_body)
-        self._frame = record.frames[0]
-
-    def show(self, frame: KeptFrame) -> None:
-        """The frame that comes next."""
-        self._frame = frame
-
-    def handle_imu(self, samples: ImuSamples) -> None:
-        """Nothing: the odometry's estimates are kept."""
-
-    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """Nothing: the odometry's estimates are kept."""
-
-    def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
-        return frame, self._frame.image
-
-    def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
-        return self._frame.odometry, self._frame.image
-
-    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Motion; None for a frame that the robot never asked about."""
-        return self._frame.motions.get(frame_index)
-
-    def will_forget(self, frame_index: int) -> bool:
-        return self._frame.forgotten.get(frame_index, True)
-
-    def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        return self._frame.is_reversed
-
-    def may_query(self, *, is_due: bool) -> bool:
-        """Where the robot did: only there features were kept."""
-        return self._frame.query is not None
-
-    def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        query = self._frame.query
-        assert query is not None
-        for _ in range(query.slices):
-            yield
-        return _features(query)
-
-    def add(self, query: FinishedQuery) -> None:
-        """Nothing: what the watch over the calibration said is kept."""
-
-    def give_up(self) -> None:
-        """Nothing, as `add`."""
-
-    def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
-        fixed_ns = None if self._frame.is_reversed else last_fix_ns
-        return with_calibration(estimate, self._frame.calibration, self._rig, fixed_ns, was_localized=was_localized)
-
-
-def _features(query: KeptQuery) -> FrameFeatures:
-    if query.pixels is None:
-        raise RecordingError(
-            "a map query without features is over before they are there; was the file made by a robot?"
-        )
-    pixels, octaves, angles_deg, descriptors, right_px = (getattr(query, name) for name in query.__struct_fields__[1:])
-    features = Features(pixels, octaves, angles_deg, descriptors)
-    made = KeptFeatures(features, np.column_stack([features.pixels, np.full(len(features), np.nan)]))
-    made.kept_px = np.asarray(right_px)
-    return made
-
 
 Load = Callable[[UsedMap], LoadedMap]
 """The map to use in the place of the one that the robot used."""
@@ -129,25 +34,20 @@ Load = Callable[[UsedMap], LoadedMap]
 
 def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     """What the present localizer says of every frame. Errors as of `load`."""
-    camera = record.camera
     rig = RigCalibration((), None, record.base_from_body)
-    localizer = Localizer(rig, camera, record.body_from_cam, 0.0, record.settings)
-    perception = localizer.perception = KeptPerception(record)
+    localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings)
     if record.used is not None:
         _use(localizer, load(record.used))
     localizer.begin(record.start)
     said = []
-    for frame in record.frames:
-        if frame.used is not None:
-            _use(localizer, load(frame.used))
-        if frame.forgets:
+    for commands, percept in record.frames:
+        if commands.used is not None:
+            _use(localizer, load(commands.used))
+        if commands.forgets:
             localizer.forget_pose()
-        for prior in frame.priors:
+        for prior in commands.priors:
             localizer.handle_prior(prior)
-        perception.show(frame)
-        stamp_ns = frame.odometry.stamp_ns
-        estimate = localizer.handle_stereo(RectifiedFrame(stamp_ns, _NO_IMAGE, None, None))
-        said.append(moment_of(estimate))
+        said.append(moment_of(localizer.localize(percept)))
     return said
 
 

@@ -1,33 +1,27 @@
-"""Ring of the last seconds: what the localizer perceived, what it answered, and a few pictures, kept for the replay of a failure. Pure.
+"""Ring of the last seconds: what the robot perceived, what it answered, and a few pictures, kept for the replay of a failure. Pure.
 
 The odometry knows no map: its estimates are kept as they were, not its samples alone, so that no image is needed to repeat what the map
 made of them. A replay begins with the pose that the robot had then.
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import atan2
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.failure_summary import Moment
-from fleetmap.geometry import Array
 from fleetmap.messages import FailureKind
-from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
-from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.estimate import Estimate
-from locclient.localization.image_quality import ImageQuality
-from locclient.localization.localizer import Localizer, Start
+from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.pose_tracker import Start
 from locclient.maps.loaded_map import LoadedMap
 
 BEFORE_NS, AFTER_NS = 5_000_000_000, 5_000_000_000  # of a failure's onset
@@ -47,65 +41,34 @@ class UsedMap:
     cells: tuple[tuple[int, int], ...]
 
 
-class KeptQuery(msgspec.Struct, array_like=True):
-    """A map query: in how many slices its features were extracted, features (N), and the columns of the right image (N,), NaN where
-    unknown. The arrays are None of a query that was given up before."""
-
-    slices: int = 0
-    pixels: Array | None = None
-    octaves: NDArray[np.int8] | None = None
-    angles_deg: NDArray[np.float32] | None = None
-    descriptors: NDArray[np.uint8] | None = None
-    right_px: Array | None = None
-
-
-class KeptFrame(msgspec.Struct, kw_only=True):
-    """What the localizer perceived in one frame, as it is written. used, forgets, priors: what came before it, in this order.
-
-    motions, forgotten: answers of the odometry by frame.
-    """
-
-    odometry: OdometryEstimate
-    image: ImageQuality
-    used: UsedMap | None = None
-    forgets: bool = False
-    priors: list[PositionPrior] = []
-    motions: dict[int, tuple[Array, Array] | None] = {}
-    forgotten: dict[int, bool] = {}
-    is_reversed: bool = False
-    calibration: CalibrationState = NOT_JUDGED
-    query: KeptQuery | None = None
-
-
 @dataclass(slots=True, eq=False)
-class Inputs:
-    """What came before a frame."""
+class Commands:
+    """What came before a frame, in this order."""
 
     used: UsedMap | None = None
     forgets: bool = False
     priors: list[PositionPrior] = field(default_factory=list)
-    imu: list[ImuSamples] = field(default_factory=list)
-    wheel: list[WheelSample] = field(default_factory=list)
 
 
 @dataclass(slots=True, eq=False)
-class HeldFrame:
-    """A frame of the ring. features: of its map query. picture: its images, for a few frames only.
+class RingFrame:
+    """A frame of the ring. imu, wheel: since the frame before. picture: its images, for a few frames only. moment: what the robot said.
 
-    moment: what the robot said of it; after, used: where a replay of the frames behind it begins, None where it cannot.
+    after, used: where a replay of the frames behind it begins; None where it cannot.
     """
 
-    inputs: Inputs
-    kept: KeptFrame
-    features: FrameFeatures | None = None
+    commands: Commands
+    imu: list[ImuSamples]
+    wheel: list[WheelSample]
+    percept: Percept
+    moment: Moment
+    after: Start | None
+    used: UsedMap | None
     picture: RectifiedFrame | None = None
-    moment: Moment = field(init=False)
-    after: Start | None = None
-    used: UsedMap | None = None
 
     @property
     def stamp_ns(self) -> int:
-        return self.kept.odometry.stamp_ns
+        return self.percept.odometry.stamp_ns
 
 
 @dataclass(slots=True, eq=False)
@@ -117,7 +80,7 @@ class FailureCut:
 
     onset_ns: int
     is_wanted: bool = True
-    frames: tuple[HeldFrame, ...] | None = None
+    frames: tuple[RingFrame, ...] | None = None
     start: Start = field(default_factory=Start)
     used: UsedMap | None = None
 
@@ -135,47 +98,54 @@ def moment_of(estimate: Estimate) -> Moment:
 
 
 class FailureRing:
-    """The perception of a localizer, followed: each answer is passed on and kept. For the thread that localizes; cuts are for any."""
+    """Frames of the last seconds, and what is cut out of them. For the thread that localizes; cuts are for any."""
 
-    def __init__(self, localizer: Localizer) -> None:
-        """Puts itself between the localizer and its perception."""
-        self._localizer, self._inner = localizer, localizer.perception
-        localizer.perception = self
-        self.add, self.give_up, self.judged = self._inner.add, self._inner.give_up, self._inner.judged
-        self._frames: deque[HeldFrame] = deque()
+    def __init__(self) -> None:
+        self._frames: deque[RingFrame] = deque()
         self._is_whole = True  # since the robot began
-        self._inputs = Inputs()
+        self._commands, self._imu, self._wheel = Commands(), list[ImuSamples](), list[WheelSample]()
         self._used: UsedMap | None = None
-        self._frame: HeldFrame | None = None
-        self._seen: RectifiedFrame | None = None
         self._cuts: list[FailureCut] = []  # that are not complete
         self._held: FailureCut | None = None  # of what goes on and may become a failure
-        self._query: HeldFrame | None = None  # the frame of the last one
+        self._query: QueryInput | None = None  # of the last map query
         self._pictured_ns = -(2**62)
 
     def use(self, loaded: LoadedMap) -> None:
         """The localizer takes these tiles before the next frame."""
         used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles))
-        self._used = self._inputs.used = used
+        self._used = self._commands.used = used
 
-    def handle_commands(self, bundle: SensorBundle) -> None:
-        """What a bundle says of the place before its frame."""
-        self._inputs.forgets |= bundle.forget
+    def handle_samples(self, bundle: SensorBundle) -> None:
+        """What came with a bundle before its frame."""
+        self._imu.append(bundle.imu)
+        self._wheel.extend(bundle.wheel)
+        self._commands.forgets |= bundle.forget
         if bundle.forget:
-            self._inputs.priors.clear()
-        self._inputs.priors.extend(bundle.priors)
+            self._commands.priors.clear()
+        self._commands.priors.extend(bundle.priors)
 
-    def handle(self, estimate: Estimate, begun_ns: Mapping[FailureKind, int]) -> None:
-        """Ends a frame. begun_ns: since when what may become a failure goes on, by kind."""
-        frame = self._now
-        frame.kept.calibration = estimate.calibration._replace(drifts=())
-        frame.moment, frame.after, frame.used = moment_of(estimate), self._localizer.start(), self._used
-        if self._query is not None and (index := self._query.kept.odometry.frame_index) not in frame.kept.motions:
-            # Another version may find a fix in the last query's frame, and go on from there.
-            frame.kept.motions[index] = self._inner.motion_since(index)
-        self._note_picture(frame)
-        self._frames.append(frame)
-        now_ns = frame.stamp_ns
+    def handle(
+        self,
+        percept: Percept,
+        frame: RectifiedFrame,
+        estimate: Estimate,
+        start: Start | None,
+        begun_ns: Mapping[FailureKind, int],
+    ) -> None:
+        """Ends a frame. start: where a replay may begin behind it. begun_ns: since when what may become a failure goes on, by kind."""
+        if percept.query is not None:
+            if self._query is not None and self._query.features is not None:
+                self._query.features.frame = None  # nothing more is measured in it
+            self._query = percept.query
+        bare = replace(percept.odometry, track_ids=_NO_TRACKS, track_pixels=None, revised=())
+        percept = replace(percept, odometry=bare, calibration=percept.calibration._replace(drifts=()))
+        now_ns = percept.odometry.stamp_ns
+        samples = self._commands, self._imu, self._wheel
+        kept = RingFrame(*samples, percept, moment_of(estimate), start, self._used)
+        self._commands, self._imu, self._wheel = Commands(), [], []
+        if now_ns - self._pictured_ns >= (_PICTURES_NS if percept.query is not None else _LATEST_PICTURE_NS):
+            self._pictured_ns, kept.picture = now_ns, frame
+        self._frames.append(kept)
         self._follow_onsets(begun_ns)
         for cut in [cut for cut in self._cuts if now_ns >= cut.onset_ns + AFTER_NS]:
             self._complete(cut)
@@ -199,71 +169,6 @@ class FailureRing:
         for cut in list(self._cuts):
             self._complete(cut)
 
-    # --- as Perception ------------------------------------------------------------------------------------------------
-
-    def handle_imu(self, samples: ImuSamples) -> None:
-        self._inputs.imu.append(samples)
-        self._inner.handle_imu(samples)
-
-    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        self._inputs.wheel.extend(samples)
-        self._inner.handle_wheel(samples)
-
-    def judge(self, frame: RectifiedFrame) -> tuple[RectifiedFrame, ImageQuality]:
-        self._seen = frame
-        return self._inner.judge(frame)
-
-    def follow(self, frame: RectifiedFrame, image: ImageQuality) -> tuple[OdometryEstimate, ImageQuality]:
-        odometry, image = self._inner.follow(frame, image)
-        bare = replace(odometry, track_ids=_NO_TRACKS, track_pixels=None, revised=())
-        given, self._inputs = self._inputs, Inputs()
-        kept = KeptFrame(odometry=bare, image=image, used=given.used, forgets=given.forgets, priors=given.priors)
-        self._frame = HeldFrame(given, kept)
-        return odometry, image
-
-    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        found = self._now.kept.motions[frame_index] = self._inner.motion_since(frame_index)
-        return found
-
-    def will_forget(self, frame_index: int) -> bool:
-        found = self._now.kept.forgotten[frame_index] = self._inner.will_forget(frame_index)
-        return found
-
-    def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        found = self._now.kept.is_reversed = self._inner.is_reversed(frame, is_localized=is_localized)
-        return found
-
-    def may_query(self, *, is_due: bool) -> bool:
-        return self._inner.may_query(is_due=is_due)
-
-    def extract(self, relocalizer: Relocalizer, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        if self._query is not None and self._query.features is not None:
-            self._query.features.frame = None  # nothing more is measured in it
-        held = self._query = self._now
-        query = held.kept.query = KeptQuery()
-        work = self._inner.extract(relocalizer, frame)
-        while True:
-            try:
-                next(work)
-            except StopIteration as done:
-                held.features = done.value
-                return held.features
-            query.slices += 1
-            yield
-
-    # --- the ring -----------------------------------------------------------------------------------------------------
-
-    @property
-    def _now(self) -> HeldFrame:
-        assert self._frame is not None
-        return self._frame
-
-    def _note_picture(self, frame: HeldFrame) -> None:
-        since_ns = frame.stamp_ns - self._pictured_ns
-        if since_ns >= (_PICTURES_NS if frame.kept.query is not None else _LATEST_PICTURE_NS):
-            self._pictured_ns, frame.picture = frame.stamp_ns, self._seen
-        self._seen = None
-
     def _follow_onsets(self, begun_ns: Mapping[FailureKind, int]) -> None:
         if self._held is not None and self._held.onset_ns not in begun_ns.values():
             if self._held in self._cuts and not self._held.is_wanted:
@@ -284,9 +189,10 @@ class FailureRing:
             cut.start, cut.used = frames[begin].after or Start(), frames[begin].used
             frames = frames[begin + 1 :]
         for place, frame in enumerate(frames):
-            if (found := frame.features) is not None and found.frame is not None:
+            query = frame.percept.query
+            if query is not None and query.features is not None and query.features.frame is not None:
+                found = query.features
                 tried = None if found.is_tried is None else found.is_tried.copy()
-                copied = FrameFeatures(found.features, found.pixels.copy(), None, tried)
-                frames[place] = replace(frame, features=copied)
-                frames[place].moment = frame.moment
+                copied = QueryInput(query.slices, FrameFeatures(found.features, found.pixels.copy(), None, tried))
+                frames[place] = replace(frame, percept=replace(frame.percept, query=copied))
         cut.frames = tuple(frames) or None

@@ -16,7 +16,6 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
-from locclient.localization.perception import SensorPerception
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
@@ -124,7 +123,7 @@ class Robot:
         self.base_from_body = calibration.base_from_body
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
         self.localizer = Localizer(calibration, *mounting, settings, clock_s)
-        self.ring = FailureRing(self.localizer) if keeps_replay else None
+        self.ring = FailureRing() if keeps_replay else None
         self._trial_settings = trial
         self._versions = _Versions()
         self._odom = ContinuousOdom(calibration.base_from_body)
@@ -188,7 +187,7 @@ class Robot:
         wheel = [] if self._wheels.is_refused or self._wheels_fault else bundle.wheel
         self.localizer.handle_wheel(wheel)
         if self.ring is not None:
-            self.ring.handle_commands(bundle)
+            self.ring.handle_samples(replace(bundle, wheel=wheel))
         if bundle.forget:
             self.localizer.forget_pose()
         for prior in bundle.priors:
@@ -209,8 +208,8 @@ class Robot:
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
-        if self.ring is not None:
-            self.ring.handle(estimate, self.monitor.begun_ns)
+        if self.ring is not None and self.localizer.percept is not None:
+            self.ring.handle(self.localizer.percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
         odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
@@ -220,13 +219,10 @@ class Robot:
         )
 
     def _left_out(self) -> dict[Flag, str]:
-        perception = self.localizer.perception
-        found = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
-        if not isinstance(perception, SensorPerception):
-            return found
-        odometry = perception.odometry
+        odometry = self.localizer.odometry
+        wheels = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
         imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
-        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **found}
+        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """The failure of a source that has sent no frame for so long."""

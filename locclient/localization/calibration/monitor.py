@@ -1,6 +1,6 @@
 """Monitor of the calibration beside the localizer: the pair's order, the watch, and what is published of them. Pure."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,15 +8,14 @@ from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.numerics.time_sliced import TimeSliced
-from fleetmap.odometry import OdometryEstimate
-from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
+from fleetmap.relocalization.relocalizer import is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
 from locclient.localization.calibration.parameters import CalibrationState
-from locclient.localization.calibration.watch import CalibrationWatch, MapQuery, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch, MapLook, Mounting
 from locclient.localization.estimate import Estimate
+from locclient.localization.map_query import FinishedQuery
 
 # Between two tests of the pair's order: until one has decided, after one has found it reversed, and while the robot is not localized.
 _UNDECIDED_S, _REVERSED_S, _NOT_LOCALIZED_S = 0.5, 5.0, 20.0
@@ -25,24 +24,12 @@ _HELD_S = 1.0  # by a fix of this age, a pose by wrong cameras is published
 _ORDER_CORNERS = 500
 
 
-@dataclass(frozen=True)
-class FinishedQuery:
-    """A look at the map that has ended, with or without a fix; whether the pose is confirmed."""
-
-    frame: RectifiedFrame
-    odometry: OdometryEstimate
-    features: FrameFeatures
-    fix: Fix | None
-    relocalizer: Relocalizer
-    is_confirmed: bool
-
-
 class CalibrationMonitor:
     """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about; but that
     of the first confirmed pose is done at once, before it is published."""
 
     def __init__(self, rig: Mounting, settings: RelocalizerSettings, imu_minus_cam_s: float = 0.0) -> None:
-        self._rig, self._settings = rig, settings
+        self._settings = settings
         self.watch = CalibrationWatch(rig, settings.stereo, imu_minus_cam_s)
         self._job: TimeSliced[None] | None = None
         self._searched_ns: int | None = None
@@ -79,16 +66,14 @@ class CalibrationMonitor:
         """Forgets work that is under way: the map has changed."""
         self._job = None
 
-    def judged(self, estimate: Estimate, last_fix_ns: int | None, *, was_localized: bool) -> Estimate:
-        """As `with_calibration`, by what is known so far."""
-        is_reversed = self._order is PairOrder.REVERSED
-        state = CalibrationState(text=REVERSED_TEXT) if is_reversed else self.watch.state
-        fixed_ns = None if is_reversed else last_fix_ns
-        return with_calibration(estimate, state, self._rig, fixed_ns, was_localized=was_localized)
+    @property
+    def state(self) -> CalibrationState:
+        """What is known so far."""
+        return CalibrationState(text=REVERSED_TEXT) if self._order is PairOrder.REVERSED else self.watch.state
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:
         assert query.fix is not None
-        self.watch.handle(MapQuery(query.frame, query.odometry, query.fix, query.relocalizer.view, query.is_confirmed))
+        self.watch.handle(MapLook(query.frame, query.odometry, query.fix, query.relocalizer.view, query.is_confirmed))
         yield
 
     def _search(self, query: FinishedQuery) -> TimeSliced[None]:
@@ -96,7 +81,7 @@ class CalibrationMonitor:
         fixes = yield from query.relocalizer.anywhere(query.features.without_depth())
         if fixes and is_reliable(fixes[0], self._settings.fix):
             yield
-            self.watch.handle_unmatched(MapQuery(query.frame, query.odometry, fixes[0], query.relocalizer.view))
+            self.watch.handle_unmatched(MapLook(query.frame, query.odometry, fixes[0], query.relocalizer.view))
 
 
 def with_calibration(

@@ -70,7 +70,7 @@ class _View:
 
 
 @dataclass(frozen=True)
-class MapQuery:
+class MapLook:
     """A look at the map that found a fix: the frame, the odometry there, the fix, and the map; whether the fix is of a confirmed pose."""
 
     frame: RectifiedFrame
@@ -106,7 +106,7 @@ class CalibrationWatch:
         """Wheel odometry newer than any before."""
         self._wheels.handle(samples)
 
-    def handle(self, query: MapQuery) -> None:
+    def handle(self, query: MapLook) -> None:
         """Takes a look at the map, where it is a new view."""
         fix, matched, frame = query.fix, query.fix.matched, query.frame
         self._look_for_a_stand(query.odometry.stamp_ns, fix.map_from_cam[:3, 3])
@@ -132,7 +132,7 @@ class CalibrationWatch:
         state = self._judged(_MIN_CONFIRMED_VIEWS if query.is_confirmed else _MIN_VIEWS)
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
-    def handle_unmatched(self, query: MapQuery) -> None:
+    def handle_unmatched(self, query: MapLook) -> None:
         """As `handle`, for a frame that agrees with the map only without its depth: that is measured here for what was matched."""
         matched = query.fix.matched
         if matched is None:
@@ -161,7 +161,7 @@ class CalibrationWatch:
         known = frozenset[int]().union(*(ids & view.ids for view in self._views))
         return max(1.0 - len(known) / len(ids), _MIN_NEW_SHARE) if ids else 1.0
 
-    def _add_mounting(self, query: MapQuery, information: Array, score: Array) -> None:
+    def _add_mounting(self, query: MapLook, information: Array, score: Array) -> None:
         fix, odometry = query.fix, query.odometry
         if odometry.inertial and self._has_stood:
             jacobian, measured = mounting.tilt(fix, self._rig.cam_from_body, odometry)

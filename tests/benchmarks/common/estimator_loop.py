@@ -226,9 +226,9 @@ def run_localizer(
     """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
     nominal = session.session.nominal
     localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
-    localizer.perception.odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
-    localizer._relocalizer, localizer._map_version = SessionRelocalizer(view, session, settings), 1
-    localizer._lookalikes = lookalikes
+    localizer.odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
+    localizer._query.use(SessionRelocalizer(view, session, settings))
+    localizer._map_version, localizer._tracker.lookalikes = 1, lookalikes
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0

@@ -36,7 +36,7 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.identity import MapAddress
-from locclient.localization import localizer
+from locclient.localization import map_query
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
@@ -46,7 +46,7 @@ from locclient.robot.version_trial import TrialSettings
 
 WITHIN_S, ELSEWHERE_M = 1.0, 8.0
 _FOLLOWED_S, _LIGHT, _DAY, _ROBOT = 2.0, "night", 3, "runner-1"
-_SLICES = localizer._SLICES_AT_REST
+_SLICES = map_query._MORE_SLICES
 PIPELINES = ("clean", "night-gain")
 
 
@@ -160,9 +160,9 @@ def main() -> None:
             unmapped.append(start(session, shown, rest))
             print(f"{time_s:5.1f} s, {name:10} {replace(mapped[-1], lost_ms=())} {unmapped[-1].is_wrong}", flush=True)
         lost[_SLICES].append(start(session, frames, rest) if "clean" not in found else found["clean"][1][-1])
-        localizer._SLICES_AT_REST = 1
+        map_query._MORE_SLICES = 1
         lost[1].append(start(session, frames, rest))
-        localizer._SLICES_AT_REST = _SLICES
+        map_query._MORE_SLICES = _SLICES
         slow.append(slowness())
     drive.renderer.close()
     results = {name: figures(*starts) for name, starts in found.items()}

@@ -1,33 +1,18 @@
 """A prior against places that a robot finds later: what leads back to it, how far it reaches, and when it is got over."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import se3, so3_exp
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.initial_pose_prior import InitialPosePrior
-from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
 STEP = se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.5, 0.0, 0.0]))
 SETTINGS = TrackSettings()
-
-
-class Steady:
-    """An odometry that knows the motion since every frame, exactly."""
-
-    def __init__(self) -> None:
-        self.frame = 0
-
-    def motion_since(self, frame_index: int) -> tuple[Array, Array]:
-        return np.linalg.matrix_power(STEP, self.frame - frame_index), 1e-8 * np.eye(6)
-
-    def will_forget(self, frame_index: int) -> bool:
-        return frame_index < self.frame - 5
 
 
 class Ride:
@@ -40,20 +25,24 @@ class Ride:
         unknown = 0.01**2 if whole else np.inf
         covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, unknown])
         self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
-        self.odometry: Any = Steady()
-        self.prior.propagate(self.odometry, self._estimate(), np.eye(4), SETTINGS)
+        self.frame = 0
+        self.prior.propagate(self._estimate(), np.eye(4))
 
     def _estimate(self) -> OdometryEstimate:
         return OdometryEstimate(
-            self.odometry.frame, self.odometry.frame, np.eye(4), 1e-6 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3),
+            self.frame, self.frame, np.eye(4), 1e-6 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3),
             OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, None,
         )  # fmt: skip
 
     def drive(self, steps: int) -> None:
         for _ in range(steps):
-            self.odometry.frame += 1
+            self.frame += 1
             self.map_from_body = self.map_from_body @ STEP
-            self.prior.propagate(self.odometry, self._estimate(), STEP, SETTINGS)
+            for hypothesis in self.prior.tracked():
+                age = self.frame - hypothesis.frame_index
+                motion = Motion(np.linalg.matrix_power(STEP, age), 1e-8 * np.eye(6), is_last=age > 5)
+                hypothesis.propagate({hypothesis.frame_index: motion}, self._estimate(), STEP, SETTINGS)
+            self.prior.propagate(self._estimate(), STEP)
 
     def place(self, x_m: float = 0.0, y_m: float = 0.0, turned_rad: float = 0.0) -> PoseHypothesis:
         beside = self.map_from_body.copy()

@@ -11,7 +11,7 @@ import pytest
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.estimate import LocalizationState, assemble
+from locclient.localization.estimate import assemble
 from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.settings import TrackSettings
 from support.fleet.estimates import estimate as estimate_at
@@ -368,7 +368,14 @@ def test_a_pose_of_nan_is_none(broken: str) -> None:
     }
     values[broken] = values[broken] * np.nan
     hypothesis: Any = SimpleNamespace(**values)
-    state = LocalizationState(hypothesis, HypothesisSet(TrackSettings()), None, has_failed=False, was_tracking=True)
-    found = assemble(estimate_at(0.1, known=False), state, TrackSettings())
+    found = assemble(
+        estimate_at(0.1, known=False),
+        TrackSettings(),
+        confirmed=hypothesis,
+        candidates=HypothesisSet(TrackSettings()),
+        prior=None,
+        has_failed=False,
+        was_tracking=True,
+    )
     assert (found.map_from_body, found.cov_rot_trans) == (None, None)
     assert found.status is Status.LOST

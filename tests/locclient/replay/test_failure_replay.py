@@ -28,7 +28,6 @@ from locclient.delivery.failure_file import failure_file, read_failure_file
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.failure_replay import SAME_M, Comparison, compare_failure
 from locclient.replay.replay import load_map
-from locclient.robot.failure_ring import KeptQuery
 from locclient.robot.robot import Robot
 from mapserver import cli as server_cli
 from mapserver.fleet import bounded_process
@@ -183,31 +182,43 @@ def _packed_array(values: Any) -> list[Any]:
     return [array.dtype.str, list(array.shape), array.tobytes()]
 
 
-def _query(name: str, make: Callable[[int], Any]) -> Callable[[Any], None]:
+def _first_query(state: Any) -> Any:
+    queries = (percept["query"] for _, percept in state["frames"])
+    return next(query for query in queries if query and query["features"])
+
+
+def _feature(name: str, make: Callable[[int], Any]) -> Callable[[Any], None]:
     """Another array of the first map query, for its number of features."""
-    place = KeptQuery.__struct_fields__.index(name)
 
     def change(state: Any) -> None:
-        query = next(frame["query"] for frame in state["frames"] if frame["query"] and frame["query"][1])
-        query[place] = _packed_array(make(query[1][1][0]))
+        found = _first_query(state)["features"]["features"]
+        found[name] = _packed_array(make(found["pixels"][1][0]))
+
+    return change
+
+
+def _depths(make: Callable[[int], Any]) -> Callable[[Any], None]:
+    def change(state: Any) -> None:
+        found = _first_query(state)["features"]
+        found["pixels"] = _packed_array(make(found["pixels"][1][0]))
 
     return change
 
 
 def _odometry(name: str, value: Any) -> Callable[[Any], None]:
-    return lambda state: state["frames"][3]["odometry"].update({name: value})
+    return lambda state: state["frames"][3][1]["odometry"].update({name: value})
 
 
 NO_ROBOT_WRITES = {
-    "one descriptor": _query("descriptors", lambda n: np.zeros((1, 32), np.uint8)),
-    "short descriptors": _query("descriptors", lambda n: np.zeros((n, 1), np.uint8)),
-    "no octaves": _query("octaves", lambda n: np.zeros(0, np.int8)),
-    "an octave of -128": _query("octaves", lambda n: np.full(n, -128, np.int8)),
-    "octaves of another kind": _query("octaves", np.zeros),
-    "pixels outside the picture": _query("pixels", lambda n: np.full((n, 2), 1e9)),
-    "pixels that are no numbers": _query("pixels", lambda n: np.full((n, 2), np.nan)),
-    "too many features": _query("pixels", lambda n: np.zeros((10_001, 2))),
-    "columns without end": _query("right_px", lambda n: np.full(n, 1e300)),
+    "one descriptor": _feature("descriptors", lambda n: np.zeros((1, 32), np.uint8)),
+    "short descriptors": _feature("descriptors", lambda n: np.zeros((n, 1), np.uint8)),
+    "no octaves": _feature("octaves", lambda n: np.zeros(0, np.int8)),
+    "an octave of -128": _feature("octaves", lambda n: np.full(n, -128, np.int8)),
+    "octaves of another kind": _feature("octaves", np.zeros),
+    "pixels outside the picture": _feature("pixels", lambda n: np.full((n, 2), 1e9)),
+    "pixels that are no numbers": _feature("pixels", lambda n: np.full((n, 2), np.nan)),
+    "too many features": _feature("pixels", lambda n: np.zeros((10_001, 2))),
+    "columns without end": _depths(lambda n: np.full((n, 3), 1e300)),
     "a picture without pixels": lambda state: state["camera"].update(width_px=0),
     "a picture of 60000 pixels": lambda state: state["camera"].update(width_px=60_000, height_px=60_000),
     "a lens that is none": lambda state: state["camera"].update(focal_px=float("nan")),
@@ -216,7 +227,14 @@ NO_ROBOT_WRITES = {
     "a covariance that is none": _odometry("cov_rot_trans", _packed_array(-np.eye(6))),
     "a skew covariance": _odometry("cov_rot_trans", _packed_array(np.triu(np.ones((6, 6))))),
     "stamps that fall": _odometry("stamp_ns", 1),
-    "slices without end": lambda state: next(f["query"] for f in state["frames"] if f["query"]).__setitem__(0, 10**12),
+    "fewer depths than features": _depths(lambda n: np.zeros((n - 1, 3))),
+    "features with images": lambda state: _first_query(state)["features"].update(
+        is_tried=_packed_array(np.ones(3, bool))
+    ),
+    "a motion that is none": lambda state: state["frames"][3][1].update(
+        motions={0: [_packed_array(np.zeros((4, 4))), _packed_array(np.eye(6)), False]}
+    ),
+    "slices without end": lambda state: _first_query(state).update(slices=10**12),
     "a pose without a covariance": lambda state: state["start"].update(cov_rot_trans=None),
     "a pose that is no transform": lambda state: state["start"].update(map_from_body=_packed_array(np.ones((4, 4)))),
     "a covariance of the pose that is none": lambda state: state["start"].update(

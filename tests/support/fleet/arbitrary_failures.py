@@ -16,7 +16,7 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import FleetmapError
 from fleetmap.failure_summary import decode_summary
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from locclient.delivery.failure_file import decode_record
@@ -87,7 +87,7 @@ def main(failure: Path, store: Path) -> None:
             record = decode_record(msgspec.msgpack.encode(changed), summary)
             compare_failure((summary, record), source)
             counts["played"] += 1
-        except RecordingError:
+        except FleetmapError:
             counts["refused"] += 1
 
     play(state)

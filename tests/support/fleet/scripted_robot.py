@@ -113,7 +113,7 @@ class Robot:
         settings = LocalizerSettings(track=TrackSettings(**track))
         self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
         self.odometry = ScriptedOdometry()
-        self.localizer.perception.odometry = self.odometry  # type: ignore[attr-defined]
+        self.localizer.odometry = self.odometry
         self.frames = 0
         self.inliers = 40
         self.landmark_recall = 1.0

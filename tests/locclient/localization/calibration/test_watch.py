@@ -15,10 +15,11 @@ from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
-from locclient.localization.calibration.monitor import CalibrationMonitor, FinishedQuery
+from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
-from locclient.localization.calibration.watch import CalibrationWatch, MapQuery, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch, MapLook, Mounting
 from locclient.localization.estimate import Estimate
+from locclient.localization.map_query import FinishedQuery
 from support.fleet.estimates import estimate
 from support.worlds.pinhole_pair import seen_with
 
@@ -27,7 +28,7 @@ NO_IMAGE = np.zeros((480, 640), np.uint8)
 LEVEL = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # map_from_cam of a camera that looks along the map's x
 
 
-def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: float = 0.2) -> MapQuery:
+def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: float = 0.2) -> MapLook:
     """The fix of one frame, a metre after the one before, by cameras whose true parameters differ so much from the calibration."""
     matched, map_from_cam, _ = seen_with(parameters, 1000 + number)
     level = se3(so3_exp(np.array([0, 0, yaw_rad * number])) @ LEVEL, np.array([1.1 * number, 0.0, 0.4]))
@@ -40,7 +41,7 @@ def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: flo
         estimate(float(number)).odometry, odom_from_body=se3(body, np.zeros(3)), inertial=turn is not None
     )
     view = cast(MapView, SimpleNamespace(landmark_ids=ids, points_map=points_map))
-    return MapQuery(RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), odometry, fix, view)
+    return MapLook(RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), odometry, fix, view)
 
 
 def parameters(**sizes: float) -> Array:
@@ -145,10 +146,10 @@ def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance
 
 
 def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | None) -> Estimate:
-    return watch.judged(before, last_fix_ns, was_localized=True)
+    return with_calibration(before, watch.state, RIG, last_fix_ns, was_localized=True)
 
 
-def first_look(parameters: Array) -> MapQuery:
+def first_look(parameters: Array) -> MapLook:
     return replace(look(0, parameters), is_confirmed=True)
 
 
@@ -220,7 +221,7 @@ def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) ->
         for stamp in (0, 100_000_000, 600_000_000, 700_000_000)
     ]
     assert answers == [False, False, True, True]
-    refused = published(monitor, estimate(1.0), 1_000_000_000)
+    refused = published(monitor, estimate(1.0), None)
     assert (refused.status, refused.cause, refused.map_from_body) == (Status.LOST, Cause.CALIBRATION, None)
     assert "exchanged" in refused.calibration.text
 

@@ -1,0 +1,232 @@
+"""Map queries: when one begins, and the work of one, spread over frames. Pure."""
+
+from dataclasses import dataclass
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import Array
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.frame_features import FrameFeatures
+from fleetmap.relocalization.relocalizer import Fix, Relocalizer
+from fleetmap.sensors.rectification import RectifiedFrame
+from locclient.localization.alias_disambiguation import ViewpointGate
+from locclient.localization.calibration.pair_order import REVERSED_TEXT
+from locclient.localization.estimate import QueryResult
+from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.pose_covariance import transport_cov
+from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.pose_tracker import PoseTracker
+from locclient.localization.settings import LocalizerSettings
+
+_SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
+_HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
+_MORE_SLICES = 3  # in a frame: of a search where the last one began too, as a late estimate costs nothing there, and where tracks broke
+
+
+@dataclass(frozen=True)
+class FinishedQuery:
+    """A look at the map that has ended, with or without a fix; whether the pose is confirmed."""
+
+    frame: RectifiedFrame
+    odometry: OdometryEstimate
+    features: FrameFeatures
+    fix: Fix | None
+    relocalizer: Relocalizer
+    is_confirmed: bool
+
+
+class MapQuery:
+    """Looks at the map from time to time, a slice of work with each frame.
+
+        IDLE      --due by the interval, or at once where tracks broke-->  EXTRACT   features of that frame
+        EXTRACT   --a pose is confirmed-->                                 NEAR      landmarks expected around it
+        EXTRACT   --none is-->                                             SEARCH    near candidates, then in the whole map or the prior
+        NEAR      --nothing there, and not for the first time-->           SEARCH
+        any       --slices used up-->                                      goes on with the next frame
+        any       --version changes, forget, tracks break-->               IDLE, without a result
+        NEAR, SEARCH --done-->                                             IDLE, with fixes for the tracker
+
+    failed: the last so many queries found nothing.
+    """
+
+    def __init__(self, tracker: PoseTracker, settings: LocalizerSettings) -> None:
+        self._tracker, self._settings, self._track = tracker, settings, settings.track
+        self.relocalizer: Relocalizer | None = None
+        self.failed = 0
+        self.finished: FinishedQuery | None = None  # with the last frame
+        self._job: TimeSliced[QueryResult] | None = None
+        self._begun: tuple[Percept, RectifiedFrame | None] | None = None  # the frame of that job, or of the last one
+        self._begun_ns: int | None = None
+        self._slices, self._is_urgent = 1, False  # of that job: in a frame; it began where tracks broke
+        self._last_ns: int | None = None  # of the last frame
+        self._gate = ViewpointGate()
+        self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
+
+    @property
+    def is_under_way(self) -> bool:
+        return self._job is not None
+
+    def use(self, relocalizer: Relocalizer) -> None:
+        """Another map: a query that goes on is given up."""
+        self.relocalizer = relocalizer
+        self._cancel()
+        self._failed_places.clear()
+
+    def forget(self) -> None:
+        """The pose is not known any more: a query that goes on is given up."""
+        self._cancel()
+        self.failed = 0
+        self._failed_places.clear()
+
+    def _cancel(self) -> None:
+        self._job = None
+        self._tracker.end_query()
+
+    def step(self, percept: Percept, frame: RectifiedFrame | None) -> QueryResult:
+        """The result of a query that is finished with this frame, with the stamp of the frame that it is for; an empty one otherwise.
+
+        Queries are spread over frames, but for the first one, those after a gap, and those of recordings with hardly more frames
+        than queries. frame: None in a replay, where queries begin as they did.
+        """
+        self.finished = None
+        if percept.odometry.new_odom_from_old_odom is not None:
+            self._gate.redefine_odom(percept.odometry.new_odom_from_old_odom)
+        result = QueryResult(refused=REVERSED_TEXT) if percept.is_reversed else self._step(percept, frame)
+        self._last_ns = percept.odometry.stamp_ns
+        return result
+
+    def _step(self, percept: Percept, frame: RectifiedFrame | None) -> QueryResult:
+        odometry, is_at_once = percept.odometry, False
+        is_urgent = percept.has_broken and not self.failed
+        if is_urgent and not self._is_urgent:
+            self._cancel()  # a frame before the break says nothing about where the robot is now
+        if self._job is None and self.relocalizer is not None:
+            is_due = is_urgent or self._is_due(odometry)
+            begins = percept.query is not None if frame is None else is_due
+            if begins:
+                is_at_once = self._is_sparse(odometry.stamp_ns) or odometry.after_gap
+                self._begin(percept, frame, self.relocalizer, is_urgent=is_urgent)
+        return self._advance(is_at_once=is_at_once)
+
+    def _is_due(self, odometry: OdometryEstimate) -> bool:
+        confirmed, last_ns = self._tracker.confirmed, self._begun_ns
+        support = 0 if confirmed is None else confirmed.support
+        interval_s = self._track.query_interval_s(support, is_sure=odometry.inertial and not self.failed)
+        return last_ns is None or odometry.after_gap or (odometry.stamp_ns - last_ns) * 1e-9 >= 0.999 * interval_s
+
+    def _is_sparse(self, stamp_ns: int) -> bool:
+        """Whether there are too few frames to spread a query over."""
+        if self._begun_ns is None or self._last_ns is None:
+            return True
+        return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
+
+    def _begin(
+        self, percept: Percept, frame: RectifiedFrame | None, relocalizer: Relocalizer, *, is_urgent: bool
+    ) -> None:
+        odometry, tracker = percept.odometry, self._tracker
+        percept.query = percept.query or QueryInput()
+        self._begun = percept, frame
+        self._begun_ns = odometry.stamp_ns
+        tracker.begin_query(odometry)
+        is_at_rest = tracker.confirmed is None and not self._gate.is_new(odometry.odom_from_body)
+        self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_at_rest or is_urgent else 1
+        if not is_at_rest:
+            self._failed_places.clear()
+        self._job = self._run(percept.query, frame, relocalizer, is_sparse=self._is_sparse(odometry.stamp_ns))
+
+    def _advance(self, *, is_at_once: bool) -> QueryResult:
+        if self._job is None:
+            return QueryResult()
+        try:
+            for _ in range(self._slices):
+                next(self._job)
+            while is_at_once:
+                next(self._job)
+        except StopIteration as done:
+            result: QueryResult = done.value._replace(fix_stamp_ns=self._begun_ns)
+            self._cancel()
+            self._is_urgent = False
+            self.failed = 0 if result.fix is not None else self.failed + 1
+            assert self._begun is not None
+            assert self.relocalizer is not None
+            percept, frame = self._begun
+            if frame is not None and percept.query is not None and percept.query.features is not None:
+                is_confirmed = self._tracker.confirmed is not None
+                looked = percept.odometry, percept.query.features, result.fix, self.relocalizer, is_confirmed
+                self.finished = FinishedQuery(frame, *looked)
+            return result
+        return QueryResult()
+
+    def _run(
+        self, query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer, *, is_sparse: bool
+    ) -> TimeSliced[QueryResult]:
+        tracker = self._tracker
+        features = yield from _extract(query, frame, relocalizer)
+        confirmed = tracker.confirmed
+        if confirmed is None:
+            fixes = yield from self._search(features, relocalizer)
+            return (yield from tracker.update_candidates(fixes))
+        near = self._near(features, relocalizer, confirmed)
+        fixes = [] if near is None else [near]
+        if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
+            yield
+            fixes = yield from relocalizer.anywhere(features, None, self._rotation(confirmed))
+            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
+        return tracker.update(fixes, confirmed, is_near=near is not None)
+
+    def _near(self, features: FrameFeatures, relocalizer: Relocalizer, hypothesis: PoseHypothesis) -> Fix | None:
+        """The fix near a hypothesis at the frame of the query."""
+        map_from_body = hypothesis.query_map_from_body
+        map_from_cam = map_from_body @ self._tracker.body_from_cam
+        cov_cam = transport_cov(hypothesis.query_cov, map_from_cam[:3, 3] - map_from_body[:3, 3])
+        return relocalizer.near(features, map_from_cam, cov_cam)
+
+    def _rotation(self, hypothesis: PoseHypothesis) -> Array:
+        return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]
+
+    def _search(self, features: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
+        """Fixes in the whole map, or within the prior; around the candidates first."""
+        tracker, fixes = self._tracker, list[Fix]()
+        candidates = tracker.candidates.hypotheses
+        for number, candidate in enumerate(candidates, start=1):
+            fix = self._near(features, relocalizer, candidate)
+            if fix is not None:
+                fixes.append(fix)
+            if number % _HYPOTHESES_AT_ONCE == 0:
+                yield
+        rotation = self._rotation(candidates[0]) if len(candidates) == 1 else None
+        prior = tracker.prior
+        near = None if prior is None else prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
+        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places)
+        fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
+        prior = tracker.prior
+        if prior is None:
+            return fixes
+        within = tracker.within_prior(fixes)
+        if within or not prior.is_revisable:
+            return fixes if prior.is_revisable else within  # a person may have named an alias of the place
+        yield
+        fixes = yield from relocalizer.anywhere(features, None, None)
+        fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
+        return fixes if tracker.drops_prior(fixes) else []
+
+
+def _extract(query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer) -> TimeSliced[FrameFeatures]:
+    """The features of a frame, kept in `query`; those that were kept, in as many slices, where there is no frame."""
+    if frame is None:
+        for _ in range(query.slices):
+            yield
+        if query.features is None:
+            raise RecordingError(
+                "a map query without features is over before they are there; was the file made by a robot?"
+            )
+        return query.features
+    work = relocalizer.extract(frame)
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            query.features = done.value
+            return query.features
+        query.slices += 1
+        yield

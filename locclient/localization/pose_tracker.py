@@ -1,0 +1,268 @@
+"""Where the robot is in its map: a prior, competing candidates or one confirmed pose, carried on by the odometry. Pure."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.numerics.time_sliced import TimeSliced
+from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.map_view import LookAlikes
+from fleetmap.relocalization.relocalizer import Fix, is_reliable
+from fleetmap.sensors.samples import PositionPrior
+from locclient.localization.estimate import QueryResult
+from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
+from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
+from locclient.localization.pose_covariance import innovation_of, kalman_update, transport_cov
+from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
+from locclient.localization.settings import LocalizerSettings
+
+_OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
+NO_AGREEMENT = QueryResult(refused="nothing in the map agrees with this frame")
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a localizer begins with: by default it searches for itself.
+
+    map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
+    of which stamp_ns and support are; else by a prior, with its is_revisable and travelled_m, the distance since it came. has_broken:
+    tracks broke since. was_tracking: the robot has known its pose before. failed_queries: the last so many map queries found nothing.
+    """
+
+    frame_index: int = 0
+    stamp_ns: int = 0
+    support: int = 0
+    map_from_body: Array | None = None
+    cov_rot_trans: Array | None = None
+    is_confirmed: bool = False
+    is_revisable: bool = False
+    travelled_m: float = 0.0
+    has_broken: bool = False
+    was_tracking: bool = False
+    failed_queries: int = 0
+
+
+class PoseTracker:
+    """Carries hypotheses from frame to frame, confirms one of them, and gives it up.
+
+    SEARCHING   nothing, or a prior, by which and by odometry the pose is DEGRADED    <--+
+        | fixes                                                                          | forget
+        v                                                                                |
+    CANDIDATES  poses of fixes; AMBIGUOUS where several agree with what is seen       ---+
+        | enough fixes over enough distance or a tight prior, and no competitor       |  |
+        v                                                                             |  |
+    CONFIRMED   each fix within its gate updates it                                   ---+
+        | several fixes beyond its gate agree with each other: the robot was carried
+        v
+    CANDIDATES  at the places of these fixes
+    """
+
+    def __init__(self, settings: LocalizerSettings, body_from_cam: Array, base_from_body: Array) -> None:
+        self._settings, self._track = settings, settings.track
+        self.body_from_cam, self._base_from_body = body_from_cam, base_from_body
+        self._cam_from_body = se3_inverse(body_from_cam)
+        self.prior: InitialPosePrior | None = None
+        self.candidates = HypothesisSet(settings.track)  # while none is confirmed
+        self.confirmed: PoseHypothesis | None = None
+        self.was_tracking = False
+        self.lookalikes: LookAlikes | None = None
+        self.odom_from_body: Array | None = None  # of the last frame
+        self._query_frame: PoseHypothesis | None = None  # of the map query that goes on, as the identity
+        self._query_index: int | None = None  # of the last map query's frame
+
+    # --- priors and starts --------------------------------------------------------------------------------------------
+
+    def handle_prior(self, prior: PositionPrior) -> None:
+        """A prior at this moment, in the place of any before."""
+        self.prior = InitialPosePrior(prior, self._base_from_body)
+
+    def is_contradicted_by(self, prior: PositionPrior) -> bool:
+        """Whether a confirmed pose lies outside the bound of a prior."""
+        return self.confirmed is not None and not agrees(prior, self.confirmed, self._base_from_body)
+
+    def forget(self, *, keeps_new_prior: bool = False) -> None:
+        """Searches for itself from now on. keeps_new_prior: one that came since the last frame says where the robot is now."""
+        if not (keeps_new_prior and self.prior is not None and self.prior.is_new):
+            self.prior = None
+        self.confirmed = self._query_frame = None
+        self.candidates.reset()
+        self.was_tracking = False
+
+    def start(self, failed_queries: int) -> Start:
+        """What another tracker, with the same odometry, goes on with."""
+        prior = self.prior
+        known = self.confirmed or (None if prior is None else prior.hypothesis)
+        start = Start(was_tracking=self.was_tracking, failed_queries=failed_queries)
+        if known is None:
+            return start
+        return replace(
+            start,
+            frame_index=known.frame_index,
+            stamp_ns=known.stamp_ns,
+            support=known.support,
+            map_from_body=known.map_from_body,
+            cov_rot_trans=known.cov_rot_trans,
+            is_confirmed=self.confirmed is not None,
+            is_revisable=prior is not None and prior.is_revisable,
+            travelled_m=0.0 if prior is None else prior.travelled_m,
+            has_broken=known.has_broken,
+        )
+
+    def begin(self, start: Start) -> None:
+        """Goes on from `start` with the next frame."""
+        self.forget()
+        self.was_tracking = start.was_tracking
+        if start.map_from_body is None or start.cov_rot_trans is None:
+            return
+        at_frame = start.map_from_body, start.cov_rot_trans
+        known = PoseHypothesis(start.frame_index, start.stamp_ns, *at_frame, *at_frame, support=start.support)
+        known.has_broken = start.has_broken
+        if start.is_confirmed:
+            self.confirmed = known
+        else:
+            self.prior = InitialPosePrior.at(known, self._base_from_body, is_revisable=start.is_revisable)
+            self.prior.travelled_m = start.travelled_m
+
+    # --- propagation --------------------------------------------------------------------------------------------------
+
+    @property
+    def frame_indices(self) -> set[int]:
+        """Frames of the odometry whose motion to the next frame `propagate` needs."""
+        # Of the last query's frame, too: another version may find a fix there, and go on from it.
+        last_query = set() if self._query_index is None else {self._query_index}
+        return {hypothesis.frame_index for hypothesis in self._tracked()} | last_query
+
+    def propagate(self, odometry: OdometryEstimate, motions: Mapping[int, Motion], *, has_broken: bool) -> None:
+        """Carries every hypothesis to the present frame. has_broken: tracks are lost though the picture is sound."""
+        change, last = odometry.new_odom_from_old_odom, self.odom_from_body
+        if last is not None and change is not None:
+            last = change @ last
+        step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
+        if odometry.previous_from_body is not None:
+            step = odometry.previous_from_body
+        for hypothesis in self._tracked():
+            hypothesis.propagate(motions, odometry, step, self._track)
+            hypothesis.has_broken |= has_broken
+            if change is not None:
+                hypothesis.history.redefine_odom(change)
+        if change is not None:
+            self.candidates.redefine_odom(change)
+        self.odom_from_body = odometry.odom_from_body
+        if self.prior is not None:
+            self.prior.propagate(odometry, step)
+
+    def _tracked(self) -> list[PoseHypothesis]:
+        found = [*self.candidates.tracked(), *([] if self.prior is None else self.prior.tracked())]
+        if self.confirmed is not None:
+            found += [self.confirmed, *self.confirmed.kidnap_hypotheses]
+        return found if self._query_frame is None else [*found, self._query_frame]
+
+    # --- fixes of a map query -----------------------------------------------------------------------------------------
+
+    def begin_query(self, odometry: OdometryEstimate) -> None:
+        """A map query begins with the present frame; its fixes may come some frames later."""
+        for hypothesis in self._tracked():
+            hypothesis.mark_query()
+        self._query_frame = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
+        self._query_index = odometry.frame_index
+
+    def end_query(self) -> None:
+        self._query_frame = None
+
+    def observations(self, fixes: Sequence[Fix]) -> Observations:
+        """The fixes of the query that goes on, with their poses at the present."""
+        assert self._query_frame is not None
+        found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
+        return found if self.prior is None else self.prior.weighed(found, self._track)
+
+    def is_reliable(self, fix: Fix) -> bool:
+        return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
+
+    def _at_body(self, fix: Fix) -> tuple[Array, Array]:
+        """A fix as map_from_body with its covariance (map axes, about the body)."""
+        map_from_body = fix.map_from_cam @ self._cam_from_body
+        return map_from_body, transport_cov(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
+
+    def within_prior(self, fixes: Sequence[Fix]) -> list[Fix]:
+        """The fixes that the prior admits."""
+        assert self.prior is not None
+        return [fix for fix, hypothesis in self.observations(fixes) if self.prior.is_compatible(hypothesis)]
+
+    def drops_prior(self, fixes: Sequence[Fix]) -> bool:
+        """Whether fixes without any within the prior contradict it by now; it is dropped then, and what they name must be confirmed."""
+        assert self.prior is not None
+        if not self.prior.is_contradicted(self.observations(fixes), self._track, self.lookalikes):
+            return False
+        self.prior = None
+        self.candidates.reset()
+        return True
+
+    def update(self, fixes: list[Fix], confirmed: PoseHypothesis, *, is_near: bool) -> QueryResult:
+        """Kalman update of the confirmed pose at the frame of the query. Fixes beyond its chi-square gate are refused, and so are
+        several within it: long without the map, the gate may hold the pose's own alias.
+
+        Sources: Bar-Shalom et al. 2001 (validation gate), Bucy and Joseph 1968 (covariance update).
+        """
+        assert self._query_frame is not None
+        if not fixes:
+            return NO_AGREEMENT
+        map_from_body, covariance = confirmed.query_map_from_body, confirmed.query_cov
+        innovations = [(fix, *innovation_of(*self._at_body(fix), map_from_body, covariance)) for fix in fixes]
+        # A fix near the prediction is tested by the gate alone; one found by search must be reliable besides.
+        limit = self._track.innovation_limit
+        gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
+        fix, error, innovation = min(innovations, key=lambda entry: entry[2])
+        off_m = float(np.linalg.norm(error[3:]))
+        if len(gated) != 1:
+            self._detect_kidnapping(fixes, confirmed)
+            if gated:
+                return QueryResult(None, f"{len(gated)} places agree with what was seen", innovation)
+            reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
+            return QueryResult(None, reason, innovation, off_m if is_near else None)
+        _, cov_fix = self._at_body(fix)
+        updated = kalman_update(map_from_body, covariance, error, cov_fix)
+        self.confirmed = PoseHypothesis.at_query(self._query_frame, *updated)
+        self.confirmed.support = confirmed.support + 1
+        return QueryResult(fix, "", innovation, off_m)
+
+    def _detect_kidnapping(self, fixes: list[Fix], confirmed: PoseHypothesis) -> None:
+        """Abandons the confirmed pose when refused fixes agree with each other query after query; theirs must be confirmed anew."""
+        assert self.odom_from_body is not None
+        self.candidates.observe(self.observations(fixes), confirmed.kidnap_hypotheses, self.odom_from_body)
+        hypotheses = confirmed.kidnap_hypotheses = recent(confirmed.kidnap_hypotheses, self._track)
+        telling = [h.support for h in hypotheses if h.speaks_against_others(self._track)]
+        if max(telling, default=0) >= self._track.kidnap_fixes:
+            self.candidates.reset(confirmed, hypotheses)
+            self.confirmed = None
+            self.prior = None  # it led to that pose
+
+    def update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
+        """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
+        assert self.odom_from_body is not None
+        candidates = self.candidates
+        is_near = self.prior is not None and self.prior.is_tight(self._track.near_prior_sigma_m)
+        # Whether the robot cannot be where nothing is mapped and all looks like a place of the map.
+        is_excluded = self.lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
+        candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self.lookalikes
+        yield from candidates.update(self.observations(fixes), self.odom_from_body)
+        if not fixes:
+            return NO_AGREEMENT
+        (best, *_), competitors = candidates.ranking()
+        if competitors:
+            return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
+        moved_m = None
+        has_prior = self.prior is not None and self.prior.confirms(best, self._track)
+        if not has_prior and candidates.may_be_lookalike(best):
+            return QueryResult(None, "a place that is not in the map may look as much like this one")
+        if has_prior or candidates.is_confirmed(best, fixes):
+            moved_m = candidates.moved_m(best)
+            candidates.reset()
+            self.confirmed, self.prior = best, None
+            self.was_tracking = True
+        best_m = best.now_map_from_body[:3, 3]
+        for fix, hypothesis in self.observations(fixes):
+            if np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m) < _OWN_FIX_M:
+                return QueryResult(fix, moved_m=moved_m)
+        return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)
