@@ -61,7 +61,6 @@ class RobotIdentity:
 
     @property
     def tls(self) -> TlsFiles:
-        """Files of the connection."""
         return TlsFiles(self.folder / "servers.ca", self.folder / "robot.pem")
 
     def certificate(self) -> "CertificateInfo":
@@ -189,7 +188,6 @@ class MapAddress:
 
     @property
     def tls(self) -> TlsFiles | None:
-        """Files of the connection, None without TLS."""
         return None if self.identity is None else self.identity.tls
 
 

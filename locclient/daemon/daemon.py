@@ -35,7 +35,7 @@ from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.jit_warmup import drop_compiler_code, gc_frozen, warm_up_kernels
 from locclient.robot.robot import Robot
-from locclient.vda5050.adapter import AdapterParts, FleetAdapter
+from locclient.vda5050.adapter import FleetAdapter
 from locclient.vda5050.factsheet import read_factsheet
 from locclient.vda5050.fleet_maps import FleetMaps
 from locclient.vda5050.mqtt_link import MqttLink
@@ -203,15 +203,15 @@ def _fleet_manager(
         server.follows = False
         folder = cache_folder(config.run.cache) / "incoming"
         maps = FleetMaps(cache, site, folder, origins_of(section, insecure=insecure), client.check_admitted)
-    parts = AdapterParts(
-        site=site,
-        maps=maps,
+    adapter = FleetAdapter(
+        section,
+        site,
+        maps,
         active=client.active,
         offer=server.fetched.append,
         put_prior=intake.put_prior,
         lost_radius_m=config.localizer.track.lost_radius_m,
     )
-    adapter = FleetAdapter(section, parts)
     server.on_change = adapter.changed_version
     sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet))
     return MqttLink(check_section(section, insecure=insecure), section, adapter, sheet)

@@ -60,7 +60,6 @@ class PoseHistory:
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest pose."""
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def at(self, stamp_ns: int) -> Array | Missing:
@@ -123,7 +122,6 @@ class DriverOdometry:
             self._take(link, self._odometry)
 
     def handle_tf(self, links: list[FrameLink]) -> None:
-        """Transforms of /tf."""
         with self._lock:
             for link in links:
                 if link.parent == self._odom:
@@ -135,7 +133,6 @@ class DriverOdometry:
             self._parents |= {link.child: link for link in decode_frame_links(message) if link.is_usable}
 
     def handle_frame(self, stamp_ns: int, map_from_base: Array) -> None:
-        """A localized frame."""
         with self._lock:
             self._since_ns = stamp_ns if self._since_ns is None or stamp_ns < self._since_ns else self._since_ns
             self._waiting.append((stamp_ns, map_from_base))

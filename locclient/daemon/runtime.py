@@ -95,7 +95,6 @@ class Runtime:
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
     def stop(self) -> None:
-        """Ends `run` soon; may be called from a signal's handler."""
         self._stop.set()
         self._sensors_stop.set()
 

@@ -101,7 +101,6 @@ class ServerSync:
             self._backoff_s = _BACKOFF_S
 
     def close(self) -> None:
-        """Takes back the robot's presence."""
         for handle in self._handles:
             handle.close()
 

@@ -71,13 +71,11 @@ class Outbox:
             self._make_room(database)
 
     def waiting(self, limit: int = 1) -> list[QueuedReport]:
-        """The oldest reports."""
         with self._transaction("DEFERRED") as database:
             rows = database.execute("SELECT id, payload FROM report ORDER BY number LIMIT ?", (limit,)).fetchall()
         return [QueuedReport(*row) for row in rows]
 
     def done(self, report_id: str) -> None:
-        """Removes a report that arrived."""
         self._remove(report_id, "delivered")
 
     def refused(self, report_id: str) -> None:

@@ -25,7 +25,6 @@ class ReplayQueue:
         self._pending: deque[tuple[FailureReport, FailureCut]] = deque(maxlen=_MAX_PENDING)
 
     def add(self, report: FailureReport, cut: FailureCut | None) -> None:
-        """A failure that was reported."""
         if cut is None:
             return
         if len(self._pending) == _MAX_PENDING:

@@ -63,7 +63,6 @@ class ViewpointGate:
         return True
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
-        """The odometry has redefined its frame."""
         if self.odom_from_body is not None:
             self.odom_from_body = new_odom_from_old_odom @ self.odom_from_body
 
@@ -90,7 +89,6 @@ class ObservationHistory:
         self._keep(np.flatnonzero(self.expected))
 
     def add(self, odom_from_map: Array, observed: CovisibleLandmarks) -> None:
-        """Landmarks of the view that began."""
         self.views |= 1
         ids, inverse = np.unique(np.concatenate([self.ids, observed.ids]), return_inverse=True)
         old, new = inverse[: len(self.ids)], inverse[len(self.ids) :]
@@ -114,7 +112,6 @@ class ObservationHistory:
         return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
-        """The odometry has redefined its frame."""
         self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
 
     def _keep(self, rows: NDArray[np.int64]) -> None:

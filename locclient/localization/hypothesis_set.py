@@ -164,11 +164,9 @@ class HypothesisSet:
         self.lookalikes: LookAlikes | None = None  # None where nobody measured them
 
     def tracked(self) -> list[PoseHypothesis]:
-        """All that must be propagated by the odometry."""
         return [*self.hypotheses, *([self._abandoned] if self._abandoned else [])]
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
-        """The odometry has redefined its frame."""
         self._viewpoint_gate.redefine_odom(new_odom_from_old_odom)
 
     def reset(self, abandoned: PoseHypothesis | None = None, hypotheses: Sequence[PoseHypothesis] = ()) -> None:

@@ -68,7 +68,6 @@ class InitialPosePrior:
 
     @property
     def is_new(self) -> bool:
-        """True if no frame has come since."""
         return self._since is None
 
     def propagate(self, odometry: OdometryEstimate, step: Array) -> None:
@@ -84,7 +83,6 @@ class InitialPosePrior:
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance)
 
     def tracked(self) -> list[PoseHypothesis]:
-        """All that must be propagated by the odometry."""
         return [*filter(None, (self.hypothesis, self._since)), *self.contradictions]
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:

@@ -54,11 +54,9 @@ class Localizer:
         self._last_ns: int | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
-        """IMU samples newer than any before."""
         self.odometry.handle_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """Wheel odometry newer than any before."""
         self.odometry.handle_wheel(samples)
         self._calibration.watch.handle_wheel(samples)
 

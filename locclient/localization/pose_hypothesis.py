@@ -64,7 +64,6 @@ class PoseHypothesis:
 
     @classmethod
     def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
-        """At the present frame."""
         return cls(odometry.frame_index, odometry.stamp_ns, map_from_body, cov_rot_trans, map_from_body, cov_rot_trans)
 
     @classmethod
@@ -76,17 +75,14 @@ class PoseHypothesis:
 
     @property
     def mean_inliers(self) -> float:
-        """Inliers per query, later ones weighing more."""
         return self.inlier_sum / max(self.queries, 1.0)
 
     @property
     def mean_recall(self) -> float:
-        """Landmark recall per query, later ones weighing more."""
         return self.recall_sum / max(self.queries, 1.0)
 
     @property
     def recall(self) -> float:
-        """Landmark recall, mean of all queries."""
         return self.recall_total / max(self.looks, 1)
 
     def speaks_against_others(self, settings: TrackSettings) -> bool:
@@ -105,7 +101,6 @@ class PoseHypothesis:
         self.looks += 1
 
     def add_fix(self, inliers: int, landmark_recall: float) -> None:
-        """Counts a fix of this query at this pose."""
         self.inlier_sum += inliers
         self.recall_sum += landmark_recall
         self.recall_total += landmark_recall

@@ -21,7 +21,6 @@ class LoadedMap:
 
     @property
     def version(self) -> int:
-        """Its number."""
         return self.manifest.version
 
     @property

@@ -296,7 +296,6 @@ class MapClient(MapSource):
         return decode_message(answer, FailureAck)
 
     def publish_health(self, health: RobotHealth) -> None:
-        """Sends the robot's report."""
         self._bus.publish(self._key("health"), encode_message(health))
 
     def publish_pose(self, message: PoseMessage) -> None:

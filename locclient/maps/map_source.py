@@ -111,7 +111,6 @@ class LocalMapSource(MapSource):
         self._folder, self._version = folder, version
 
     def ready(self) -> ReadyVersion:
-        """The version that is asked for, else the site's current one."""
         return ReadyVersion(self.wanted())
 
     def wanted(self) -> WantedVersion:

@@ -26,7 +26,6 @@ class ActiveVersion(msgspec.Struct, frozen=True):
     blobs: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
     def wanted(self, site: str) -> WantedVersion:
-        """The same as a server names a version."""
         return WantedVersion(site=site, version=self.version, manifest_sha256=self.blobs[0])
 
 
@@ -56,7 +55,6 @@ class TileCache:
 
     @property
     def total_bytes(self) -> int:
-        """Bytes of all cached files."""
         return sum(self._sizes.values())
 
     def get(self, sha256: str) -> bytes | None:
@@ -118,7 +116,6 @@ class TileCache:
         self._evict(keep="")
 
     def active(self, site: str) -> ActiveVersion | None:
-        """The site's version that this robot has whole, None before the first one."""
         return self._active.get(site)
 
     def keep(self, site: str, version: int, blobs: Sequence[str]) -> None:

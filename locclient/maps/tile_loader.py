@@ -68,7 +68,6 @@ class TileLoader:
             version.cells = None
 
     def keep_only(self, held: list[WantedVersion]) -> None:
-        """Drops all other versions."""
         kept = {wanted.manifest_sha256 for wanted in held}
         self._versions = {sha256: version for sha256, version in self._versions.items() if sha256 in kept}
 

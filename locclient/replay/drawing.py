@@ -48,11 +48,9 @@ class Canvas:
         cv2.fillPoly(self._pixels, [_fixed(points)], colour, cv2.LINE_AA, _SHIFT)
 
     def box(self, low: Array, high: Array, colour: Colour) -> None:
-        """A filled rectangle."""
         self.area(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]), colour)
 
     def dot(self, centre: Array, radius: float, colour: Colour) -> None:
-        """A disc."""
         (x, y), fine_radius = _fixed(centre).tolist(), round(radius * _FINER * 2**_SHIFT)
         cv2.circle(self._pixels, (x, y), fine_radius, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
 

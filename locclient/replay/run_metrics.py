@@ -36,7 +36,6 @@ class FrameRecord:
 
     @property
     def error_m(self) -> float | None:
-        """Distance between estimate and truth."""
         return None if self.error_map_m is None else float(np.linalg.norm(self.error_map_m))
 
 

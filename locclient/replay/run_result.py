@@ -42,7 +42,6 @@ class ReplayResult:
 
     @property
     def stamps_ns(self) -> Stamps:
-        """(N,) stamps of the frames."""
         return np.array([estimate.stamp_ns for estimate in self.estimates], np.int64)
 
     @property
@@ -61,7 +60,6 @@ class ReplayResult:
 
     @property
     def statuses(self) -> list[Status]:
-        """Status of each frame."""
         return [estimate.status for estimate in self.estimates]
 
     def aligned_error_m(self) -> dict[str, float] | None:
@@ -95,7 +93,6 @@ class ReplayResult:
 
     @property
     def report(self) -> dict[str, object]:
-        """Figures of the run; docs/reports.md explains the keys."""
         built: dict[str, object] = {name: metric(self.frames) for name, metric in METRICS.items()}
         built["aligned_error_m"] = self.aligned_error_m()
         built["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0

@@ -41,7 +41,6 @@ class RunViewer:
         self._add(Shown.now(channels.lens(first_ns, profile.camera)))
 
     def handle(self, outcome: Outcome) -> None:
-        """The next frame's."""
         estimate, published, profile = outcome.estimate, outcome.published, self._profile
         stamp_ns, number = estimate.stamp_ns, self._number
         self._number += 1

@@ -38,7 +38,6 @@ class Belief:
     recall: float
 
     def carried_on(self, odom_from_body: Array) -> Array:
-        """map_from_body (4, 4) at a later frame, by odometry."""
         return self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
 
     @property

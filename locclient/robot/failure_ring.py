@@ -111,7 +111,6 @@ class FailureRing:
         self._pictured_ns = -(2**62)
 
     def use(self, loaded: LoadedMap) -> None:
-        """The localizer takes these tiles before the next frame."""
         used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles))
         self._used = self._commands.used = used
 

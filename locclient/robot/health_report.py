@@ -29,7 +29,6 @@ class FixFigures:
         self._speed_mps: float | None = None
 
     def handle(self, estimate: Estimate, dock_error_m: float | None, speed_mps: float | None = None) -> None:
-        """Counts a frame."""
         self._speed_mps = speed_mps
         was_tracking = self._last is not None and self._last.status is Status.TRACKING
         self._last = estimate
@@ -73,7 +72,6 @@ class HealthFigures:
         self.search = SearchWay()
 
     def handle(self, outcome: Outcome) -> None:
-        """Counts a frame."""
         estimate = outcome.estimate
         self.last = outcome
         self._frame_ms.append(1e3 * outcome.cpu_s)
@@ -88,7 +86,6 @@ class HealthFigures:
         self.search.handle(estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
 
     def count_failure(self) -> None:
-        """Counts a detected failure."""
         self._failures += 1
 
     def report(

@@ -145,7 +145,6 @@ class Robot:
 
     @property
     def running(self) -> LoadedMap | None:
-        """The version that the localizer uses."""
         versions = self._versions
         return versions.good if versions.candidate is None or versions.is_recheck else versions.candidate
 

@@ -70,7 +70,6 @@ class ActionBook:
             del self._states[key]
 
     def clear(self) -> None:
-        """Forgets what is finished or failed."""
         self._states = {key: state for key, state in self._states.items() if state.action_status not in OVER}
 
     def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
@@ -104,15 +103,12 @@ class ActionBook:
         del self._errors[until][:-_MOST_STATES]
 
     def end(self, until: str) -> None:
-        """Ends errors."""
         self._errors.pop(until, None)
 
     @property
     def states(self) -> list[ActionState]:
-        """In the order in which the actions came."""
         return list(self._states.values())
 
     @property
     def errors(self) -> list[Error]:
-        """Those that stand."""
         return [error for errors in self._errors.values() for error in errors]

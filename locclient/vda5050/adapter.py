@@ -4,7 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_definition import is_driving
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.robot import Change, Outcome, VersionChange
@@ -26,6 +26,7 @@ _MOST_JOBS = 16
 _ENABLE_S = 120.0  # for the trial of a version, and for the trial of the one before that follows where it fails
 _TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a floor, which is all that x, y and theta say about it
 _SIGMAS = 3.7  # as far from where the fleet manager put it a robot still agrees
+_ERRORS = {DuplicateMapError: ("DUPLICATE_MAP", "WARNING"), NoRoomError: ("INSUFFICIENT_MEMORY", "URGENT")}
 _UNKNOWN: dict[str, Any] = {
     "operatingMode": "STARTUP",
     "powerSupply": {"stateOfCharge": 0.0, "charging": False},
@@ -38,49 +39,6 @@ _EMPTY: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class AdapterParts:
-    """maps: None where the map server chooses the version. offer: gives a version to the localizer; put_prior: a pose.
-
-    active: the version that the robot has whole, from the thread that calls `work`. lost_radius_m: of 95 %, beyond which it is LOST.
-    """
-
-    site: str
-    maps: FleetMaps | None
-    active: Callable[[], WantedVersion | None]
-    offer: Callable[[WantedVersion], None]
-    put_prior: Callable[[PositionPrior], None]
-    lost_radius_m: float
-
-
-@dataclass
-class _Pending:
-    """Actions that wait for the localizer."""
-
-    enable: tuple[Action, WantedVersion, float] | None = None
-    position: tuple[Action, Position, float] | None = None
-
-
-@dataclass
-class _Robot:
-    """What came of the robot's own program last, and when."""
-
-    part: RobotPart | None = None
-    heard_s: float = 0.0
-    last_node: tuple[str, str] | None = None  # by initializePosition, and what the robot said then
-
-
-@dataclass
-class _Known:
-    """fleet_from_map: None while the map does not say where it lies in the frame that the fleet manager speaks."""
-
-    localization: Localization = field(default_factory=Localization)
-    versions: list[tuple[int, bool]] = field(default_factory=list)
-    in_use: frozenset[int] = frozenset()
-    robot: _Robot = field(default_factory=_Robot)
-    fleet_from_map: Array | None = None
-
-
 class FleetAdapter:
     """Takes what comes from the fleet manager, the robot's program and the localizer, works at maps in `work`, and says what the state is.
 
@@ -88,17 +46,43 @@ class FleetAdapter:
     """
 
     def __init__(
-        self, section: Vda5050Section, parts: AdapterParts, clock_s: Callable[[], float] = time.monotonic
+        self,
+        section: Vda5050Section,
+        site: str,
+        maps: FleetMaps | None,
+        *,
+        active: Callable[[], WantedVersion | None],
+        offer: Callable[[WantedVersion], None],
+        put_prior: Callable[[PositionPrior], None],
+        lost_radius_m: float,
+        clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._section, self._parts, self._clock_s = section, parts, clock_s
-        self.map_id = section.map_id or parts.site
+        """maps: None where the map server chooses the version. offer: gives a version to the localizer; put_prior: a pose.
+
+        active: the version that the robot has whole, from the thread that calls `work`. lost_radius_m: of 95 %, beyond which it is LOST.
+        """
+        self._section, self._maps, self._clock_s = section, maps, clock_s
+        self._active, self._offer, self._put_prior = active, offer, put_prior
+        self._lost_radius_m = lost_radius_m
+        self.map_id = section.map_id or site
         self.changed, self.factsheet_wanted = threading.Event(), threading.Event()
         self._lock = threading.RLock()
-        self._book, self._known, self._pending = ActionBook(), _Known(), _Pending()
-        self._known.fleet_from_map = np.eye(4) if section.frame == "map" else None
+        self._book = ActionBook()
         self._jobs: deque[tuple[Action, dict[str, Any]]] = deque()
-        self._last_said: object = None
+        # Actions that wait for the localizer, and until when.
+        self._enabling: tuple[Action, WantedVersion, float] | None = None
+        self._placing: tuple[Action, Position, float] | None = None
+        # What the robot's own program has said last, and when; the node by initializePosition, and what the program said then.
+        self._part: RobotPart | None = None
+        self._part_s = 0.0
+        self._last_node: tuple[str, str] | None = None
+        self._localization = Localization()
         self._untold: Localization | None = None  # a loss that no state has told yet, however short it was
+        self._last_said: object = None
+        self._versions: list[tuple[int, bool]] = []
+        self._in_use: frozenset[int] = frozenset()
+        # None while the map does not say where it lies in the frame that the fleet manager speaks.
+        self._fleet_from_map = np.eye(4) if section.frame == "map" else None
 
     # --- from the fleet manager ---------------------------------------------------------------------------------------
 
@@ -124,7 +108,7 @@ class FleetAdapter:
                 return
             self._book.end("order")
             named = {node.node_position.map_id for node in message.nodes if node.node_position is not None}
-            known = {self.map_id} if self._known.versions else set()
+            known = {self.map_id} if self._versions else set()
             for map_id in sorted(named - known)[:20]:
                 words = f"the order {message.order_id[:200]!r} names a map that is not on the robot: {map_id[:200]!r}"
                 references = {"orderId": message.order_id, "mapId": map_id}
@@ -140,7 +124,7 @@ class FleetAdapter:
             except LinkError as error:
                 self._book.add_error("robot", "ROBOT_PART_INVALID", str(error), {"topic": "robotState"}, "CRITICAL")
             else:
-                self._known.robot.part, self._known.robot.heard_s = part, self._clock_s()
+                self._part, self._part_s = part, self._clock_s()
             self.changed.set()
 
     def _begin(self, action: Action) -> None:
@@ -171,7 +155,7 @@ class FleetAdapter:
     # --- maps ---------------------------------------------------------------------------------------------------------
 
     def _queue(self, action: Action, given: dict[str, Any]) -> None:
-        if self._parts.maps is None:
+        if self._maps is None:
             words = 'the map server chooses this robot\'s map: [vda5050] versions = "map server"'
             return self._book.fail(action, "MAP_ACTION_FAILED", words)
         if given["mapId"] != self.map_id or not (given["mapVersion"].isascii() and given["mapVersion"].isdecimal()):
@@ -187,13 +171,13 @@ class FleetAdapter:
 
     def work(self) -> None:
         """One action on maps, which may take as long as a download; from the thread that owns the cache."""
-        maps = self._parts.maps
-        active = self._parts.active()
+        maps = self._maps
+        active = self._active()
         versions = [] if active is None or active.version is None else [(active.version, True)]
         with self._lock:
-            self._known.versions = versions if maps is None else maps.versions()
+            self._versions = versions if maps is None else maps.versions()
             self._end_enabling()
-            if maps is None or not self._jobs or (self._pending.enable and self._jobs[0][0].action_type == "enableMap"):
+            if maps is None or not self._jobs or (self._enabling and self._jobs[0][0].action_type == "enableMap"):
                 return
             action, given = self._jobs.popleft()
             self._book.set(action, "RUNNING")
@@ -201,15 +185,11 @@ class FleetAdapter:
         try:
             self._act(maps, action, given)
         except FleetmapError as error:
-            kind, level = "MAP_ACTION_FAILED", "WARNING"
-            if isinstance(error, DuplicateMapError):
-                kind = "DUPLICATE_MAP"
-            elif isinstance(error, NoRoomError):
-                kind, level = "INSUFFICIENT_MEMORY", "URGENT"
+            kind, level = _ERRORS.get(type(error), ("MAP_ACTION_FAILED", "WARNING"))
             with self._lock:
                 self._book.fail(action, kind, str(error), level)
         with self._lock:
-            self._known.versions = maps.versions()
+            self._versions = maps.versions()
             self.changed.set()
 
     def _act(self, maps: FleetMaps, action: Action, given: dict[str, Any]) -> None:
@@ -218,28 +198,28 @@ class FleetAdapter:
             maps.download(version, given["mapDownloadLink"], given.get("mapHash"))
         elif action.action_type == "deleteMap":
             with self._lock:
-                enabling = self._pending.enable
-                in_use = set(self._known.in_use) | ({enabling[1].version or 0} if enabling else set())
+                enabling = self._enabling
+                in_use = set(self._in_use) | ({enabling[1].version or 0} if enabling else set())
             maps.delete(version, in_use)
         elif (version, True) not in maps.versions():
             wanted = maps.wanted(version)
             with self._lock:
-                self._pending.enable = (action, wanted, self._clock_s() + _ENABLE_S)
-            return self._parts.offer(wanted)
+                self._enabling = (action, wanted, self._clock_s() + _ENABLE_S)
+            return self._offer(wanted)
         with self._lock:
-            self._known.versions = maps.versions()  # before the action is finished, in any state
+            self._versions = maps.versions()  # before the action is finished, in any state
             self._book.set(action, "FINISHED")
         return None
 
     def changed_version(self, change: VersionChange) -> None:
         """A version was adopted, refused or postponed by the localizer, and the disk knows; from the thread of `work`."""
         with self._lock:
-            enabling = self._pending.enable
+            enabling = self._enabling
             if enabling is None or enabling[1].manifest_sha256 != change.wanted.manifest_sha256:
                 return
-            self._pending.enable = None
-            if self._parts.maps is not None:
-                self._known.versions = self._parts.maps.versions()
+            self._enabling = None
+            if self._maps is not None:
+                self._versions = self._maps.versions()
             if change.change is Change.ADOPTED:
                 self._book.set(enabling[0], "FINISHED")
             else:
@@ -247,9 +227,9 @@ class FleetAdapter:
             self.changed.set()
 
     def _end_enabling(self) -> None:
-        enabling = self._pending.enable
+        enabling = self._enabling
         if enabling is not None and self._clock_s() > enabling[2]:
-            self._pending.enable = None
+            self._enabling = None
             words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; does it see anything?"
             self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
             self.changed.set()
@@ -257,53 +237,50 @@ class FleetAdapter:
     # --- position -----------------------------------------------------------------------------------------------------
 
     def _initialize(self, action: Action, given: dict[str, Any]) -> None:
-        now, section = self._known.localization, self._section
-        if given["mapId"] != self.map_id or not any(is_enabled for _, is_enabled in self._known.versions):
-            return self._book.fail(
-                action, "INITIALIZE_POSITION_FAILED", f"map {given['mapId'][:80]!r} is not enabled here"
-            )
-        if abs(given["theta"]) > np.pi + 1e-6:
-            return self._book.fail(
-                action, "INITIALIZE_POSITION_FAILED", f"theta = {given['theta']} is beyond -pi to pi"
-            )
-        if now.stamp_ns is None or now.is_silent:
-            return self._book.fail(action, "INITIALIZE_POSITION_FAILED", "no images come from the cameras")
-        if self._pending.position is not None:
-            self._book.set(self._pending.position[0], "FAILED", "another initializePosition came")
-        fleet_from_map = self._known.fleet_from_map
-        if fleet_from_map is None:
+        now, section = self._localization, self._section
+        fleet_from_map = self._fleet_from_map
+        words = ""
+        if given["mapId"] != self.map_id or not any(is_enabled for _, is_enabled in self._versions):
+            words = f"map {given['mapId'][:80]!r} is not enabled here"
+        elif abs(given["theta"]) > np.pi + 1e-6:
+            words = f"theta = {given['theta']} is beyond -pi to pi"
+        elif now.stamp_ns is None or now.is_silent:
+            words = "no images come from the cameras"
+        elif fleet_from_map is None:
             words = "the map does not say where it lies in the building, in which [vda5050] frame puts positions"
+        if now.stamp_ns is None or fleet_from_map is None or words:
             return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
+        if self._placing is not None:
+            self._book.set(self._placing[0], "FAILED", "another initializePosition came")
         place = Position(float(given["x"]), float(given["y"]), float(given["theta"]))
-        self._pending.position = (action, place, self._clock_s() + section.initialize_s)
+        self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
         if now.status == Status.TRACKING:  # a pose that fixes confirm is not given up for what somebody says
             return self._judge_position(is_last=True)
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._parts.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas))))
+        self._put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas))))
         return None
 
     def after_frame(self, outcome: Outcome, in_use: frozenset[int]) -> None:
         """The results of a frame, and the versions that the localizer holds; from the thread that localizes."""
         with self._lock:
-            known = self._known
-            known.in_use = in_use
+            self._in_use = in_use
             if self._section.frame == "building":
-                known.fleet_from_map = outcome.published.building_from_map
-            how = (outcome, self._parts.lost_radius_m, known.fleet_from_map)
-            self._see(known.localization.after(*how, is_driving=is_driving(outcome.speed_mps)))
+                self._fleet_from_map = outcome.published.building_from_map
+            how = (outcome, self._lost_radius_m, self._fleet_from_map)
+            self._see(self._localization.after(*how, is_driving=is_driving(outcome.speed_mps)))
             self._judge_position()
 
     def silence(self) -> None:
         """No frames come."""
         with self._lock:
-            self._see(replace(self._known.localization, is_silent=True))
+            self._see(replace(self._localization, is_silent=True))
             self._judge_position()
 
     def _see(self, localization: Localization) -> None:
-        self._known.localization = localization
+        self._localization = localization
         said = localization.error(), localization.is_driving
         if said != self._last_said:
             if localization.error() is not None:
@@ -313,7 +290,7 @@ class FleetAdapter:
 
     def _judge_position(self, *, is_last: bool = False) -> None:
         """Whether the robot has come to be where it was put; is_last: there is no time left for it."""
-        pending, now = self._pending.position, self._known.localization
+        pending, now = self._placing, self._localization
         if pending is None:
             return
         action, wanted, until_s = pending
@@ -322,14 +299,14 @@ class FleetAdapter:
             off_m, off_rad = now.position.away_from(wanted)
             reach_m = _SIGMAS * section.initial_sigma_m + now.position.radius_m
             if off_m <= reach_m and off_rad <= _SIGMAS * section.initial_sigma_rad:
-                node, part = parameters(action)["lastNodeId"], self._known.robot.part
-                self._known.robot.last_node = (node, "" if part is None else part.last_node_id)
-                self._pending.position = None
+                said_node = "" if self._part is None else self._part.last_node_id
+                self._last_node = parameters(action)["lastNodeId"], said_node
+                self._placing = None
                 self._book.set(action, "FINISHED")
                 return self.changed.set()
             words = f"what the robot sees puts it {off_m:.2f} m and {off_rad:.2f} rad from there"
         if is_last or self._clock_s() > until_s:
-            self._pending.position = None
+            self._placing = None
             self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
             self.changed.set()
         return None
@@ -339,21 +316,20 @@ class FleetAdapter:
     def state(self) -> dict[str, Any]:
         """The state without its header."""
         with self._lock:
-            known, now = self._known, self._untold or self._known.localization
+            now = self._untold or self._localization
             if self._untold is not None:
                 self._untold = None
                 self.changed.set()
             lost = now.error()
             errors = [*([lost] if lost else []), *self._book.errors]
             found: dict[str, Any] = {**_EMPTY, "driving": now.is_driving, **self._robots_own()}
-            node = known.robot.last_node
-            if node is not None and found["lastNodeId"] == node[1]:
-                found["lastNodeId"] = node[0]
+            if self._last_node is not None and found["lastNodeId"] == self._last_node[1]:
+                found["lastNodeId"] = self._last_node[0]
             found["maps"] = [
                 {"mapId": self.map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
-                for number, on in known.versions
+                for number, on in self._versions
             ]
-            place = now.mobile_robot_position(self.map_id, self._parts.lost_radius_m)
+            place = now.mobile_robot_position(self.map_id, self._lost_radius_m)
             if place is not None:
                 found["mobileRobotPosition"] = place
             found["errors"] = to_plain(errors) + found.get("errors", [])
@@ -361,18 +337,15 @@ class FleetAdapter:
             return found
 
     def _robots_own(self) -> dict[str, Any]:
-        part, age_s = self._known.robot.part, self._clock_s() - self._known.robot.heard_s
-        if part is not None and age_s <= self._section.robot_silent_s:
-            own: dict[str, Any] = to_plain(part)
+        age_s = self._clock_s() - self._part_s
+        if self._part is not None and age_s <= self._section.robot_silent_s:
+            own: dict[str, Any] = to_plain(self._part)
             return own
-        return {**_UNKNOWN, "errors": to_plain([_silent(part is None, age_s)])}
-
-
-def _silent(is_first: bool, age_s: float) -> Error:
-    since = "has said nothing yet" if is_first else f"has said nothing for {age_s:.0f} s"
-    return Error(
-        error_type="ROBOT_PART_MISSING",
-        error_level="CRITICAL",
-        error_description=f"the robot's own program {since}; battery, safety and operating mode are unknown",
-        error_hint="it publishes them on the topic robotState",
-    )
+        since = "has said nothing yet" if self._part is None else f"has said nothing for {age_s:.0f} s"
+        missing = Error(
+            error_type="ROBOT_PART_MISSING",
+            error_level="CRITICAL",
+            error_description=f"the robot's own program {since}; battery, safety and operating mode are unknown",
+            error_hint="it publishes them on the topic robotState",
+        )
+        return {**_UNKNOWN, "errors": to_plain([missing])}

@@ -32,15 +32,11 @@ class Strict(Struct, forbid_unknown_fields=True):
 
 
 class ActionParameter(Struct):
-    """A parameter of an action."""
-
     key: Text
     value: Any
 
 
 class Action(Struct):
-    """An action that the fleet manager asks for."""
-
     action_type: Text
     action_id: Text
     blocking_type: Text
@@ -49,34 +45,24 @@ class Action(Struct):
 
 
 class InstantActions(Struct):
-    """Topic instantActions."""
-
     header_id: int
     actions: Annotated[list[Action], msgspec.Meta(max_length=_MOST)]
 
 
 class NodePosition(Struct):
-    """The part of a node's position that concerns maps."""
-
     map_id: Text
 
 
 class OrderNode(Struct):
-    """A node of an order."""
-
     node_position: NodePosition | None = None
 
 
 class Order(Struct):
-    """Topic order, as far as it concerns maps; the robot's own program executes orders."""
-
     order_id: Text
     nodes: Annotated[list[OrderNode], msgspec.Meta(max_length=100_000)]
 
 
 class PowerSupply(Strict):
-    """The robot's battery."""
-
     state_of_charge: Percent
     charging: bool
     battery_voltage: float | None = None
@@ -86,23 +72,17 @@ class PowerSupply(Strict):
 
 
 class SafetyState(Strict):
-    """The robot's protective devices."""
-
     active_emergency_stop: Literal["MANUAL", "REMOTE", "NONE"]
     field_violation: bool
 
 
 class Velocity(Strict):
-    """In the robot's coordinates."""
-
     vx: float | None = None
     vy: float | None = None
     omega: float | None = None
 
 
 class StateNodePosition(Strict):
-    """Where a node is."""
-
     x: float
     y: float
     map_id: Text
@@ -110,8 +90,6 @@ class StateNodePosition(Strict):
 
 
 class NodeState(Strict):
-    """A node that is still to be traversed."""
-
     node_id: Text
     sequence_id: Count
     released: bool
@@ -120,8 +98,6 @@ class NodeState(Strict):
 
 
 class EdgeState(Strict):
-    """An edge that is still to be traversed."""
-
     edge_id: Text
     sequence_id: Count
     released: bool
@@ -129,8 +105,6 @@ class EdgeState(Strict):
 
 
 class Load(Strict):
-    """Something that the robot carries."""
-
     load_id: Text | None = None
     load_type: Text | None = None
     load_position: Text | None = None
@@ -138,15 +112,11 @@ class Load(Strict):
 
 
 class Reference(Strict):
-    """What an error is about."""
-
     reference_key: Text
     reference_value: Text
 
 
 class Error(Strict):
-    """An error of the state."""
-
     error_type: Text
     error_level: Literal["WARNING", "URGENT", "CRITICAL", "FATAL"]
     error_references: list[Reference] | None = None
@@ -155,8 +125,6 @@ class Error(Strict):
 
 
 class ActionState(Strict):
-    """The state of an action."""
-
     action_id: Text
     action_status: Literal["WAITING", "INITIALIZING", "RUNNING", "PAUSED", "RETRIABLE", "FINISHED", "FAILED"]
     action_type: Text | None = None
@@ -165,8 +133,6 @@ class ActionState(Strict):
 
 
 class Information(Strict):
-    """Something for people to look at."""
-
     info_type: Text
     info_level: Literal["INFO", "DEBUG"]
     info_references: list[Reference] | None = None
@@ -174,8 +140,6 @@ class Information(Strict):
 
 
 class RobotPart(Strict):
-    """What the robot's own program says of its state, the localization apart; it executes orders and all other actions."""
-
     operating_mode: Literal["STARTUP", "AUTOMATIC", "SEMIAUTOMATIC", "INTERVENED", "MANUAL", "SERVICE", "TEACH_IN"]
     power_supply: PowerSupply
     safety_state: SafetyState

@@ -44,7 +44,6 @@ class MqttLink:
         self._client = self._new_client()
 
     def start(self) -> None:
-        """Begins to connect, and returns at once."""
         self._connect()
         self._client.loop_start()
         self._thread.start()

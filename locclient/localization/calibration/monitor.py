@@ -68,7 +68,6 @@ class CalibrationMonitor:
 
     @property
     def state(self) -> CalibrationState:
-        """What is known so far."""
         return CalibrationState(text=REVERSED_TEXT) if self._order is PairOrder.REVERSED else self.watch.state
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:

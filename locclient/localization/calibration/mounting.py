@@ -38,11 +38,9 @@ class WheelTravel:
 
     @property
     def is_heard(self) -> bool:
-        """Whether wheel odometry has come."""
         return bool(self._x_y_yaw)
 
     def handle(self, samples: Sequence[WheelSample]) -> None:
-        """Adds samples in the order of their stamps."""
         for sample in samples:
             x_y_yaw = np.zeros(3)
             if self._x_y_yaw:

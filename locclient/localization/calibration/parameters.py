@@ -73,7 +73,6 @@ class Drift(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For people: which parameter, by how much."""
         parameter, scale = self.parameter, self.parameter.per_unit
         if parameter.figure.endswith("_scale"):
             size = f"{100 * self.value:+.2f} % (sigma {100 * self.sigma:.2f} %)"
@@ -94,7 +93,6 @@ class CalibrationState(NamedTuple):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the calibration is wrong by more than may pass."""
         return bool(self.text)
 
     def cov_bias(self, map_from_cam: Array, map_from_body: Array) -> Array:

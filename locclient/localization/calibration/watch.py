@@ -103,7 +103,6 @@ class CalibrationWatch:
         self.has_confirmed = False  # whether a view of a confirmed pose was taken
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """Wheel odometry newer than any before."""
         self._wheels.handle(samples)
 
     def handle(self, query: MapLook) -> None:

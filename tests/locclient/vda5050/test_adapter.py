@@ -17,7 +17,7 @@ from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.continuous_odom import PublishedPose
-from locclient.vda5050.adapter import AdapterParts, FleetAdapter
+from locclient.vda5050.adapter import FleetAdapter
 from locclient.vda5050.factsheet import read_factsheet
 from locclient.vda5050.localization import Localization, Position
 from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
@@ -66,10 +66,10 @@ class Adapter(FleetAdapter):
     def __init__(self, **settings: Any) -> None:
         self.now_s, self.offers, self.priors = 100.0, [], []
         self.schema = validator("state")
-        parts = AdapterParts(
-            "hall", FakeMaps(), lambda: None, self.offers.append, self.priors.append, 3.0  # type: ignore[arg-type]
+        super().__init__(
+            Vda5050Section(**settings), "hall", FakeMaps(), active=lambda: None, offer=self.offers.append,  # type: ignore[arg-type]
+            put_prior=self.priors.append, lost_radius_m=3.0, clock_s=lambda: self.now_s,
         )  # fmt: skip
-        super().__init__(Vda5050Section(**settings), parts, lambda: self.now_s)
         self.work()
         self._see(TRACKING)
 
@@ -269,12 +269,12 @@ def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
     assert adapter.ask(name="b", mapId="hall", mapVersion="2")["actionStatus"] == "RUNNING"
     assert adapter.ask(name="c", mapId="hall", mapVersion="2")["actionStatus"] == "WAITING"
     (wanted,) = adapter.offers
-    adapter._parts.maps.held = [(1, False), (2, True)]
+    adapter._maps.held = [(1, False), (2, True)]
     adapter.changed_version(VersionChange(wanted, Change.ADOPTED))
     assert [entry["mapStatus"] for entry in adapter.said()["maps"]] == ["DISABLED", "ENABLED"], (
         "finished and enabled in one state"
     )
-    adapter._parts.maps.held = [(1, True), (2, False)]
+    adapter._maps.held = [(1, True), (2, False)]
     adapter.work()
     adapter.changed_version(VersionChange(wanted, Change.REFUSED, "fixes contradict it"))
     by_name = {state["actionId"]: state for state in adapter.said()["instantActionStates"]}
