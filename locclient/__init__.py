@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from locclient.localization.estimate import Estimate
     from locclient.localization.localizer import Localizer
     from locclient.localization.settings import LocalizerSettings
-    from locclient.replay.localize import LocalizeOptions, fetch_map, localize
+    from locclient.replay.replay import LocalizeOptions, fetch_map, localize
     from locclient.replay.run_result import ReplayResult
     from locclient.robot.robot import Robot
 
@@ -61,7 +61,7 @@ _NAMES = {
     "locclient.localization.estimate": "Estimate",
     "locclient.localization.localizer": "Localizer",
     "locclient.localization.settings": "LocalizerSettings",
-    "locclient.replay.localize": "LocalizeOptions fetch_map localize",
+    "locclient.replay.replay": "LocalizeOptions fetch_map localize",
     "locclient.replay.run_result": "ReplayResult",
     "locclient.robot.robot": "Robot",
 }

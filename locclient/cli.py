@@ -1,21 +1,144 @@
 """The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import Commands, Options, Version, make_app
-from locclient.commands.check import check
-from locclient.commands.config import CONFIG
-from locclient.commands.enrol import enrol
-from locclient.commands.prepare import prepare
-from locclient.commands.replay import replay
-from locclient.commands.run import run
-from locclient.commands.status import status
+from fleetmap.cli_options import Commands, ConfigFile, Group, Options, Version, config_path, make_app
+from fleetmap.errors import UsageError, disk_errors
+from locclient.replay.command import IdentityFolder, Insecure, replay
 
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
+
+_MAX_BUNDLE_BYTES = 1 << 20
+
+
+def enrol(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="ROBOT.fleetmap, from `mapserver robots enrol`.")],
+    identity: IdentityFolder = None,
+) -> None:
+    """Make this robot's own key, and get a certificate for it. `run`, `replay` and `check` then need no server and no root."""
+    from locclient.identity import RobotIdentity, identity_folder
+
+    with disk_errors(f"{bundle} cannot be read", "check the path", UsageError):
+        if bundle.stat().st_size > _MAX_BUNDLE_BYTES:
+            raise UsageError(f"{bundle} has {bundle.stat().st_size} bytes and is no enrolment bundle")
+        data = bundle.read_bytes()
+    made = RobotIdentity.enrol(identity_folder(identity), data)
+    about = made.certificate()
+    typer.echo(f"enrolled as {made.who.robot} of site {made.who.site} at {made.who.endpoint}")
+    typer.echo(f"certificate {about.name} until {about.ends:%Y-%m-%d}, in {made.folder}")
+    typer.echo(f"{bundle} is used and worth nothing now; remove it")
+
+
+def check(
+    context: typer.Context,
+    config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
+    seconds: Annotated[float, typer.Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
+    insecure: Insecure = False,
+) -> None:
+    """Check a robot before it drives; status 3 if something must be repaired first."""
+    settings = _with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+    from locclient.daemon.preflight import FAIL, run_preflight
+
+    failed = False
+    for finding in run_preflight(settings, seconds):
+        typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
+        failed |= finding.level == FAIL
+    if failed:
+        raise typer.Exit(3)
+
+
+def run(
+    context: typer.Context,
+    config: Annotated[Path, typer.Option(help="TOML file with the robot, its sensors, map and outputs.")],
+    insecure: Insecure = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Log successes too.")] = False,
+) -> None:
+    """Localize a robot from its live sensors; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
+    import logging
+    import signal
+
+    from fleetmap.log_lines import log_to_stderr
+
+    log_to_stderr(logging.INFO if verbose else logging.WARNING, "%(levelname)s %(name)s: %(message)s")
+    settings = _with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+    from locclient.daemon.daemon import check_run, daemon_parts
+
+    check_run(settings)
+    from locclient.daemon.runtime import Runtime
+    from locclient.daemon.service_manager import ServiceManager
+
+    with daemon_parts(settings) as parts:
+        runtime = Runtime(parts, ServiceManager())
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: runtime.stop())
+        typer.echo(f"ready: {parts.profile.robot} at {parts.profile.site}, source {settings.source.kind}")
+        runtime.run()
+
+
+def status(
+    folder: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="The daemon's $RUNTIME_DIRECTORY; default: ours, or /run/fleetmap."),
+    ] = None,
+) -> None:
+    """Print what the running daemon last said; status 3 if it has not said anything for ten seconds."""
+    from locclient.daemon.service_manager import last_status, runtime_folder
+
+    typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
+
+
+def prepare() -> None:
+    """Compile everything that `run` and `replay` compute with, so that no frame waits; at once where that was done before."""
+    import fleetmap
+    import locclient
+    from fleetmap.preparation.kernel_cache import prepare_kernels
+
+    packages = [Path(package.__path__[0]) for package in (fleetmap, locclient)]
+    prepare_kernels("locclient", packages, warm_up_steps, typer.echo)
+
+
+def warm_up_steps() -> Mapping[str, Callable[[], None]]:
+    """What `prepare` runs, by its name."""
+    import cv2
+
+    from fleetmap.preparation.painted_room import rig
+    from fleetmap.sensors.rectification import Rectifier
+    from fleetmap.sensors.samples import SensorSet
+    from locclient.localization.settings import LocalizerSettings
+    from locclient.robot.jit_warmup import warm_up_kernels
+
+    cv2.setNumThreads(1)
+
+    def warm_up(sensors: SensorSet) -> None:
+        calibration = rig(sensors)
+        rectifier = Rectifier(calibration, has_depth=sensors is SensorSet.RGBD)
+        warm_up_kernels(calibration, rectifier, LocalizerSettings())
+
+    carried = (SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD)
+    return {f"robot with {sensors}": lambda sensors=sensors: warm_up(sensors) for sensors in carried}  # type: ignore[misc]
+
+
+def show_config(context: typer.Context, config: ConfigFile = None) -> None:
+    """Print the effective configuration as TOML, with the origin of every value."""
+    import msgspec
+
+    from fleetmap.config_show import Layer, command_options, effective_settings
+    from locclient.config import TIERS, with_common
+
+    path = config_path(context)
+    settings, defaults = context.obj.read_config(path)
+    given = {} if path is None else with_common(msgspec.toml.decode(path.read_bytes()))
+    lines = [*effective_settings(settings, TIERS, (Layer(str(path), given),))]
+    lines += command_options("replay", context.obj.commands["replay"], defaults.get("replay", {}), str(path))
+    typer.echo("\n".join(lines))
+
 
 COMMANDS: Commands = {
     "enrol": enrol,
@@ -24,7 +147,7 @@ COMMANDS: Commands = {
     "run": run,
     "status": status,
     "prepare": prepare,
-    "config": CONFIG,
+    "config": Group("The configuration file.", {"show": show_config}),
 }
 
 
@@ -36,6 +159,13 @@ def _read_config(path: Path | None) -> "tuple[LocclientConfig, Options]":
     from locclient.config import read_config
 
     return read_config(path, {"replay": replay})  # [run] holds settings, not options
+
+
+def _with_insecure(config: "LocclientConfig", *, insecure: bool) -> "LocclientConfig":
+    """The configuration, [run] insecure as on the command line where that says so."""
+    from msgspec.structs import replace
+
+    return replace(config, run=replace(config.run, insecure=True)) if insecure else config
 
 
 app = make_app(COMMANDS, locclient, _read_config)

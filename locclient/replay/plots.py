@@ -1,4 +1,4 @@
-"""Picture of a replay: the path over the map's landmarks, coloured by error, and errors and statuses over time beside it."""
+"""Picture of a replay, by OpenCV, which robots have: path and landmarks, coloured by error; errors and statuses over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +13,13 @@ from fleetmap.errors import UsageError, disk_errors
 from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
-from locclient.replay.drawing import INK, QUIET, Canvas, ChartAxes, Colour, draw_legend, ticks
 from locclient.replay.run_metrics import FrameRecord, error_m, frame_ms, localised, localised_share_of_all
 
-_WIDTH, _PLAN_WIDTH, _BESIDE_WIDTH = 2040, 1220.0, 640.0
-_TOP, _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 140.0, 520.0, 1100.0
-_POINT, _ERROR, _BAND, _NOT_LOCALISED = (161, 149, 139), (235, 99, 37), (253, 236, 222), (168, 60, 190)
-_GOOD, _BAD = (75, 146, 20), (47, 52, 209)
-_SCALE = np.array([[255, 201, 156], [235, 99, 37], [92, 31, 11]], float)  # light to dark blue
-_LIMIT_MM = 1e3 * ERROR_LIMIT_M
+Colour = tuple[int, int, int]  # blue, green, red
+Picture = NDArray[np.uint8]
+_INK, _QUIET, _GRID, _POINT, _ERROR = (36, 31, 27), (128, 114, 107), (235, 231, 229), (161, 149, 139), (235, 99, 37)
+_GOOD, _BAD, _NOT_LOCALISED = (75, 146, 20), (47, 52, 209), (168, 60, 190)
+_EXACT, _AT_LIMIT = np.array([255, 201, 156]), np.array([92, 31, 11])  # light to dark blue
 _STATUS_COLOURS: dict[Status, Colour] = {
     Status.INITIALISING: (200, 190, 180),
     Status.TRACKING: (120, 180, 90),
@@ -29,7 +27,11 @@ _STATUS_COLOURS: dict[Status, Colour] = {
     Status.AMBIGUOUS: (190, 100, 170),
     Status.LOST: (70, 70, 215),
 }
+_WIDTH, _PLAN_WIDTH, _TOP, _LEFT, _BELOW = 2040, 1220, 140, 100, 140
+_MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 520.0, 1100.0
+_LIMIT_MM = 1e3 * ERROR_LIMIT_M
 _MAX_LANDMARKS = 40_000
+_SHIFT = 4  # bits of a coordinate behind the point
 
 
 @dataclass(frozen=True)
@@ -42,17 +44,6 @@ class RunPlot:
     truths_map_m: Array
     landmarks_map_m: Array
 
-    @property
-    def seconds(self) -> Array:
-        """(N,) since the first frame."""
-        stamps_ns = np.array([frame.stamp_ns for frame in self.frames], np.int64)
-        return np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9)
-
-    @property
-    def errors_mm(self) -> Array:
-        """(N,) distances from the truth; NaN where unknown."""
-        return np.array([np.nan if f.error_m is None else 1e3 * f.error_m for f in self.frames])
-
 
 def save_picture(plot: RunPlot, path: Path) -> None:
     """Writes the picture as PNG; UsageError where it cannot be written."""
@@ -61,28 +52,41 @@ def save_picture(plot: RunPlot, path: Path) -> None:
         path.write_bytes(data.tobytes())
 
 
-def draw_run(plot: RunPlot) -> NDArray[np.uint8]:
+def draw_run(plot: RunPlot) -> Picture:
     """(H, 2040, 3) BGR; the height follows the shape of the map."""
     low, high = _view(plot)
-    height = float(np.clip(_PLAN_WIDTH * (high - low)[1] / (high - low)[0], _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT))
-    grow = np.array([_PLAN_WIDTH, height]) / min(_PLAN_WIDTH / (high - low)[0], height / (high - low)[1]) - (high - low)
-    corner = np.array([100.0, _TOP])
-    plan = ChartAxes(corner, np.array([corner[0] + _PLAN_WIDTH, _TOP + height]), low - 0.5 * grow, high + 0.5 * grow)
-    canvas = Canvas(_WIDTH, round(_TOP + height + 140.0))
-    canvas.text(plot.title, np.array([42.0, 44.0]), 21.0, bold=True)
-    canvas.text(_figures(plot), np.array([42.0, 78.0]), 12.0, QUIET)
-    values, label = (plot.errors_mm, "position error, mm")
-    if np.isnan(values).all():
-        radii_mm = [1e3 * radius_95_m(frame.cov_rot_trans) for frame in plot.frames]
-        values, label = np.where(np.isfinite(radii_mm), radii_mm, np.nan), "95 % radius of the position, mm"
-    known = values[~np.isnan(values)]
-    # Values beyond the ceiling stand at the upper edge.
-    ceiling = min(1.1 * float(known.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0
-    scale = min(ceiling, _LIMIT_MM)
-    _draw_plan(canvas, plan, plot, values / scale)
-    _draw_colour_bar(canvas, plan, scale, label)
-    _draw_over_time(canvas, plan, plot, values, ceiling, label)
-    return canvas.image()
+    size_m = high - low
+    height = float(np.clip(_PLAN_WIDTH * size_m[1] / size_m[0], _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT))
+    margin_m = 0.5 * (np.array([_PLAN_WIDTH, height]) / min(_PLAN_WIDTH / size_m[0], height / size_m[1]) - size_m)
+    picture = np.full((round(_TOP + height + _BELOW), _WIDTH, 3), 255, np.uint8)
+    _text(picture, plot.title, (42, 44), _INK, 0.9)
+    _text(picture, _figures(plot), (42, 78), _QUIET, 0.55)
+    bottom = round(_TOP + height)
+    plan = _Axes(picture, (_LEFT, _TOP), (_LEFT + _PLAN_WIDTH, bottom), low - margin_m, high + margin_m)
+
+    stamps_ns = np.array([frame.stamp_ns for frame in plot.frames], np.int64)
+    seconds: Array = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9)
+    values_mm: Array = np.array([np.nan if f.error_m is None else 1e3 * f.error_m for f in plot.frames])
+    label = "position error, mm"
+    if np.isnan(values_mm).all():
+        radii_mm = np.array([1e3 * radius_95_m(frame.cov_rot_trans) for frame in plot.frames])
+        values_mm, label = np.where(np.isfinite(radii_mm), radii_mm, np.nan), "95 % radius of the position, mm"
+    known_mm = values_mm[~np.isnan(values_mm)]
+    ceiling_mm = min(1.1 * float(known_mm.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0  # what is larger stands there
+    darkest_mm = min(ceiling_mm, _LIMIT_MM)
+    _draw_plan(plan, plot, values_mm / darkest_mm, f"{darkest_mm:.0f} mm")
+
+    span_s = max(float(seconds[-1]), 1e-3) if len(seconds) else 1.0
+    left, right = _LEFT + _PLAN_WIDTH + 130, _WIDTH - 60
+    over_time = _Axes(picture, (left, _TOP), (right, bottom), np.zeros(2), np.array([span_s, ceiling_mm]))
+    _draw_over_time(over_time, seconds, values_mm, label)
+    strip = _Axes(picture, (left, bottom + 50), (right, bottom + 66), np.zeros(2), np.array([span_s, 1.0]))
+    for frame, (begin_s, end_s) in zip(plot.frames, pairwise([*seconds, span_s]), strict=True):
+        corners = strip.pixels(np.array([[begin_s, 1.0], [end_s, 0.0]])).round().astype(int)
+        cv2.rectangle(picture, corners[0].tolist(), corners[1].tolist(), _STATUS_COLOURS[frame.status], cv2.FILLED)
+    met = [status for status in Status if any(frame.status is status for frame in plot.frames)]
+    _legend(picture, (left, bottom + 96), [(status.lower(), _STATUS_COLOURS[status]) for status in met])
+    return picture
 
 
 def _view(plot: RunPlot) -> tuple[Array, Array]:
@@ -91,13 +95,13 @@ def _view(plot: RunPlot) -> tuple[Array, Array]:
     spread = np.percentile(plot.landmarks_map_m[:, :2], [2, 98], axis=0) if len(plot.landmarks_map_m) else path[:2]
     shown = np.vstack([path, spread, [[0.0, 0.0]] if not len(path) and not len(spread) else path[:0]])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    edge = 0.05 * float((high - low).max()) + 0.3
-    return low - edge, high + edge
+    edge_m = 0.05 * float((high - low).max()) + 0.3
+    return low - edge_m, high + edge_m
 
 
 def _figures(plot: RunPlot) -> str:
     share, errors, times = localised_share_of_all(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
-    figures = [f"{len(plot.frames)} frames in {plot.seconds[-1]:.0f} s" if plot.frames else "no frames"]
+    figures = [f"{len(plot.frames)} frames"]
     figures += [] if share is None else [f"localised {100 * share:.1f} % of all" if share else "never localised"]
     if errors is not None:
         figures.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
@@ -106,87 +110,107 @@ def _figures(plot: RunPlot) -> str:
     return "   |   ".join(figures)
 
 
-def _draw_plan(canvas: Canvas, axes: ChartAxes, plot: RunPlot, shares: Array) -> None:
-    axes.draw(canvas, ("x, m", "y, m"))
+def _draw_plan(axes: "_Axes", plot: RunPlot, shares: Array, darkest: str) -> None:
+    """shares (N,): of the darkest blue."""
+    axes.draw_frame("x and y, m")
     landmarks = plot.landmarks_map_m[:: len(plot.landmarks_map_m) // _MAX_LANDMARKS + 1, :2]
     inside = ((landmarks > axes.data_low) & (landmarks < axes.data_high)).all(axis=1)
-    radius = float(np.clip(1.6 * (10_000 / max(len(landmarks), 1)) ** 0.5, 0.7, 1.6))
     for point in axes.pixels(landmarks[inside]):
-        canvas.dot(point, radius, _POINT)
+        axes.dot(point, 1.0, _POINT)
     truths = plot.truths_map_m[~np.isnan(plot.truths_map_m[:, 0]), :2]
-    canvas.line(axes.pixels(truths), INK, 1.5)
+    axes.line(truths, _INK, 1)
     places = axes.pixels(plot.positions_map_m[:, :2])
     good, known = np.array(localised(plot.frames), bool), ~np.isnan(places[:, 0])
     for k in np.flatnonzero(known):
-        colour = _colour(shares[k]) if good[k] else _NOT_LOCALISED
+        colour = _by_error(shares[k]) if good[k] else _NOT_LOCALISED
         if k and known[k - 1] and np.linalg.norm(places[k] - places[k - 1]) < 40.0:
-            canvas.line(places[k - 1 : k + 1], colour, 6.0)
+            axes.line(plot.positions_map_m[k - 1 : k + 1, :2], colour, 6)
         else:
-            canvas.dot(places[k], 3.0, colour)
-    for at, colour in ((places[known][:1], _GOOD), (places[known][-1:], _BAD)):
-        for point in at:
-            canvas.dot(point, 9.0, (255, 255, 255))
-            canvas.dot(point, 7.5, colour)
-    entries = [("dot", "start", _GOOD), ("dot", "end", _BAD), ("dot", "landmark", _POINT)]
-    entries += [("line", "ground truth", INK)] if len(truths) else []
-    entries += [("line", "not localised", _NOT_LOCALISED)] if (known & ~good).any() else []
-    entries += [("line", f"over {_LIMIT_MM:.0f} mm", _BAD)] if (shares[known & good] > 1.0).any() else []
-    draw_legend(canvas, np.array([axes.low[0], axes.low[1] - 18.0]), entries)
+            axes.dot(places[k], 3.0, colour)
+    for point, colour in [*((p, _GOOD) for p in places[known][:1]), *((p, _BAD) for p in places[known][-1:])]:
+        axes.dot(point, 8.0, colour)
+    entries = [("start", _GOOD), ("end", _BAD), ("landmark", _POINT), ("0 mm", _by_error(0.0))]
+    entries += [(darkest, _by_error(1.0)), ("ground truth", _INK), ("not localised", _NOT_LOCALISED)]
+    _legend(axes.picture, (axes.low[0], axes.low[1] - 18), entries)
 
 
-def _draw_colour_bar(canvas: Canvas, plan: ChartAxes, ceiling: float, label: str) -> None:
-    low = np.array([plan.low[0] + 60.0, plan.high[1] + 66.0])
-    bar = ChartAxes(low, np.array([plan.high[0] - 60.0, low[1] + 14.0]), np.zeros(2), np.array([ceiling, 1.0]))
-    edges = np.linspace(0.0, ceiling, 201)
-    for begin, end in pairwise(edges):
-        canvas.box(bar.pixels(np.array([begin, 1.0])), bar.pixels(np.array([end, 0.0])), _colour(begin / ceiling))
-    for value in ticks(0.0, ceiling, 10):
-        at = np.array([bar.pixels(np.array([value, 0.0]))[0], bar.high[1] + 19.0])
-        canvas.text(f"{value:g}", at, colour=QUIET, anchor=0.5)
-    canvas.text(label, np.array([0.5 * (bar.low[0] + bar.high[0]), bar.high[1] + 42.0]), colour=QUIET, anchor=0.5)
+def _draw_over_time(axes: "_Axes", seconds: Array, values_mm: Array, label: str) -> None:
+    axes.draw_frame(f"{label}, over seconds since the start")
+    ceiling_mm, span_s = float(axes.data_high[1]), float(axes.data_high[0])
+    known = np.flatnonzero(~np.isnan(values_mm))
+    points = np.column_stack([seconds, np.minimum(values_mm, ceiling_mm)])
+    for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
+        axes.line(points[run], _ERROR, 2)
+    entries = [("each frame", _ERROR)]
+    if len(known):
+        median_mm = float(np.median(values_mm[known]))
+        axes.line(np.array([[0.0, median_mm], [span_s, median_mm]]), _INK, 1)
+        entries.append((f"median {median_mm:.0f} mm", _INK))
+    if ceiling_mm > _LIMIT_MM:
+        axes.line(np.array([[0.0, _LIMIT_MM], [span_s, _LIMIT_MM]]), _BAD, 1)
+        entries.append(("limit of a failure", _BAD))
+    _legend(axes.picture, (axes.low[0], axes.low[1] - 18), entries)
 
 
-def _draw_over_time(canvas: Canvas, plan: ChartAxes, plot: RunPlot, values: Array, ceiling: float, label: str) -> None:
-    seconds, span_s = plot.seconds, max(float(plot.seconds[-1]), 1e-3) if plot.frames else 1.0
-    left, right = plan.high[0] + 130.0, plan.high[0] + _BESIDE_WIDTH + 20.0
-    limits = np.array([0.0, 0.0]), np.array([span_s, ceiling])
-    axes = ChartAxes(np.array([left, plan.low[1]]), np.array([right, plan.high[1]]), *limits)
-    known = np.flatnonzero(~np.isnan(values))
-    points = axes.pixels(np.column_stack([seconds, np.minimum(values, ceiling)]))
-    pieces = [points[run] for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(run)]
-    for piece in pieces:
-        foot = [[piece[-1, 0], plan.high[1]], [piece[0, 0], plan.high[1]]]
-        canvas.area(np.vstack([piece, foot]), _BAND)
-    axes.draw(canvas, ("seconds since the start", label))
-    for piece in pieces:
-        canvas.line(piece, _ERROR, 1.8)
-    entries: list[tuple[str, str, Colour]] = [("line", "each frame", _ERROR)]
-    levels = [(float(np.median(values[known])), "median {:.0f} mm", INK)] if len(known) else []
-    levels += [(_LIMIT_MM, "limit of a failure", _BAD)] if ceiling > _LIMIT_MM else []
-    for level, words, colour in levels:
-        canvas.dashes(axes.pixels(np.array([[0.0, level], [span_s, level]])), colour, 1.5)
-        entries.append(("dashes", words.format(level), colour))
-    draw_legend(canvas, np.array([left, plan.low[1] - 18.0]), entries)
-    strip = np.array([left, plan.high[1] + 66.0]), np.array([right, plan.high[1] + 80.0])
-    _draw_statuses(canvas, ChartAxes(*strip, *limits), plot)
-
-
-def _draw_statuses(canvas: Canvas, strip: ChartAxes, plot: RunPlot) -> None:
-    """The status of each frame as a coloured piece of a strip along the axis of time."""
-    ends_s = np.append(plot.seconds, strip.data_high[0])
-    for frame, (begin_s, end_s) in zip(plot.frames, pairwise(ends_s), strict=True):
-        corners = strip.pixels(np.array([[begin_s, strip.data_high[1]], [end_s, 0.0]]))
-        canvas.box(corners[0], corners[1], _STATUS_COLOURS[frame.status])
-    met = [status for status in Status if any(frame.status is status for frame in plot.frames)]
-    shown = [("square", status.lower(), _STATUS_COLOURS[status]) for status in met]
-    draw_legend(canvas, np.array([strip.low[0], strip.high[1] + 30.0]), shown)
-
-
-def _colour(share: float) -> Colour:
+def _by_error(share: float) -> Colour:
     """Light blue at 0 to dark blue at 1; red beyond, grey for NaN."""
     if np.isnan(share) or share > 1.0:
         return _POINT if np.isnan(share) else _BAD
-    place = float(max(share, 0.0)) * (len(_SCALE) - 1)
-    k = min(int(place), len(_SCALE) - 2)
-    blue, green, red = _SCALE[k] + (place - k) * (_SCALE[k + 1] - _SCALE[k])
+    blue, green, red = _EXACT + max(share, 0.0) * (_AT_LIMIT - _EXACT)
     return int(blue), int(green), int(red)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """A rectangle of the picture from low (top left) to high, in pixels, that shows values from data_low to data_high, each (2,)."""
+
+    picture: Picture
+    low: tuple[int, int]
+    high: tuple[int, int]
+    data_low: Array
+    data_high: Array
+
+    def pixels(self, data: Array) -> Array:
+        """(N, 2) of data points; the second axis of data points upwards."""
+        share = (data - self.data_low) / (self.data_high - self.data_low)
+        share[:, 1] = 1.0 - share[:, 1]
+        return np.asarray(self.low + share * np.subtract(self.high, self.low))
+
+    def line(self, data: Array, colour: Colour, width: int) -> None:
+        points = np.round(self.pixels(data) * 2**_SHIFT).astype(np.int32)
+        cv2.polylines(self.picture, [points], False, colour, width, cv2.LINE_AA, _SHIFT)
+
+    def dot(self, pixel: Array, radius: float, colour: Colour) -> None:
+        x, y = np.round(pixel * 2**_SHIFT).astype(int).tolist()
+        cv2.circle(self.picture, (x, y), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+    def draw_frame(self, label: str) -> None:
+        """Border, grid, ticks with their values, and the label below."""
+        cv2.rectangle(self.picture, self.low, self.high, _GRID, 2)
+        for axis in (0, 1):
+            for value in ticks(float(self.data_low[axis]), float(self.data_high[axis])):
+                ends = np.array([self.data_low, self.data_high])
+                ends[:, axis] = value
+                self.line(ends, _GRID, 1)
+                x, y = self.pixels(ends)[0].round().astype(int).tolist()
+                _text(self.picture, f"{value:g}", (x - 8, y + 20) if axis == 0 else (x - 50, y + 5), _QUIET)
+        _text(self.picture, label, (self.low[0], self.high[1] + 42), _INK)
+
+
+def ticks(low: float, high: float, about: int = 8) -> list[float]:
+    """Round values between two limits, about so many: steps of 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10((high - low) / about))
+    step = float(next(power * k for k in (1, 2, 5, 10) if power * k * about >= high - low))
+    return [round(k * step, 9) for k in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1)]
+
+
+def _text(picture: Picture, words: str, at: tuple[int, int], colour: Colour, scale: float = 0.5) -> None:
+    cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+
+
+def _legend(picture: Picture, at: tuple[int, int], entries: Sequence[tuple[str, Colour]]) -> None:
+    x, y = at
+    for words, colour in entries:
+        cv2.rectangle(picture, (x, y - 10), (x + 14, y + 2), colour, cv2.FILLED)
+        _text(picture, words, (x + 22, y), _INK)
+        x += 46 + 9 * len(words)

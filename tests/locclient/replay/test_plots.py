@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.messages import Status
-from locclient.replay.drawing import ticks
-from locclient.replay.plots import RunPlot, draw_run
+from locclient.replay.plots import RunPlot, draw_run, ticks
 from locclient.replay.run_metrics import FrameRecord
 
 FRAMES = 60
@@ -36,8 +35,8 @@ def test_a_good_run_shows_no_alarm() -> None:
     picture = draw_run(plot())
     assert picture.shape[1:] == (2040, 3)
     assert picture.shape[0] >= 700
-    assert count(picture, RED) < 400, "the end's mark alone"
-    assert count(picture, VIOLET) == 0
+    assert count(picture, RED) < 500, "the end's mark alone"
+    assert count(picture, VIOLET) < 200, "its entry in the legend alone"
 
 
 def test_large_errors_and_frames_that_are_not_localised_stand_out() -> None:

@@ -19,7 +19,7 @@ import pickle, sys, time
 from pathlib import Path
 from fleetmap.numerics.kernel import KERNELS
 from fleetmap.sensors.rectification import Rectifier
-from locclient.commands.prepare import _steps
+from locclient.cli import warm_up_steps
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
@@ -27,7 +27,7 @@ from locclient.robot.version_trial import TrialSettings
 def compiled():
     return {(kernel.py_func.__module__, kernel.py_func.__name__, str(s)) for kernel in KERNELS for s in kernel.signatures}
 
-for run in _steps().values():
+for run in warm_up_steps().values():
     run()
 prepared = compiled()
 rig, loaded, bundles = pickle.loads(Path(sys.argv[1]).read_bytes())

@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
 from fleetmap.errors import UsageError
-from locclient.commands.options import IdentityFolder, Insecure
 
 if TYPE_CHECKING:
     from fleetmap.foxglove import ViewerAddress
@@ -19,6 +18,13 @@ if TYPE_CHECKING:
     from locclient.identity import MapAddress
     from locclient.replay.run_viewer import RunViewer
 
+Insecure = Annotated[
+    bool, typer.Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")
+]
+IdentityFolder = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Folder that `locclient enrol` fills; default: in the user's folder of state."),
+]
 NOT_LOCALISED_STATUS = 6
 
 
@@ -44,15 +50,19 @@ class MapOptions:
     # As tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
     cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
 
-    def address(self) -> "MapAddress":
-        """Where the map comes from; UsageError unless the options name one map."""
+    def address(self, version: int | None) -> "MapAddress":
+        """Where the map comes from; UsageError unless the options name one map, and for a version of a server's."""
         from locclient.identity import GivenAddress
 
         words = {name: None if value is None else str(value) for name, value in vars(self).items()}
         named = ("site", "robot", "server", "store", "root", "identity")
-        return GivenAddress(**{name: words[name] for name in named}, insecure=self.insecure, sign="--").resolve(
-            "replay"
-        )
+        given = GivenAddress(**{name: words[name] for name in named}, insecure=self.insecure, sign="--")
+        address = given.resolve("replay")
+        if version is not None and address.store is None:
+            raise UsageError(
+                f"--version {version} needs --store DIR: a server gives the version that its robots should run"
+            )
+        return replace(address, version=version)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,9 +129,9 @@ def replay(
     if is_failure_recording(recording):
         _replay_failure(recording, map_options, playback, files, version)
         return
-    address = _in_version(map_options.address(), version)
+    address = map_options.address(version)
     files.check()
-    _run(recording, (address, map_options), playback, files, settings)
+    _run(recording, address, map_options, playback, files, settings)
 
 
 def _replay_failure(
@@ -141,7 +151,7 @@ def _replay_failure(
                 )
     files.check()
     summary, record = read_failure_file(path)
-    address = _in_version(replace(map_options, site=map_options.site or summary.site).address(), version)
+    address = replace(map_options, site=map_options.site or summary.site).address(version)
     with connected(address, map_options.cache, map_options.cache_bytes) as connection:
         sha256 = None if version is None else connection.source.ready().wanted.manifest_sha256
         found = compare_failure((summary, record), connection.source, sha256)
@@ -157,25 +167,20 @@ def _replay_failure(
     typer.echo(found.answer)
 
 
-def _in_version(address: "MapAddress", version: int | None) -> "MapAddress":
-    if version is not None and address.store is None:
-        raise UsageError(
-            f"--version {version} needs --store DIR: a server gives the version that its robots should run"
-        )
-    return replace(address, version=version)
-
-
 def _run(
     path: Path,
-    map_from: "tuple[MapAddress, MapOptions]",
+    address: "MapAddress",
+    map_options: MapOptions,
     playback: PlaybackOptions,
     files: ResultFiles,
     settings: "LocclientConfig",
 ) -> None:
     from rich.progress import Progress
+    from rich.table import Table
 
     from fleetmap.console import plain_console
     from fleetmap.encoding import to_json
+    from fleetmap.foxglove import require_foxglove, viewer_address
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
@@ -184,8 +189,9 @@ def _run(
     from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
 
-    address, map_options = map_from
-    at = _viewer_address(playback, files, insecure=map_options.insecure)
+    at = None if playback.foxglove is None else viewer_address(playback.foxglove, insecure=map_options.insecure)
+    if at is not None or files.mcap is not None:
+        require_foxglove("--mcap" if at is None else "--foxglove")
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
@@ -211,20 +217,13 @@ def _run(
                 result.save_picture(files.picture)
             if viewer is not None and files.mcap is not None:
                 viewer.write_mcap(files.mcap)
-            _print_table(report)
+            table = Table("measure", "value")
+            for name, value in report.items():
+                table.add_row(name, _shown(value))
+            plain_console().print(table)
     if result.search.is_lost_run:
         typer.echo(result.search.words, err=True)
         raise typer.Exit(NOT_LOCALISED_STATUS)
-
-
-def _viewer_address(playback: PlaybackOptions, files: ResultFiles, *, insecure: bool) -> "ViewerAddress | None":
-    """Where viewers connect to, None for nowhere; UsageError as `viewer_address` and `require_foxglove`."""
-    from fleetmap.foxglove import require_foxglove, viewer_address
-
-    at = None if playback.foxglove is None else viewer_address(playback.foxglove, insecure=insecure)
-    if at is not None or files.mcap is not None:
-        require_foxglove("--mcap" if at is None else "--foxglove")
-    return at
 
 
 @contextmanager
@@ -247,17 +246,6 @@ def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: b
         with FoxgloveServer(at, recording.name) as server:
             typer.echo(f"foxglove: {server.url}")
             yield RunViewer(played, server.show)
-
-
-def _print_table(report: dict[str, Any]) -> None:
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
-
-    table = Table("measure", "value")
-    for name, value in report.items():
-        table.add_row(name, _shown(value))
-    plain_console().print(table)
 
 
 def _shown(value: object) -> str:
