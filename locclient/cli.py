@@ -10,7 +10,7 @@ import typer
 from fleetmap.cli_exit import run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Group, Options, Version, config_path, make_app
 from fleetmap.errors import UsageError, disk_errors
-from locclient.replay.command import IdentityFolder, Insecure, replay
+from locclient.replay_command import IdentityFolder, Insecure, replay
 
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
