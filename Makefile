@@ -10,7 +10,6 @@
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
 #   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
-#   make conformance SUITE=DIR robots' client of signed lists against a checkout of tuf-conformance (needs faketime)
 #   make clean                 remove everything that the other verbs made
 
 PYTHON ?= python3
@@ -30,7 +29,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test test-ci test-all check kernels kernels-server kernels-robot kernels-simulator bench acceptance study conformance clean
+.PHONY: help demo demo-recording test test-ci test-all check kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -87,11 +86,6 @@ acceptance: $(DEV_STAMP)
 study: $(DEV_STAMP)
 	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=square"; exit 2; }
 	PYTHONPATH=tests $(BIN)/python -m studies.$(NAME)
-
-conformance: $(DEV_STAMP)
-	@test -d "$(SUITE)/tuf_conformance" || { echo "SUITE=DIR: a checkout of tuf-conformance"; exit 2; }
-	PYTHONPATH=shared:$(SUITE) $(BIN)/python -m pytest -p no:cacheprovider -c $(SUITE)/pyproject.toml --rootdir $(SUITE) \
-		$(SUITE)/tuf_conformance --entrypoint "$(CURDIR)/$(BIN)/python $(CURDIR)/tests/support/fleet/conformance_client.py" $(PYTEST_ARGS)
 
 clean:
 	rm -rf $(VENV) out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

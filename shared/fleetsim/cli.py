@@ -1,4 +1,4 @@
-"""The command `fleetsim`: lists scenarios, records them, draws contact sheets of them."""
+"""The command `fleetsim`: lists scenarios and records them."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import TopicNames, Version, expand_options
+from fleetmap.cli_options import Version, expand_options
 from fleetmap.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
@@ -102,43 +102,6 @@ def record(
     from fleetsim.commands import record_order
 
     typer.echo(record_order(order, out, format_, images))
-
-
-@app.command()
-@expand_options
-def show(
-    out: Annotated[Path, Option(help="PNG to write.")],
-    run_options: RunOptions,
-    pictures: Annotated[int, Option(min=1, max=64, help="How many moments of the run.")] = 12,
-) -> None:
-    """A contact sheet: moments of a run, evenly spread, and the plan of the site with the route."""
-    if out.suffix.lower() != ".png":
-        raise UsageError(f"{out} should end in .png")
-    from fleetsim.commands import show_order
-    from fleetsim.recorder import Order
-
-    typer.echo(show_order(Order(**asdict(run_options)), out, pictures))
-
-
-@app.command()
-def reprocess(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="A recording in any format that fleetmap reads.")
-    ],
-    out: Annotated[Path, Option(help="File to write (.mcap).")],
-    camera_pipeline: Annotated[str, Option(metavar="NAME", help="As of `fleetsim record`.")],
-    seed: Annotated[int, Option(min=0, help="The noise follows from it.")] = 0,
-    topic: TopicNames = None,
-) -> None:
-    """Puts a recording's pictures through an image pipeline without rendering them again."""
-    if out.exists() or out.suffix != ".mcap":
-        raise UsageError(f"{out} {'exists already' if out.exists() else 'should end in .mcap'}; choose another name")
-    from fleetmap.recordings import OpenOptions, named_topics, open_recording
-    from fleetsim.imaging.pipelines import reprocess
-
-    with open_recording(recording, OpenOptions(topics=named_topics(topic))) as opened:
-        reprocess(opened, out, camera_pipeline, seed)
-        typer.echo(f"{out}: {len(opened)} frames through {camera_pipeline}")
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

@@ -1,29 +1,23 @@
-"""Work of the commands: recording with progress, contact sheets."""
+"""Recording with progress."""
 
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import cv2
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fleetmap.console import plain_console
-from fleetmap.errors import FleetmapError
 from fleetmap.recordings.images import StoredFrame, StoredImage, grey_image, jpeg_image, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import CameraFrame, Image
 from fleetsim.euroc_writer import EurocRecordingWriter
 from fleetsim.recorder import Order, Session, prepare, write_session
-from fleetsim.scenarios import find_scenario
-from fleetsim.scene.layout import Layout
 
 # Measured on 640x480 pictures of day and night, one core, per pair: raw 614 kB; png 340 kB, 9 ms to write and 4 ms to
 # read, lossless; jpeg 213 kB, 1 ms and 2 ms, but it adds an error of 1.7 grey rms, as much as the sensor's noise.
 IMAGE_ENCODINGS: dict[str, Callable[[Image], StoredImage]] = {"png": png_image, "jpeg": jpeg_image, "raw": grey_image}
-_THUMBNAIL_PX = 320
-_PLAN_PX_PER_M = 12
 
 
 def _progress() -> Progress:
@@ -86,51 +80,3 @@ def record_order(order: Order, out: Path, format_: str, images: str = "png") -> 
     seconds = time.monotonic() - started
     driven = f"{count} frames, {path_m:.1f} m, {session.frame_times_s[-1]:.1f} s of driving"
     return f"{out}: {driven}, recorded in {seconds:.1f} s"
-
-
-def show_order(order: Order, out: Path, pictures: int) -> str:
-    """Writes a contact sheet to `out`; a line that names it."""
-    with _progress() as progress, ThreadPoolExecutor(2) as workers:
-        session = _ready(order, progress, workers)
-        task = progress.add_task("taking pictures", total=pictures)
-        thumbnails = []
-        last = len(session.frame_times_s) - 1
-        for number in np.linspace(0, last, pictures + 2)[1:-1]:
-            image = session.renderer.shoot(session.frame_times_s[round(float(number))]).left
-            thumbnails.append(_scaled(image, _THUMBNAIL_PX))
-            progress.advance(task)
-        session.renderer.close()
-    sheet = _tile(thumbnails, 4)
-    plan = _scaled(_plan(find_scenario(order.scenario).layout, session), sheet.shape[1])
-    if not cv2.imwrite(str(out), np.concatenate([sheet, plan])):
-        raise FleetmapError(f"{out} cannot be written; does the folder exist?")
-    return f"{out}: {pictures} moments and the plan"
-
-
-def _scaled(image: Image, width_px: int) -> Image:
-    height_px = round(image.shape[0] * (width_px / image.shape[1]))
-    return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _tile(images: list[Image], columns: int) -> Image:
-    height, width = images[0].shape
-    rows = -(-len(images) // columns)
-    sheet = np.zeros((rows * height, columns * width), np.uint8)
-    for number, image in enumerate(images):
-        row, column = divmod(number, columns)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = image
-    return sheet
-
-
-def _plan(layout: Layout, session: Session) -> Image:
-    """The site from above, racks grey, the route white; x to the right, y up."""
-    scale = min(_PLAN_PX_PER_M * 1.0, 2400 / layout.length_m)
-    image = np.full((round(layout.width_m * scale), round(layout.length_m * scale)), 40, np.uint8)
-    for x_min, y_min, x_max, y_max in layout.solid_rectangles():
-        rows = slice(max(0, round((layout.width_m - y_max) * scale)), round((layout.width_m - y_min) * scale))
-        image[rows, max(0, round(x_min * scale)) : round(x_max * scale)] = 110
-    places = session.truth.positions_m[:, :2] * scale
-    points = np.stack([places[:, 0], image.shape[0] - places[:, 1]], axis=1)
-    polyline = np.rint(points).astype(np.int32)
-    cv2.polylines(image, [polyline], isClosed=False, color=255, thickness=2, lineType=cv2.LINE_AA)
-    return image

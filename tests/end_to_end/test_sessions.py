@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import SurveyError, UsageError
@@ -27,7 +26,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
-from support.storage.known_rig import KNOWN_RIG
+from support.room_site import KNOWN_RIG, invoke, run
 from support.worlds import box_room
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -35,18 +34,6 @@ FRAME_S = 0.1
 WALL = 3  # the face at y = 3 that all rides look at
 POSTER_M = np.array([[-0.8, -0.7], [0.8, 0.7]])  # x and z of its corners
 FIELDS = ("points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m")
-
-
-def invoke(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
-
-
-def run(*arguments: object) -> str:
-    result = invoke(*arguments)
-    if result.exception is not None:
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @contextmanager
@@ -93,8 +80,10 @@ class Nights:
         """Builds and publishes one night's version."""
         files = ["--report", self.folder / f"r{night}.json", "--trajectory-out", self.folder / f"t{night}.tum"]
         options = [option] if option else []
-        said = run("build", self.folder / f"night{night}", "--site", "lab", "--store", self.store, *files, *options)
-        run("publish", "--site", "lab", "--store", self.store, *KNOWN_RIG)
+        said = run(
+            app, "build", self.folder / f"night{night}", "--site", "lab", "--store", self.store, *files, *options
+        )
+        run(app, "publish", "--site", "lab", "--store", self.store, *KNOWN_RIG)
         return said
 
     def session(self, night: int) -> dict[str, Any]:
@@ -201,7 +190,7 @@ def test_the_archive_remembers_what_was_expected_and_seen(nights: Nights) -> Non
 def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
     """On the same version, the same recording ends in the same bytes."""
     copy = nights.folder / "three_nights"
-    run("build", nights.folder / "night4", "--site", "lab", "--store", copy)
+    run(app, "build", nights.folder / "night4", "--site", "lab", "--store", copy)
     with MapStore.open(copy) as again, MapStore.open(nights.store) as maps:
         assert again.manifest("lab", 4).tiles == maps.manifest("lab", 4).tiles
         assert again.archive("lab", 4) == maps.archive("lab", 4)
@@ -209,7 +198,7 @@ def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
 
 def test_the_frame_of_a_site_stays(nights: Nights) -> None:
     common = [nights.folder / "night2", "--site", "lab", "--store", nights.store]
-    error = invoke("build", *common, "--frame-from-ground-truth").exception
+    error = invoke(app, "build", *common, "--frame-from-ground-truth").exception
     assert isinstance(error, UsageError)
     assert "frame stays" in str(error)
 
@@ -219,7 +208,9 @@ def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp
     write_euroc(tmp_path / "foreign", make_sample(20))
     rides = [nights.folder / "night1", tmp_path / "foreign", nights.folder / "night2"]
     files = ["--report", tmp_path / "r.json", "--trajectory-out", tmp_path / "t.tum", "--picture", tmp_path / "p.png"]
-    said = run("build", *rides, "--site", "hall", "--store", tmp_path / "store", "--frame-from-ground-truth", *files)
+    said = run(
+        app, "build", *rides, "--site", "hall", "--store", tmp_path / "store", "--frame-from-ground-truth", *files
+    )
     assert "left out" in said
     report = json.loads((tmp_path / "r.json").read_text())
     assert [s["joined"] for s in report["sessions"]] == [True, False, True]
@@ -260,6 +251,6 @@ def test_a_prior_alone_joins_nothing(nights: Nights, tmp_path: Path) -> None:
 
 def test_a_site_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:
     write_euroc(tmp_path / "foreign", make_sample(20))
-    error = invoke("build", tmp_path / "foreign", "--site", "lab", "--store", nights.store).exception
+    error = invoke(app, "build", tmp_path / "foreign", "--site", "lab", "--store", nights.store).exception
     assert isinstance(error, SurveyError)
     assert "nothing could be joined" in str(error)

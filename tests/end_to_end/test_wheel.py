@@ -12,8 +12,7 @@ from zipfile import ZipFile
 
 import pytest
 
-from fleetsim import Order, record_order
-from mapserver import Actor, BuildOptions, build_map
+from support.room_site import RoomSite
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = {"fleetmap", "fleetsim", "mapserver", "locclient"}
@@ -64,16 +63,6 @@ def take_kernels(source: Path, installed: Path) -> None:
         kept = installed / compiled.relative_to(source)
         kept.parent.mkdir(exist_ok=True)
         shutil.copy2(compiled, kept)
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recording of a few metres of warehouse, `clip.mcap`, and a published map of it, `store`."""
-    folder = tmp_path_factory.mktemp("site")
-    record_order(Order("clip", frames=60), folder / "clip.mcap", "mcap")
-    draft = build_map(folder / "clip.mcap", folder / "store", "lab", BuildOptions(frame_from_ground_truth=True))
-    draft.publish(trust_calibration=True, actor=Actor("ada", "the rig is known"))
-    return folder
 
 
 def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
@@ -131,22 +120,11 @@ def test_it_stays_small(robot: Path) -> None:
     assert sum(path.stat().st_size for path in ours) < 335e6
 
 
-def test_help(robot: Path) -> None:
-    assert "replay" in run([robot / "locclient", "--help"], robot)
-    assert "--server" in run([robot / "locclient", "replay", "--help"], robot)
-
-
-def test_replay(robot: Path, site: Path, tmp_path: Path) -> None:
-    recording, store = site / "clip.mcap", site / "store"
-    run(
-        [robot / "locclient", "replay", recording, "--store", store, "--site", "lab", "--report", tmp_path / "r.json",
-         "--trajectory", tmp_path / "r.tum"],
-        tmp_path,
-    )  # fmt: skip
+def test_replay(robot: Path, site: RoomSite, tmp_path: Path) -> None:
+    files = ["--report", tmp_path / "r.json", "--trajectory", tmp_path / "r.tum"]
+    run([robot / "locclient", "replay", site.robot, "--store", site.store, "--site", "lab", *files], tmp_path)
     report = json.loads((tmp_path / "r.json").read_text("utf-8"))
     assert report["map_version"] == 1
-    assert report["first_fix_s"] < 1.0
-    # Tracking is announced after fixes that agree over a metre, which is a good part of this short drive.
-    assert report["localised_share"] > 0.25
-    assert report["error_m"]["median"] < 0.05
+    assert report["localised_share"] == 1.0
+    assert report["error_m"]["median"] < 0.01
     assert (tmp_path / "r.tum").read_text("utf-8").count("\n") > report["frames"] // 2

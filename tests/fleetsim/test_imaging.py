@@ -1,17 +1,11 @@
 """Image pipelines: what each stage does to a picture, that none moves anything, and that recordings go through them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from fleetmap.errors import UsageError
-from fleetmap.recordings import open_recording
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.cli import app
 from fleetsim.imaging import pipelines as stages
-from fleetsim.imaging.pipelines import IMAGE_PIPELINES, ImagePipeline, process_frame, processed
+from fleetsim.imaging.pipelines import IMAGE_PIPELINES, ImagePipeline, process_frame
 
 RNG = np.random.default_rng(0)
 REAL_PIPELINES = [name for name in IMAGE_PIPELINES if name != "clean"]
@@ -112,31 +106,3 @@ def test_noise_follows_from_seed_stamp_and_camera(name: str) -> None:
 def test_one_camera_has_no_right_picture() -> None:
     picture = stages.quantise(_blobs())
     assert process_frame(CameraFrame(5, picture, None), ImagePipeline(blur_px=1.0), 1).right is None
-
-
-def test_a_recording_processed_later_is_the_one_recorded_so(tmp_path: Path) -> None:
-    def run(*arguments: str) -> None:
-        result = CliRunner().invoke(app, list(arguments), catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-
-    order = ["record", "clip", "--frames", "2", "--size", "160x120", "--seed", "3"]
-    clean, phone, later = (str(tmp_path / f"{name}.mcap") for name in ("clean", "phone", "later"))
-    run(*order, "--out", clean)
-    run(*order, "--out", phone, "--camera-pipeline", "phone")
-    run("reprocess", clean, "--camera-pipeline", "phone", "--seed", "3", "--out", later)
-    with open_recording(phone) as one, open_recording(later) as other, open_recording(clean) as before:
-        in_memory = processed(before, "phone", 3)
-        for index in range(2):
-            ours, theirs, untouched = (r.read_frame(index) for r in (one, other, before))
-            np.testing.assert_array_equal(ours.left, theirs.left)
-            np.testing.assert_array_equal(ours.right, theirs.right)
-            np.testing.assert_array_equal(in_memory.read_frame(index).right, theirs.right)
-            assert not np.array_equal(ours.left, untouched.left)
-        np.testing.assert_array_equal(other.imu.accel_mps2, before.imu.accel_mps2)
-        assert len(other.priors) == len(before.priors)
-        assert len(other.wheel) == len(before.wheel)
-        assert in_memory.content_hash() != before.content_hash()
-        with pytest.raises(UsageError, match="unknown camera pipeline 'polaroid'; known are clean, soft"):
-            processed(before, "polaroid")
-    with pytest.raises(UsageError, match="exists already"):
-        run("reprocess", clean, "--camera-pipeline", "phone", "--out", later)

@@ -1,7 +1,5 @@
 """Splines against scipy, rates against numeric derivatives, the IMU integrated back, routes within limits."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -129,16 +127,3 @@ def test_no_scenario_drives_through_anything(name: str) -> None:
     for run in scenario.runs.values():
         motion = drive(run, run.kind, scenario.layout, np.random.default_rng(0))
         assert motion.duration_s > 2.0
-
-
-def test_the_centre_s_surveys_see_every_aisle_both_ways() -> None:
-    scenario = SCENARIOS["fulfilment-centre"]()
-    layout = scenario.layout
-    assert layout.length_m * layout.width_m >= 40_000
-    y = np.array([layout.aisle_y_m(aisle) for aisle in range(layout.aisles)])
-    driven: set[tuple[int, bool]] = set()
-    for name in ("survey-south", "survey-north", "survey-south-back", "survey-north-back"):
-        for start, end in pairwise(scenario.runs[name].routes[0].way_points_map):
-            if start[1] == end[1] and abs(end[0] - start[0]) > layout.bays * layout.bay_m:
-                driven.add((int(np.argmin(np.abs(y - start[1]))), end[0] > start[0]))
-    assert driven == {(aisle, forth) for aisle in range(layout.aisles) for forth in (False, True)}

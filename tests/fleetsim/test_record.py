@@ -151,11 +151,6 @@ def test_the_same_bytes_on_an_older_machine(tmp_path: Path) -> None:
     assert digests[0] == digests[1]
 
 
-def test_contact_sheet(tmp_path: Path) -> None:
-    _run("show", "clip", "--out", str(tmp_path / "sheet.png"), "--pictures", "2")
-    assert (tmp_path / "sheet.png").stat().st_size > 10_000
-
-
 def test_camera_faults_are_in_the_pictures() -> None:
     faults = (
         Fault("camera-dark", 0.5, 0.6), Fault("camera-frozen", 0.7, 0.9), Fault("over-exposure", 1.0, 1.1),
@@ -191,6 +186,7 @@ def test_camera_faults_are_in_the_pictures() -> None:
         (Order("clip", robot="r2"), "no robot 'r2'.*survey"),
         (Order("clip", lens="fish"), "unknown lens 'fish'; known are pinhole"),
         (Order("clip", day=-1), "day -1"),
+        (Order("clip", camera_pipeline="polaroid"), "unknown camera pipeline 'polaroid'; known are clean, soft"),
     ],
 )
 def test_nonsense_orders_are_refused(order: Order, words: str) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
@@ -22,6 +21,7 @@ from support.recordings.spoiled_recording import (
     with_lost_frames,
     without_imu,
 )
+from support.room_site import run
 from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES, FRAME_S = 60, 0.1
@@ -45,10 +45,8 @@ def another(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def built(recording: Recording, folder: Path) -> dict[str, Any]:
     """The report of a build of a recording that is written to `folder`; raises what the build raises."""
     copy_to_mcap(recording, folder / "r.mcap")
-    arguments = [str(folder / "r.mcap"), "--site", "lab", "--store", str(folder / "store")]
-    result = CliRunner().invoke(app, ["build", *arguments, "--report", str(folder / "r.json")])
-    if result.exception is not None:
-        raise result.exception
+    to_store = ("--site", "lab", "--store", folder / "store")
+    run(app, "build", folder / "r.mcap", *to_store, "--report", folder / "r.json")
     report: dict[str, Any] = json.loads((folder / "r.json").read_text())
     return report
 

@@ -41,7 +41,7 @@ from mapserver.survey.state import ImageStore, MemoryImageStore
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
-ROBOTS = ("survey-south", "survey-south-back")  # 13,000 keyframes and more
+ROBOTS = ("survey",)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
 
 

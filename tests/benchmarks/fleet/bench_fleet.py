@@ -1,40 +1,45 @@
 """A fleet that reports: health at 1 Hz, estimates at 2 Hz and failures of many robots to one server on loopback, counted at both ends.
 
-    PYTHONPATH=tests python tests/benchmarks/fleet/bench_fleet.py [--robots 300] [--seconds 120] [--month] [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.fleet.bench_fleet [--robots 300] [--seconds 120] [--month] [--out FILE.json]
 
-Robots have a zenoh session each and clocks that are wrong by seconds. Meanwhile the lists and figures are asked for over HTTP as an
-operator's page does. Every count is compared with what the robots know: reports, failures by site, robot, tile and cause, hours
-driven. --month fills a store with 30 days of sums of so many robots and measures its size and how long figures take.
+Robots have a zenoh session each and clocks that are wrong by seconds. Meanwhile lists and figures are asked for over HTTP. Every count is
+compared with what the robots know: reports, failures by site, robot, tile and cause, hours driven. --month fills a store with 30 days of
+sums of so many robots and measures its size.
 """
 
 import argparse
 import json
-import os
-import platform
-import subprocess
-import sys
+import multiprocessing
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack
-from importlib import metadata
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
-import msgspec
 import numpy as np
 from prometheus_client.parser import text_string_to_metric_families
 
-from benchmarks.fleet.bench_service import _SOURCES, cpu_s, resident_mb, serving
-from benchmarks.fleet.fleet_clients import SITE, TILES
+from benchmarks.fleet.server_process import SITE, measured, serving
+from fleetmap.bus import Bus
+from fleetmap.errors import FleetmapError
+from fleetmap.messages import (
+    FailureAck,
+    FailureReport,
+    PoseMessage,
+    RobotHealth,
+    decode_message,
+    encode_message,
+    robot_key,
+)
 from mapserver import releases
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters
 from mapserver.store import DraftContent, FailureFilter, FleetBatch, MapStore
+from support.fleet.made_fleet import NS, Known, MadeRobot
 from support.storage.map_samples import draft_details, random_tile
 
+_TILES, _PROCESSES = 20, 2
 _PAGES = (
     "/v1/robots?limit=1000",
     "/v1/fleet/measures?by=robot&limit=1000",
@@ -46,102 +51,105 @@ _PAGES = (
 )
 
 
-def make_site(folder: Path) -> None:
-    """A published version with a row of tiles."""
-    rng = np.random.default_rng(0)
-    tiles = [random_tile(rng, cell=(x, 0)) for x in range(TILES)]
-    with MapStore.open(folder, create=True) as store:
-        store.save_draft(SITE, DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=100.0)))
-        releases.publish(store, SITE)
+class _Robot:
+    """A robot and its connection."""
+
+    def __init__(self, endpoint: str, number: int, known: Known) -> None:
+        self.made = MadeRobot(
+            SITE, f"robot-{number}", np.random.default_rng(number), known, rate_per_robot_day=60.0, tiles=_TILES,
+            bad_tile=number % _TILES, ahead_s=(number % 7) - 3.0, cause=("dark", "blur", "covered")[number % 3], suspected_share=0.2,
+        )  # fmt: skip
+        self.bus = Bus.connect(endpoint)
+        self.alive = self.bus.declare_alive(robot_key(SITE, self.made.name, "alive"))
+
+    def say(self, message: RobotHealth | PoseMessage) -> None:
+        what = "health" if isinstance(message, RobotHealth) else "pose"
+        self.bus.publish(robot_key(SITE, self.made.name, what), encode_message(message), may_drop=what == "pose")
+
+    def report(self, failure: FailureReport) -> None:
+        """Asks until it is acknowledged."""
+        key = robot_key(SITE, failure.robot, "failures")
+        while True:
+            try:
+                answer = self.bus.get(key, encode_message(failure), timeout_s=10.0)
+            except FleetmapError:
+                continue
+            assert decode_message(answer, FailureAck) == FailureAck(id=failure.id)
+            return
 
 
-class Robots:
-    """Processes full of robots."""
-
-    def __init__(self, endpoint: str, robots: int, seconds: int, processes: int) -> None:
-        shares = [len(part) for part in np.array_split(np.arange(robots), processes)]
-        program = "from benchmarks.fleet.fleet_clients import main; main()"
-        self._processes = [
-            subprocess.Popen(
-                [sys.executable, "-c", program, endpoint, str(1000 * number), str(share), str(seconds)],
-                env=os.environ | {"PYTHONPATH": _SOURCES}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            )
-            for number, share in enumerate(shares)
-        ]  # fmt: skip
-        for process in self._processes:
-            assert process.stdout is not None and process.stdout.readline() == "ready\n"
-
-    def drive(self) -> dict[str, Any]:
-        """Lets them drive; what they said, added up."""
-        self._tell()
-        answers = [json.loads(process.stdout.readline()) for process in self._processes if process.stdout is not None]
-        total: dict[str, Any] = {
-            name: sum(answer[name] for answer in answers)
-            for name in ("health", "estimates", "reports", "acknowledged", "driving_s")
-        }
-        for name in ("failures", "suspected"):
-            counts: Counter[str] = Counter()
-            for answer in answers:
-                counts.update(answer[name])
-            total[name] = dict(counts)
-        return total | {"late_s": max(answer["late_s"] for answer in answers)}
-
-    def close(self) -> None:
-        """Lets them go."""
-        self._tell()
-        for process in self._processes:
-            process.wait(timeout=60)
-
-    def _tell(self) -> None:
-        for process in self._processes:
-            assert process.stdin is not None
-            process.stdin.write("go\n")
-            process.stdin.flush()
+def _drive(robots: list[_Robot], seconds: int, pool: ThreadPoolExecutor) -> float:
+    """Every robot speaks twice a second, all of them spread over it; returns by how much the last word was late."""
+    begun_s, late_s = time.monotonic(), 0.0
+    for step in range(1, seconds + 1):
+        now_ns = time.time_ns()
+        later: list[tuple[_Robot, PoseMessage | RobotHealth]] = []
+        for place, robot in enumerate(robots):
+            offset_s = 0.5 * place / len(robots)
+            time.sleep(max(0.0, begun_s + step - 1 + offset_s - time.monotonic()))
+            first, second, health, *failures = robot.made.second(now_ns + round(offset_s * NS))
+            robot.say(first)
+            later += [(robot, second), (robot, health)]
+            for failure in failures:
+                pool.submit(robot.report, failure)
+        for place, (robot, message) in enumerate(later):
+            time.sleep(max(0.0, begun_s + step - 0.5 + 0.5 * place / len(later) - time.monotonic()))
+            robot.say(message)
+        late_s = max(late_s, time.monotonic() - begun_s - step)
+    return late_s
 
 
-def measure_load(folder: Path, robots: int, seconds: int, processes: int) -> dict[str, Any]:
+def _robots(endpoint: str, numbers: range, seconds: int, said: Any, begin: Any, end: Any) -> None:
+    """A process of robots: connects, drives at `begin`, puts what was said, stays until `end`."""
+    known = Known()
+    robots = [_Robot(endpoint, number, known) for number in numbers]
+    while not all(robot.bus.connected() for robot in robots):
+        time.sleep(0.05)
+    said.put("ready")
+    begin.wait()
+    with ThreadPoolExecutor(8) as pool:
+        late_s = _drive(robots, seconds, pool)
+    time.sleep(1.0)  # what was published last is on its way
+    said.put((known, late_s))
+    end.wait()
+    for robot in robots:
+        robot.bus.close()
+
+
+def measure_load(folder: Path, robots: int, seconds: int) -> dict[str, Any]:
     """Drives, counts, compares; raises AssertionError where a count differs."""
-    rss_mb: list[float] = []
-    page_ms: dict[str, list[float]] = {page: [] for page in _PAGES}
-    over = threading.Event()
-    with ExitStack() as stack:
-        process, http, endpoint = stack.enter_context(serving(folder))
-        fleet = Robots(endpoint, robots, seconds, processes)
-
-        def watch() -> None:
-            with httpx.Client(base_url=http, timeout=30) as client:
-                number = 0
-                while not over.wait(1.0):
-                    rss_mb.append(resident_mb(process.pid))
-                    page = _PAGES[number % len(_PAGES)]
-                    page_ms[page].append(_timed_ms(lambda page=page: client.get(page).raise_for_status()))
-                    number += 1
-
-        watcher = threading.Thread(target=watch)
-        watcher.start()
-        begun_s, begun_cpu_s = time.monotonic(), cpu_s(process.pid)
-        said = fleet.drive()
-        cores = (cpu_s(process.pid) - begun_cpu_s) / (time.monotonic() - begun_s)
-        over.set()
-        watcher.join()
+    context = multiprocessing.get_context("spawn")
+    said, begin, end = context.Queue(), context.Event(), context.Event()
+    with serving(folder) as (process, http, endpoint):
+        shares = [range(n, robots, _PROCESSES) for n in range(_PROCESSES)]
+        fleets = [context.Process(target=_robots, args=(endpoint, s, seconds, said, begin, end)) for s in shares]
+        for fleet in fleets:
+            fleet.start()
+        assert [said.get() for _ in fleets] == ["ready"] * len(fleets)
+        with measured(process.pid, http, _PAGES, 1.0) as load:
+            begin.set()
+            answers = [said.get() for _ in fleets]
         time.sleep(6.0)  # the last flush and the last look for robots
         text = httpx.get(f"{http}/metrics", timeout=30).text
         present = httpx.get(f"{http}/v1/robots?limit=1000", timeout=30).json()["robots"]
-        fleet.close()
+        end.set()
+        for fleet in fleets:
+            fleet.join()
+    known = [answer[0] for answer in answers]
     heard = _bus_counts(text)
     with MapStore.open(folder) as store:
-        kept = _compare(store, said)
-    assert heard["health"] == said["health"], (heard, said["health"])
-    assert all(robot["is_present"] for robot in present) and len(present) == robots
-    tenth = max(1, len(rss_mb) // 10)
-    slowest = {page: max(times) for page, times in page_ms.items() if times}
+        kept = _compare(store, known)
+    health = sum(each.health for each in known)
+    assert heard["health"] == health, (heard, health)
+    assert all(robot["is_present"] for robot in present)
+    assert len(present) == robots
+    tenth = max(1, len(load.rss_mb) // 10)
+    rss_begin_mb, rss_end_mb = np.mean(load.rss_mb[tenth : 2 * tenth]), np.mean(load.rss_mb[-tenth:])
     return {
-        "robots": robots, "seconds": seconds, "health_said": said["health"], "health_heard": heard["health"],
-        "estimates_said": said["estimates"], "estimates_heard": heard["pose"], "failures_said": said["reports"],
-        "failures_kept": kept, "server_cores": cores, "rss_begin_mb": float(np.mean(rss_mb[tenth : 2 * tenth])),
-        "rss_end_mb": float(np.mean(rss_mb[-tenth:])),
-        "rss_growth": float(np.mean(rss_mb[-tenth:]) / np.mean(rss_mb[tenth : 2 * tenth])),
-        "robots_late_s": said["late_s"], "slowest_page_ms": slowest,
+        "robots": robots, "seconds": seconds, "health": health, "estimates_said": sum(each.estimates for each in known),
+        "estimates_heard": heard["pose"], "failures_kept": kept, "server_cores": load.cores, "rss_begin_mb": float(rss_begin_mb),
+        "rss_end_mb": float(rss_end_mb), "rss_growth": float(rss_end_mb / rss_begin_mb),
+        "robots_late_s": max(answer[1] for answer in answers), "slowest_page_ms": {p: max(ms) for p, ms in load.page_ms.items()},
     }  # fmt: skip
 
 
@@ -156,95 +164,60 @@ def _bus_counts(text: str) -> Counter[str]:
     return counts
 
 
-def _compare(store: MapStore, said: dict[str, Any]) -> int:
+def _compare(store: MapStore, known: list[Known]) -> int:
     """The number of failures in the store, after every marginal was compared with what the robots know."""
     for axis in ("site", "robot", "version", "tile", "cause"):
         counted = {key: counts for (_, key), counts in store.fleet.counters(SITE, axis).items()}
         for name in ("failures", "suspected"):
             mine = {key: getattr(counts, name) for key, counts in counted.items() if getattr(counts, name)}
-            theirs = {key.partition("|")[2]: n for key, n in said[name].items() if key.partition("|")[0] == axis}
-            assert mine == theirs, (axis, name)
-    total = store.fleet.counters(SITE, "site")[SITE, ""]
-    assert total.reports == said["health"], (total.reports, said["health"])
-    assert abs(total.driving_ms / 1e3 / said["driving_s"] - 1) < 0.02, (total.driving_ms, said["driving_s"])
+            theirs: Counter[str] = Counter()
+            for each in known:
+                theirs.update({key: n for (of, key), n in getattr(each, name).items() if of == axis})
+            assert mine == dict(theirs), (axis, name)
+    total, driving_s = store.fleet.counters(SITE, "site")[SITE, ""], sum(each.driving_s["site", ""] for each in known)
+    assert abs(total.driving_ms / 1e3 / driving_s - 1) < 0.02, (total.driving_ms, driving_s)
     count = len(store.fleet.failures(FailureFilter(site=SITE)))
-    assert count == said["reports"] == said["acknowledged"]
+    assert count == sum(each.reports for each in known)
     return count
 
 
 def measure_month(folder: Path, robots: int) -> dict[str, float]:
-    """A month of sums: 300 robots, 400 tiles, 3 versions, 6 causes, all of them every hour."""
+    """A month of sums: so many robots, 400 tiles, 3 versions, 6 causes, all of them every hour."""
     rng = np.random.default_rng(0)
+    keys = [("robot", f"robot-{n}") for n in range(robots)] + [("tile", f"{n % 20},{n // 20}") for n in range(400)]
+    keys += [("version", str(n)) for n in range(3)] + [("cause", f"c{n}") for n in range(6)] + [("site", "")]
     with MapStore.open(folder, create=True) as store:
         for hour in range(720):
             batch = FleetBatch()
-            keys = [("robot", f"robot-{n}") for n in range(robots)] + [
-                ("tile", f"{n % 20},{n // 20}") for n in range(400)
-            ]
-            keys += [("version", str(n)) for n in range(3)] + [("cause", f"c{n}") for n in range(6)] + [("site", "")]
             for axis, key in keys:
-                batch.add(
-                    SITE,
-                    axis,
-                    key,
-                    hour,
-                    Counters(*(int(value) for value in rng.integers(0, 3_600_000, len(COUNTER_COLUMNS)))),
-                )
+                values = rng.integers(0, 3_600_000, len(COUNTER_COLUMNS)).tolist()
+                batch.add(SITE, axis, key, hour, Counters(*values))
             store.fleet.add(batch)
-        timed: dict[str, Callable[[], object]] = {
-            "robots_day_ms": lambda: store.fleet.counters(SITE, "robot", since_hour=696),
-            "robots_month_ms": lambda: store.fleet.counters(SITE, "robot"),
-            "tiles_month_ms": lambda: store.fleet.counters(SITE, "tile"),
-            "hours_month_ms": lambda: store.fleet.hours(SITE, "site"),
-        }
-        figures = {name: min(_timed_ms(ask) for _ in range(3)) for name, ask in timed.items()}
-    return {"size_mb": sum(path.stat().st_size for path in folder.glob("store.sqlite3*")) / 1e6} | figures
-
-
-def _timed_ms(act: Callable[[], object]) -> float:
-    begun_s = time.perf_counter()
-    act()
-    return 1e3 * (time.perf_counter() - begun_s)
-
-
-def show(name: str, figures: dict[str, Any]) -> None:
-    """A table of two columns."""
-    print(f"\n{name}")
-    for key, value in figures.items():
-        rows = value.items() if isinstance(value, dict) else [("", value)]
-        for part, figure in rows:
-            print(f"  {key:20} {part:45} {figure:12.4g}", flush=True)
-
-
-def bench(robots: int, seconds: int, *, month: bool, processes: int = 2) -> dict[str, Any]:
-    """All figures."""
-    found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as name:
-        make_site(Path(name) / "store")
-        found["load"] = measure_load(Path(name) / "store", robots, seconds, processes)
-        show("load", found["load"])
-        if month:
-            found["month"] = measure_month(Path(name) / "month", robots)
-            show("month", found["month"])
-    return found
+    return {"size_mb": sum(path.stat().st_size for path in folder.glob("store.sqlite3*")) / 1e6}
 
 
 def main() -> None:
+    """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, default=300)
     parser.add_argument("--seconds", type=int, default=120)
     parser.add_argument("--month", action="store_true")
-    parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    found = bench(options.robots, options.seconds, month=options.month, processes=options.processes)
-    about = {
-        "machine": platform.machine(), "cores": os.cpu_count(), "python": platform.python_version(),
-        "zenoh": metadata.version("eclipse-zenoh"), "command": sys.argv,
-    }  # fmt: skip
-    print(json.dumps(about | found))
+    with tempfile.TemporaryDirectory() as name:
+        store = Path(name) / "store"
+        rng = np.random.default_rng(0)
+        tiles = [random_tile(rng, cell=(x, 0)) for x in range(_TILES)]
+        content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=100.0))
+        with MapStore.open(store, create=True) as maps:
+            maps.save_draft(SITE, content)
+            releases.publish(maps, SITE)
+        found = {"load": measure_load(store, options.robots, options.seconds)}
+        if options.month:
+            found["month"] = measure_month(Path(name) / "month", options.robots)
+    print(json.dumps(found, indent=1))
     if options.out is not None:
-        options.out.write_bytes(msgspec.json.format(msgspec.json.encode(about | found), indent=2) + b"\n")
+        options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

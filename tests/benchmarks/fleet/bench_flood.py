@@ -22,7 +22,7 @@ import numpy as np
 import zenoh
 
 from benchmarks.fleet.bench_bus_access import SITE, open_register, robot_files
-from benchmarks.fleet.bench_service import resident_mb, serving
+from benchmarks.fleet.server_process import resident_mb, serving
 from fleetmap.access import ALIVE, ORDERS, QUESTIONS, REPORTS, Holder
 from fleetmap.bus import Bus, TlsFiles
 from fleetmap.messages import (

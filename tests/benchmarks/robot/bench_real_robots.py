@@ -30,7 +30,7 @@ from fleetmap.recordings import open_recording
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from support.recordings.realdata import DATA
-from support.storage.known_rig import KNOWN_RIG
+from support.room_site import KNOWN_RIG
 
 MAPPED, UNSEEN = "0::2", "1::2"
 _STARTS = 20

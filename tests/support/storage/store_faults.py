@@ -12,10 +12,8 @@ import json
 import os
 import pickle
 import random
-import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -40,19 +38,6 @@ from support.storage.map_samples import draft_details, random_tile  # noqa: E402
 
 ADA = Actor("ada", "a fault")
 MODES = ("kill", "tear", "ENOSPC", "EIO", "ENOSPC from then on", "EIO from then on", "power cut")
-TRACED = {"strace kill": "signal=KILL", "strace ENOSPC": "error=ENOSPC", "strace EIO": "error=EIO"}
-TRACED_CALLS = (
-    "openat",
-    "write",
-    "pwrite64",
-    "fsync",
-    "fdatasync",
-    "rename",
-    "unlink",
-    "mkdir",
-    "ftruncate",
-    "pread64",
-)
 CHILD_WITHIN_S = 30
 Act = Callable[[MapStore], object]
 State = tuple[tuple[str, int, str, str], ...]
@@ -150,31 +135,11 @@ def in_child(folder: Path, act: Act, disk: Disk) -> tuple[int, Disk]:
     return os.waitstatus_to_exitcode(status), pickle.loads(told.read_bytes()) if told.exists() else disk
 
 
-def in_traced_child(folder: Path, act: Act, *options: str) -> int:
-    """The same on a sound disk, under `strace` with these options: the kernel's own calls, SQLite's among them."""
-    child = os.fork()
-    if child == 0:
-        os.kill(os.getpid(), signal.SIGSTOP)
-        _be_child(folder, act, None, None)
-    os.waitpid(child, os.WUNTRACED)
-    command = ["strace", "-f", "-p", str(child), *options]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as tracer:
-        assert tracer.stderr is not None
-        attached = tracer.stderr.readline()
-        assert "attached" in attached, attached
-        os.kill(child, signal.SIGCONT)
-        _, status = os.waitpid(child, 0)
-        tracer.stderr.read()
-    code = os.waitstatus_to_exitcode(status)
-    return -code if code < 0 else code
-
-
-def _be_child(folder: Path, act: Act, disk: Disk | None, told: Path | None) -> None:
+def _be_child(folder: Path, act: Act, disk: Disk, told: Path) -> None:
     status = 4
     try:
         signal.alarm(CHILD_WITHIN_S)
-        if disk is not None:
-            install(disk)
+        install(disk)
         with MapStore.open(folder, clock_ns=clock_ns) as store:
             act(store)
         status = 0
@@ -183,8 +148,7 @@ def _be_child(folder: Path, act: Act, disk: Disk | None, told: Path | None) -> N
     except BaseException:
         traceback.print_exc()
     finally:
-        if told is not None:
-            told.write_bytes(pickle.dumps(disk))
+        told.write_bytes(pickle.dumps(disk))
         os._exit(status)
 
 
@@ -249,29 +213,9 @@ def power_cuts(scenario: Scenario, folder: Path, every: int) -> Iterator[tuple[i
             image.apply(call)
 
 
-def traced(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
-    """The same by `strace`, at every `every`-th of each kind of system call."""
-    copy(scenario.start, folder)
-    calls = folder.with_suffix(".calls")
-    status = in_traced_child(folder, scenario.act, "-o", str(calls), "-e", f"trace={','.join(TRACED_CALLS)}")
-    assert status == 0, f"{scenario.name} fails on a sound disk"
-    names = re.findall(r"^\d* *(\w+)\(", calls.read_text("utf-8", "replace"), re.MULTILINE)
-    for name in TRACED_CALLS:
-        for number in range(1, names.count(name) + 1, every):
-            copy(scenario.start, folder)
-            fault = f"inject={name}:{TRACED[mode]}:when={number}"
-            status = in_traced_child(folder, scenario.act, "-o", os.devnull, "-e", f"trace={name}", "-e", fault)
-            faults = faults_after(folder, scenario, status == 0)
-            if status not in (0, 3, 9):
-                faults.append(f"the process ended with {status}")
-            yield number, [f"{name}: {fault}" for fault in faults]
-
-
 def _tries(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator[tuple[int, list[str]]]:
     if mode == "power cut":
         return power_cuts(scenario, folder, every)
-    if mode in TRACED:
-        return traced(scenario, folder, mode, every)
     return strikes(scenario, folder, mode, every)
 
 

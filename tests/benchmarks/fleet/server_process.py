@@ -1,0 +1,84 @@
+"""A running server for benchmarks, and what it costs."""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+
+SITE = "bench"
+_REPOSITORY = Path(__file__).resolve().parents[3]
+_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", "", "tests"))
+
+
+@contextmanager
+def serving(folder: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[subprocess.Popen[str], str, str]]:
+    """A running server and its HTTP and zenoh addresses."""
+    command = [sys.executable, "-m", "mapserver.cli", "serve", "--store", str(folder)]
+    command += ["--http", "127.0.0.1:0", "--zenoh", endpoint]
+    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": _SOURCES}, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
+        assert process.stdout.readline() == "ready\n"
+        yield process, addresses["http"], addresses["zenoh"]
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        process.stdout.close()
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of a process."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return float("nan")
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time that a process has used."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Load:
+    """What a server cost while something went on: cores, memory, and times of the pages that were asked for meanwhile."""
+
+    cores: float = 0.0
+    rss_mb: list[float] = field(default_factory=list)
+    page_ms: dict[str, list[float]] = field(default_factory=dict)
+
+
+@contextmanager
+def measured(pid: int, http: str, pages: tuple[str, ...], every_s: float) -> Iterator[Load]:
+    """Measures the server until the block ends, and asks it for one page after the other as an operator does."""
+    load, over = Load(rss_mb=[resident_mb(pid)]), threading.Event()
+
+    def watch() -> None:
+        with httpx.Client(base_url=http, timeout=30) as client:
+            number = 0
+            while not over.wait(every_s):
+                page = pages[number % len(pages)]
+                asked_s = time.perf_counter()
+                client.get(page).raise_for_status()
+                load.page_ms.setdefault(page, []).append(1e3 * (time.perf_counter() - asked_s))
+                load.rss_mb.append(resident_mb(pid))
+                number += 1
+
+    watcher = threading.Thread(target=watch)
+    begun_s, begun_cpu_s = time.monotonic(), cpu_s(pid)
+    watcher.start()
+    try:
+        yield load
+    finally:
+        load.cores = (cpu_s(pid) - begun_cpu_s) / (time.monotonic() - begun_s)
+        over.set()
+        watcher.join()
