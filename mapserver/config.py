@@ -32,9 +32,9 @@ TIERS = {
     "tuning": {
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "gate": "*",
-        "ingest": "trace_every_s trace_days tally_days failure_days picture_bytes replay_bytes",
-        "canary": "share margin_ratio margin_per_robot_day min_robot_days max_days",
-        "resurvey": "recent_days before_days min_failures rising_ratio fading",
+        "ingest": "*",
+        "canary": "*",
+        "resurvey": "*",
         "survey": "seed occupancy_grid surfel_map",
         "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options
+from fleetmap.cli_options import ConfigFile, expand_options
 from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
 
@@ -72,12 +72,21 @@ def build(
     check_output("--trajectory-out", options.trajectory_out)
     check_output("--picture", options.picture, ".png")
     options.check()
-    from mapserver import BuildOptions, build_map
+    from mapserver import build_map
     from mapserver.drafting.sensor_subset import named_sensor_set
 
-    use = None if options.use is None else named_sensor_set(options.use)
-    asked = options.asked(context) | {"use": use, "replay": tuple(options.replay or ()), "config": config_path(context)}
-    site, store = asked.pop("site"), asked.pop("store")
-    asked["trajectory"] = trajectory.given()
-    built = build_map(recordings, store, site, BuildOptions(**asked))
+    built = build_map(
+        recordings,
+        options.store,
+        options.site,
+        options.build_options(
+            context,
+            use=None if options.use is None else named_sensor_set(options.use),
+            replay=tuple(options.replay or ()),
+            trajectory=trajectory.given(),
+            trajectory_out=options.trajectory_out,
+            picture=options.picture,
+            frame_from_ground_truth=options.frame_from_ground_truth,
+        ),
+    )
     typer.echo(built.sentence)

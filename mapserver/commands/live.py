@@ -70,25 +70,21 @@ def live(
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     if at is not None:
         require_foxglove("--foxglove")
-    from mapserver import BuildOptions
+        from mapserver.live.live_viewer import LiveViewer
     from mapserver.drafting.sensor_subset import named_sensor_set
     from mapserver.live import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)
-    asked = options.asked(context) | {"config": config_path(context), "use": use}
-    site, store, speed, server, record = (asked.pop(name) for name in ("site", "store", "speed", "server", "record"))
-    for name in ("foxglove", "insecure", "sensors"):
-        asked.pop(name)
-    build, is_stopped = BuildOptions(**asked), _stopping()
+    build, is_stopped = options.build_options(context, use=use), _stopping()
     with (
-        _foxglove(at, site) as foxglove,
-        _played(recording, build, speed)
+        _foxglove(at, options.site) as foxglove,
+        _played(recording, build, options.speed)
         if recording is not None
-        else _driven(context.obj.read_config(sensors)[0], record, build) as (drive, settings),
-        _bus(server, store) as bus,
+        else _driven(context.obj.read_config(sensors)[0], options.record, build) as (drive, settings),
+        _bus(options.server, options.store) as bus,
     ):
-        request = LiveRequest(site, store, settings, build)
-        viewer = None if foxglove is None else _viewer(foxglove, drive)
+        request = LiveRequest(options.site, options.store, settings, build)
+        viewer = None if foxglove is None else LiveViewer(foxglove, drive)
         tell = _teller(bus, viewer)
         see = None if viewer is None else viewer.see
         result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
@@ -108,13 +104,16 @@ def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[t
 
 
 @contextmanager
-def _driven(given: "MapserverConfig", record: Path, build: "BuildOptions") -> "Iterator[tuple[Drive, SurveySettings]]":
+def _driven(
+    given: "MapserverConfig", record: Path | None, build: "BuildOptions"
+) -> "Iterator[tuple[Drive, SurveySettings]]":
     """The sensors that a configuration file names, and the settings that suit them; errors of `open_source`."""
     from fleetmap.sensors.samples import SensorSet
     from fleetmap.sources.source import open_source
     from mapserver.config import survey_settings
     from mapserver.live import SensorDrive
 
+    assert record is not None
     drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
     kinds = {
         (2, True): SensorSet.STEREO_INERTIAL,
@@ -163,12 +162,6 @@ def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[
     server = FoxgloveServer(at, site)
     typer.echo(f"foxglove: {server.url}")
     return server
-
-
-def _viewer(server: "FoxgloveServer", drive: "Drive") -> "LiveViewer":
-    from mapserver.live.live_viewer import LiveViewer
-
-    return LiveViewer(server, drive)
 
 
 def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":

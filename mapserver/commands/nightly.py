@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.commands.options import SurveyOptions
 
@@ -36,8 +36,8 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     from mapserver.nightly import NightRequest, run_night
 
     FrameSelection.parse(options.frames)
-    asked = {name: value for name, value in options.asked(context).items() if name != "report"}
-    request = NightRequest(now_ns=time.time_ns(), config=config_path(context), **asked)
+    build = options.build_options(context, report=None)
+    request = NightRequest(options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build)
     try:
         sentence = run_night(request, settings_of(context).gate, plain_console(stderr=True))
     except BusyError:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleetmap.cli_options import TopicNames, settings_of
+from fleetmap.cli_options import TopicNames, config_path, settings_of
 from fleetmap.errors import UsageError, disk_errors
 
 if TYPE_CHECKING:
     from fleetmap.recordings import Topics
+    from mapserver import BuildOptions
     from mapserver.store import Actor, MapStore
 
 
@@ -69,11 +70,14 @@ class SurveyOptions(SiteOptions):
         typer.Option(metavar="ADDRESS", help="Run on this dask cluster (tls://...)."),
     ] = None
 
-    def asked(self, context: typer.Context) -> dict[str, Any]:
-        """All options by their names, topics as Topics."""
-        values = dict(vars(self))
-        values["topics"] = topics_of(context, values.pop("topic"))
-        return values
+    def build_options(self, context: typer.Context, **more: Any) -> "BuildOptions":
+        """Those of a build, and more of them."""
+        from mapserver import BuildOptions
+
+        names = ("frames", "calibration", "zones", "report", "threads", "scheduler")
+        shared = {name: getattr(self, name) for name in names}
+        topics = topics_of(context, self.topic)
+        return BuildOptions(**shared | {"topics": topics, "config": config_path(context)} | more)
 
     def check(self) -> None:
         """Raises UsageError for a report that cannot be written and for an impossible name of the site."""

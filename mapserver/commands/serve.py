@@ -257,7 +257,7 @@ def _run(
     bus, robots = guarded_bus
     webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
-    tasks = server_tasks(maps, fleet, bus_service, settings)
+    tasks = server_tasks(maps, fleet, bus_service, settings.canary)
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:

@@ -27,23 +27,17 @@ _DAY_NS = 86_400_000_000_000
 
 
 class IngestSettings(Section, frozen=True):
-    """How often robots' reports go to the disk, how thinned, and how long they stay there."""
+    """How thinned robots' traces go to the disk, and how long what they report stays there."""
 
-    flush_every_s: Positive = 2.0  # a crash loses this much of the counts; failures are written at once
     trace_every_s: Positive = 10.0
     trace_days: Positive = 2.0
-    trace_rows: PositiveInt = 3_000_000  # whole hours are deleted, the oldest first
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
     picture_bytes: PositiveInt = 1_000_000_000  # the oldest pictures go as new ones come
     replay_bytes: PositiveInt = 2_000_000_000  # the oldest recordings of failures go as new ones come
-    failures_per_robot: PositiveInt = 5000  # twelve a day for 400 days
-    prune_every_s: Positive = 600.0  # between deletions of old rows
-    presence_every_s: Positive = 5.0  # between looks at the robots on the bus
 
     def retention(self) -> FleetRetention:
-        days = (self.tally_days, self.failure_days)
-        return FleetRetention(*days, self.picture_bytes, self.trace_days, self.trace_rows, self.failures_per_robot)
+        return FleetRetention(self.tally_days, self.failure_days, self.picture_bytes, self.trace_days)
 
 
 @dataclass(slots=True)

@@ -21,6 +21,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Action = Literal["wait", "promote", "roll_back"]
 DAY_NS = 86_400_000_000_000
+ALPHA = 0.01  # probability that a version within margin_ratio is rolled back, over all looks
+_CONFIDENCE = 0.95  # of being within the margin, for promotion; below its complement a version may be rolled back
 
 _WORSE_BY = np.geomspace(1.25, 50.0, 16)  # how much worse than the margin the alternatives are
 _QUANTILES = (np.arange(400) + 0.5) / 400
@@ -29,18 +31,14 @@ _QUANTILES = (np.arange(400) + 0.5) / 400
 class CanarySettings(Section, frozen=True):
     """How a canary is chosen and judged. The margin: margin_ratio times the others' rate plus margin_per_robot_day.
 
-    share: of the robots, when a command names none. alpha: chance to take back a harmless version. confidence: to promote.
+    share: of the robots, when a command names none.
     """
 
     share: Probability = 0.05
     margin_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
     margin_per_robot_day: Annotated[float, msgspec.Meta(ge=0)] = 0.5
-    alpha: Probability = 0.01  # probability that a version within margin_ratio is rolled back, over all looks
-    # Probability of being within the margin, for promotion; below its complement a version may be rolled back
-    confidence: Probability = 0.95
     min_robot_days: Positive = 3.0
     max_days: Positive = 7.0
-    check_every_s: Positive = 10.0  # between judgements
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +71,9 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
     evidence = evidence_of_harm(ours, theirs, settings.margin_ratio)
     within = within_margin(ours, theirs, settings.margin_ratio, settings.margin_per_robot_day)
     action: Action
-    if evidence >= 1 / settings.alpha and 1 - within >= settings.confidence:
+    if evidence >= 1 / ALPHA and 1 - within >= _CONFIDENCE:
         action, why = "roll_back", f"it fails more often than the margin allows (evidence {evidence:.0f} to 1)"
-    elif ours.robot_days >= settings.min_robot_days and within >= settings.confidence:
+    elif ours.robot_days >= settings.min_robot_days and within >= _CONFIDENCE:
         action, why = "promote", f"its rate is within the margin with {within:.1%}"
     elif age_days >= settings.max_days:
         why = f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})"

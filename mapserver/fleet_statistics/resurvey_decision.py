@@ -15,13 +15,15 @@ from scipy.special import betainc
 from fleetmap.config import Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, kpis, rate
 
+_ALPHA = 0.01  # probability that any tile of an unchanged site is listed
+_MIN_LANDMARKS = 2000  # looked for in both periods, for their share to count
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class ResurveySettings(Section, frozen=True):
     """What is recent, what is before, and how much worse the recent must be.
 
-    rising_ratio: how often the rate before must be exceeded, with at most a chance of alpha that it is not; fading: by how much the
+    rising_ratio: how often the rate before must be exceeded, with at most a chance of 1 % that it is not; fading: by how much the
     share of found landmarks fell.
     """
 
@@ -29,10 +31,7 @@ class ResurveySettings(Section, frozen=True):
     before_days: Positive = 14.0
     min_failures: Annotated[int, msgspec.Meta(ge=1)] = 3
     rising_ratio: Annotated[float, msgspec.Meta(ge=1)] = 1.5
-    # Probability that any tile of an unchanged site is listed
-    alpha: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.01
     fading: Annotated[float, msgspec.Meta(gt=0, lt=1)] = 0.15
-    min_landmarks: Annotated[int, msgspec.Meta(ge=1)] = 2000  # looked for in both periods, for their share to count
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +140,7 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
         return []
     odds = settings.rising_ratio * max(now.robot_days, 1e-6) / days
     chance = float(betainc(now.events, events + 1, odds / (1 + odds)))
-    if chance * tests > settings.alpha:
+    if chance * tests > _ALPHA:
         return []
     driven = f"{now.driving_ms / 3.6e6:.1f} h of driving"
     return [f"{now.events} failures in {driven}, {events} in {days * 16:.1f} h {words}"]
@@ -149,6 +148,6 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
 
 def _fading(now: Counters, then: Counters, settings: ResurveySettings) -> list[str]:
     new, old = kpis(now).landmarks_seen_share, kpis(then).landmarks_seen_share
-    if new is None or old is None or min(now.landmarks_expected, then.landmarks_expected) < settings.min_landmarks:
+    if new is None or old is None or min(now.landmarks_expected, then.landmarks_expected) < _MIN_LANDMARKS:
         return []
     return [f"{new:.0%} of the landmarks are found, {old:.0%} before"] if new < old - settings.fading else []

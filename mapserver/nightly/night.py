@@ -8,7 +8,7 @@ gate by the next night; recordings that a version holds are only put away.
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from fleetmap.log_lines import printable
-from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, Topics
+from fleetmap.recordings import FILE_SUFFIXES
 from mapserver import releases
 from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
 from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, only_one
@@ -33,7 +33,6 @@ _ENDED = (
     "{nights} nights ended while this was read or built: killed, out of memory or out of time, or by a fault of the program; "
     "try `mapserver doctor` on it, and move it back, alone, to try again"
 )
-_SHARED_WITH_BUILDS = ("frames", "calibration", "topics", "zones", "threads", "scheduler", "config")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +44,7 @@ class NightRequest:
     store: Path
     now_ns: int
     settle_s: float = 300.0
-    frames: str = "::"
-    calibration: Path | None = None
-    topics: Topics = field(default_factory=Topics)
-    zones: Path | None = None
-    threads: int | None = None
-    scheduler: str | None = None
-    config: Path | None = None
+    options: BuildOptions = field(default_factory=BuildOptions)
 
 
 @dataclass
@@ -184,7 +177,7 @@ class _Night:
                 self._put_away(path, boxes.BAD, None, _ENDED.format(nights=self._report.ended[name]))
                 continue
             self._look_at([path])
-            recorded = boxes.identify(path, OpenOptions(self._request.calibration, self._request.topics))
+            recorded = boxes.identify(path, self._request.options.reading.opening)
             if recorded is None:
                 self._wait(name, "not yet: it changed while it was read")
             elif isinstance(recorded, str):
@@ -223,12 +216,12 @@ class _Night:
         request = self._request
         by_hash = {recorded.sha256: recorded for recorded in recordings}
         unusable: dict[Path, str] = {}
-        options = BuildOptions(
+        options = replace(
+            request.options,
             replay=tuple(self._replayed()),
             actor=self._actor(),
             job=self._report.job,
             look_at=self._look_at,
-            **{name: getattr(request, name) for name in _SHARED_WITH_BUILDS},
         )
         paths = tuple(recorded.path for recorded in recordings)
         build = BuildRequest(paths, request.site, request.store, options)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from fleetmap.errors import FleetmapError
 from fleetmap.log_lines import LogLimit
-from mapserver.config import MapserverConfig
 from mapserver.drafting.job_lock import end_interrupted
 from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
 from mapserver.serving.webhook import AlertWatch, Webhook
@@ -20,6 +20,10 @@ from mapserver.store import MapStore
 from mapserver.trust import update_lists
 
 _ANNOUNCE_EVERY_S = 1.0
+_FLUSH_EVERY_S = 2.0  # a crash loses this much of the counts; failures are written at once
+_PRESENCE_EVERY_S = 5.0
+_PRUNE_EVERY_S = 600.0
+_CANARIES_EVERY_S = 10.0
 _LOOK_EVERY_S = 0.2
 _JOBS_EVERY_S = 20.0
 _ADMIT_EVERY_S = 1.0  # what changes meanwhile goes together
@@ -39,23 +43,20 @@ class BackgroundTask:
 
 
 def server_tasks(
-    store: MapStore, fleet: Fleet, bus_service: BusService, settings: MapserverConfig
+    store: MapStore, fleet: Fleet, bus_service: BusService, canary: CanarySettings
 ) -> list[BackgroundTask]:
     """All background tasks of a server."""
-    ingest = settings.ingest
     return [
         # Before the announcement: robots take only what the lists admit.
         BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
         BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
-        BackgroundTask("keeping reports", ingest.flush_every_s, fleet.flush),
-        BackgroundTask("looking for robots", ingest.presence_every_s, bus_service.look_for_robots),
-        BackgroundTask("removing old reports", ingest.prune_every_s, fleet.prune),
+        BackgroundTask("keeping reports", _FLUSH_EVERY_S, fleet.flush),
+        BackgroundTask("looking for robots", _PRESENCE_EVERY_S, bus_service.look_for_robots),
+        BackgroundTask("removing old reports", _PRUNE_EVERY_S, fleet.prune),
         BackgroundTask(
             "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
         ),
-        BackgroundTask(
-            "looking at canaries", settings.canary.check_every_s, lambda: review(store, settings.canary, time.time_ns())
-        ),
+        BackgroundTask("looking at canaries", _CANARIES_EVERY_S, lambda: review(store, canary, time.time_ns())),
     ]
 
 

@@ -1,6 +1,7 @@
 """The server's side of the bus: answers for versions, manifests and bytes; takes the robots' messages; announces versions."""
 
 import logging
+import threading
 from collections.abc import Callable
 
 from fleetmap.bus import Bus, Handle
@@ -27,7 +28,6 @@ from fleetmap.messages import (
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_access import BusGuard
-from mapserver.serving.caches import AuthorizationCache, ByteCache
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 from mapserver.trust import SignedLists
@@ -41,6 +41,7 @@ MAX_REPORT_BYTES = 16 << 10  # a health report with everything in it has 3 kB, a
 RENEWAL_RATE = (5, 1 / 60)  # of a robot: each is a signature, and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
+_ENTRY_BYTES = 200  # what an entry of the cache takes beside its bytes, so that empty ones are bounded too
 
 
 class BusService:
@@ -61,8 +62,7 @@ class BusService:
         self._rates["renew"] = RateLimit(*RENEWAL_RATE, store.now_ns)
         self._lists = SignedLists(store.folder)
         self._announced: dict[tuple[str, str], str | None] = {}
-        self._recent = ByteCache(_CACHED_BYTES)
-        self._kinds = AuthorizationCache(store.served_kind)
+        self._recent = ByteCache(_CACHED_BYTES, store.blob)
         self.surveys = LiveSurveys()
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
@@ -165,7 +165,7 @@ class BusService:
         info = self._store.version(site, int(number))
         if info.state == "draft":
             raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
-        return self._read(info.manifest_sha256)
+        return self._recent.get(info.manifest_sha256)
 
     def _list_file(self, key: str) -> bytes:
         site, _what, name = split_key(key)
@@ -173,16 +173,13 @@ class BusService:
 
     def _blob(self, key: str) -> bytes:
         site, _what, sha256 = split_key(key)
-        if self._kinds.get(sha256, site) is None:
+        if self._store.served_kind(sha256, site) is None:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
-        return self._read(sha256)
+        return self._recent.get(sha256)
 
     def _patch(self, key: str) -> bytes:
         """Robots of before ask for patches first, and for the whole where that is refused."""
         raise LinkError(f"there are no patches any more ({key[:200]}); fetch the whole")
-
-    def _read(self, sha256: str) -> bytes:
-        return self._recent.get(sha256, lambda: self._store.blob(sha256))
 
     def _hear(self, key: str, payload: bytes) -> None:
         what = key.rpartition("/")[2]
@@ -223,3 +220,26 @@ class BusService:
         """Published messages have no answer: the log and the metric show the refusal."""
         self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
         self._count(what, "refused", 0)
+
+
+class ByteCache:
+    """Thread-safe; the bytes that were asked for last. A whole fleet asks for the same tile at once: it is read once."""
+
+    def __init__(self, max_bytes: int, read: Callable[[str], bytes]) -> None:
+        self._max_bytes, self._read = max_bytes, read
+        self._held: dict[str, bytes] = {}  # in the order of their last use
+        self._lock = threading.Lock()
+
+    def get(self, sha256: str) -> bytes:
+        """The bytes of an address, read where they are not held; errors as of `read`."""
+        with self._lock:
+            data = self._held.pop(sha256, None)
+            if data is None:
+                data = self._read(sha256)
+            self._held[sha256] = data
+            while self.total_bytes() > self._max_bytes:
+                del self._held[next(iter(self._held))]
+            return data
+
+    def total_bytes(self) -> int:
+        return sum(len(data) + _ENTRY_BYTES for data in self._held.values())

@@ -337,5 +337,5 @@ class FleetRetention:
     failure_days: float = 400.0
     picture_bytes: int = 1_000_000_000
     trace_days: float = 2.0
-    trace_rows: int = 3_000_000
-    failures_per_robot: int = 5000
+    trace_rows: int = 3_000_000  # whole hours are deleted, the oldest first
+    failures_per_robot: int = 5000  # twelve a day for 400 days

@@ -16,7 +16,7 @@ from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_service import BusService
-from mapserver.store import Actor, FailureFilter, MapStore
+from mapserver.store import Actor, FailureFilter, FleetRetention, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
 
@@ -180,8 +180,9 @@ def test_pictures_have_a_bound_at_once(store: MapStore, clock: Clock) -> None:
     assert store._transactions.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] <= 100_000
 
 
-def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock) -> None:
-    fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(failures_per_robot=20))
+def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(IngestSettings, "retention", lambda _: FleetRetention(failures_per_robot=20))
+    fleet = Fleet(store, clock_ns=clock)
     send(fleet, clock, 0, "calm")
     for number in range(50):
         assert send(fleet, clock, number)

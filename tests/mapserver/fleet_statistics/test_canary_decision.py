@@ -5,6 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from mapserver.fleet_statistics.canary_decision import (
+    ALPHA,
     CanarySettings,
     evidence_of_harm,
     judge_canary,
@@ -57,8 +58,8 @@ def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at()
             evidence_of_harm(rate(int(a), 0.1 * n), rate(int(b), 2.0 * n), 1.5)
             for n, (a, b) in enumerate(zip(ours, theirs, strict=True), start=1)
         ]
-        alarms += max(evidence) >= 1 / SETTINGS.alpha
-    assert alarms / runs <= SETTINGS.alpha * 1.5
+        alarms += max(evidence) >= 1 / ALPHA
+    assert alarms / runs <= ALPHA * 1.5
 
 
 @pytest.mark.parametrize(

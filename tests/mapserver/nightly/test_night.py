@@ -37,7 +37,7 @@ from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
 from mapserver import cli, releases
 from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildRequest, Draft
+from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly import inbox as boxes
@@ -120,7 +120,8 @@ def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
     config.write_text("[survey]\nseed = 5\n")
     monkeypatch.setattr(night, "build_draft", spied)
     monkeypatch.setattr("mapserver.library.sensor_set_of", lambda *_: SensorSet.MONO)
-    order = NightRequest("hall", hall / "inbox", hall / "store", time.time_ns() + LATER_NS, config=config)
+    now_ns, options = time.time_ns() + LATER_NS, BuildOptions(config=config)
+    order = NightRequest("hall", hall / "inbox", hall / "store", now_ns, options=options)
     run_night(order, GateSettings(), Console(file=io.StringIO()))
     assert used == [survey_settings(config, SensorSet.MONO)]
     assert used[0] != survey_settings(config, SensorSet.STEREO_INERTIAL)

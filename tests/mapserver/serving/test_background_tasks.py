@@ -8,10 +8,9 @@ import pytest
 from fleetmap.errors import StoreError
 from fleetmap.messages import FailureReport, RobotHealth
 from mapserver import releases
-from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.serving import background_tasks
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -54,15 +53,14 @@ def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
-    settings = MapserverConfig(
-        ingest=IngestSettings(flush_every_s=0.05, presence_every_s=0.05), canary=CanarySettings(check_every_s=0.05)
-    )
+def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("_FLUSH_EVERY_S", "_PRESENCE_EVERY_S", "_CANARIES_EVERY_S"):
+        monkeypatch.setattr(background_tasks, name, 0.05)
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         save_sample_draft(store)
         releases.publish(store, "lab")
         save_sample_draft(store, seed=3)
-        fleet = Fleet(store, settings=settings.ingest)
+        fleet = Fleet(store)
         service = BusService(store, fleet, bus, lambda *_: None)
         releases.start_canary(store, "lab", 2, 0.1)
         for robot, version in (("r1", 2), ("r2", 1), ("r3", 1)):
@@ -78,7 +76,7 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
                 duration_s=3.0, kind="blind", status="LOST", cause="changed", version=2,
             )  # fmt: skip
             fleet.take_failure("lab", "r1", report)
-        run_for(server_tasks(store, fleet, service, settings), 2.0)
+        run_for(server_tasks(store, fleet, service, CanarySettings()), 2.0)
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary
         assert "8 failures in" in canary.outcome

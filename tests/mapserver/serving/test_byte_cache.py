@@ -6,56 +6,47 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mapserver.serving.caches import ByteCache
+from mapserver.serving.bus_service import ByteCache
 
 
-def test_the_least_recently_used_go_first() -> None:
-    made: list[str] = []
+def test_the_least_recently_used_go_first_and_nothing_is_kept_beyond_the_limit() -> None:
+    read: list[str] = []
 
-    def make(key: str) -> bytes:
-        made.append(key)
-        return key.encode() * 100
+    def blob(key: str) -> bytes:
+        read.append(key)
+        if key == "missing":
+            raise LookupError
+        return b"" if key.startswith("empty") else key.encode() * (2000 if key == "x" else 100)
 
-    held = ByteCache(1000)
-    for key in "abcab":
-        assert held.get(key, lambda key=key: make(key)) == key.encode() * 100
-    assert made == ["a", "b", "c"]
-    held.get("d", lambda: make("d"))
-    held.get("b", lambda: make("b"))
-    held.get("c", lambda: make("c"))
-    assert made == ["a", "b", "c", "d", "c"]
-    assert held.total_bytes <= 1000
-
-
-def test_what_is_larger_than_the_limit_and_what_fails_is_not_kept() -> None:
-    held = ByteCache(1000)
-    assert len(held.get("x", lambda: bytes(2000))) == 2000
-    with pytest.raises(ZeroDivisionError):
-        held.get("y", lambda: bytes(1 // 0))
-    assert held.total_bytes == 0
+    held = ByteCache(1000, blob)
+    for key in "abcabdbc":
+        assert held.get(key) == key.encode() * 100
+    assert read == ["a", "b", "c", "d", "c"]
+    assert len(held.get("x")) == 2000
+    with pytest.raises(LookupError):
+        held.get("missing")
     for number in range(100):
-        held.get(str(number), lambda: b"")
-    assert held.total_bytes <= 1000
+        held.get(f"empty {number}")
+    assert 0 < held.total_bytes() <= 1000
 
 
-def test_what_many_ask_for_at_once_is_made_once() -> None:
-    """Also where making it fails at first: the next one tries."""
-    held, begun, made = ByteCache(1000), threading.Event(), []
+def test_what_many_ask_for_at_once_is_read_once() -> None:
+    """Also where reading it fails at first: the next one tries."""
+    begun, read = threading.Event(), []
 
-    def make() -> bytes:
-        made.append(threading.get_ident())
+    def blob(key: str) -> bytes:
+        read.append(key)
         begun.wait(5)
-        if len(made) == 1:
+        if len(read) == 1:
             raise LookupError
         return b"tile"
 
+    held = ByteCache(1000, blob)
     with ThreadPoolExecutor(8) as pool:
-        asked = [pool.submit(held.get, "a", make) for _ in range(8)]
-        while not made:
+        asked = [pool.submit(held.get, "a") for _ in range(8)]
+        while not read:
             time.sleep(0.001)
         begun.set()
         failed = sum(answer.exception() is not None for answer in asked)
         answers = [answer.result() for answer in asked if answer.exception() is None]
-    assert failed == 1
-    assert answers == [b"tile"] * 7
-    assert len(made) == 2
+    assert (failed, answers, len(read)) == (1, [b"tile"] * 7, 2)
