@@ -12,16 +12,14 @@ import numpy as np
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words
 from fleetmap.sensors.samples import ImuSamples
+from mapserver.doctor.camera_motion import CameraTurns
 from mapserver.doctor.findings import Finding, Verdict, not_judged
-from mapserver.doctor.gyro_images import CameraTurns
 
 NAME = "accelerometer axes"
 _HALF_WINDOW_S = 0.3
 _MIN_WINDOWS = 8
-_BIAS_SIGMA_MPS2, _NOISE_MPS = (
-    0.3,
-    0.03,
-)  # the second, of a change of velocity by the images, weighs the first: windows tell their own
+_BIAS_SIGMA_MPS2 = 0.3
+_NOISE_MPS = 0.03  # of a change of velocity by the images: weighs the bias' sigma; windows tell their own
 _FLOOR_MPS = 0.02  # of the same: half a degree of tilt by the images. Windows that agree better than this say no more
 _REACH = 4.0  # windows that are further off than so many typical ones are outliers: someone walked through the picture
 # What the best order of axes must explain better than another that is ruled out: in squares of the windows' scatter, and times as well.
@@ -62,9 +60,8 @@ def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: floa
         return []
     runs = np.array([window.run for window in windows])
     changes, forces, biases = (np.array([getattr(w, name) for w in windows]) for name in ("change", "force", "bias"))
-    design = np.zeros(
-        (len(windows), 3, 7 + 3 * int(runs.max()))
-    )  # metres, bias, gravity in the axes where each run of frames begins
+    # metres, bias, gravity in the axes where each run of frames begins
+    design = np.zeros((len(windows), 3, 7 + 3 * int(runs.max())))
     design[:, :, 0], design[:, :, 1:4] = changes, biases
     for axis in range(3):
         design[np.arange(len(windows)), axis, 4 + 3 * runs + axis] = [window.span_s for window in windows]
@@ -97,9 +94,8 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
     """Whether the given axes may be right. base_from_body (4, 4): of a robot that stands on its wheels, None for one that need not."""
     limit = "fail where other signs or another order of the axes explain the images, and the given ones do not"
     if not fits:
-        return not_judged(
-            NAME, "too few frames follow each other, or they show no metres", "record every frame of a pair"
-        )
+        reason = "too few frames follow each other, or they show no metres"
+        return not_judged(NAME, reason, "record every frame of a pair")
     ups = [None if base_from_body is None else base_from_body[:3, :3] @ fit.up_body for fit in fits]
     possible = [fit for fit, up in zip(fits, ups, strict=True) if up is None or up[2] > _UPRIGHT]
     if any(fit.is_given for fit in possible):
@@ -113,13 +109,8 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
         words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: so the images accelerate"
     if given is not None:
         words += f"; as given, up is {np.round(given, 1) + 0.0} of the base"
-    return Finding(
-        NAME,
-        Verdict.FAIL,
-        None,
-        limit,
-        f"{words}; mend its driver's signs, or how the calibration mounts it (T_cam_imu)",
-    )
+    words += "; mend its driver's signs, or how the calibration mounts it (T_cam_imu)"
+    return Finding(NAME, Verdict.FAIL, None, limit, words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +130,7 @@ def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> lis
     known = np.isfinite(turns.ways_m).all(axis=1)
     if len(imu) < 10 or known.sum() < 2:
         return []
-    starts_ns, ends_ns = turns.starts_ns[known], turns.ends_ns[known]
-    turns = CameraTurns(starts_ns, ends_ns, turns.rates_body_radps[known], turns.ways_m[known])
+    turns = turns.only(np.flatnonzero(known))
     origin_ns = int(turns.starts_ns[0])
     starts_s, ends_s = (turns.starts_ns - origin_ns) * 1e-9, (turns.ends_ns - origin_ns) * 1e-9
     times_s = (imu.stamps_ns - origin_ns) * 1e-9 - imu_minus_cam_s

@@ -20,7 +20,7 @@ from mapserver.calibration import CalibrationEstimate, CalibrationParameter, Par
 from mapserver.calibration.parameters import RANGES
 from mapserver.calibration.recordings import busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
-from mapserver.doctor.timing import SPARSE_S, median_period_s
+from mapserver.doctor.sensors import SPARSE_S, median_period_s
 from mapserver.survey.executor import Executor
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
@@ -103,14 +103,16 @@ def measure_calibration(recording: Recording, on_frame: Callable[[], None], exec
     """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
-        return _unknown(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
+        return unknown_calibration(f"frames are {period_s:.2f} s apart", "record every frame of the camera")
     tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
     try:
         focal_px = Rectifier(recording.calibration).camera.focal_px
         enough = partial(_is_good, focal_px)
         estimate = estimate_calibration([recording], SurveySettings(), tools, enough)
     except (FleetmapError, np.linalg.LinAlgError) as error:
-        return _unknown(f"the frames could not be followed: {error}", "record a drive in the light, with every frame")
+        return unknown_calibration(
+            f"the frames could not be followed: {error}", "record a drive in the light, with every frame"
+        )
     return MeasuredCalibration(findings_of(estimate, focal_px), estimate)
 
 
@@ -142,7 +144,8 @@ def in_words(name: str, value: float) -> str:
     return f"{factor * value:+.{digits}f} {shown}"
 
 
-def _unknown(reason: str, missing: str) -> MeasuredCalibration:
+def unknown_calibration(reason: str, missing: str) -> MeasuredCalibration:
+    """No parameter judged, for the same reason."""
     return MeasuredCalibration([not_judged(p.value, reason, missing) for p in P], None)
 
 

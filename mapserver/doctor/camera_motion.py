@@ -1,17 +1,60 @@
 """Motion of the camera between two frames, by the images alone."""
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from fleetmap.features.flow import Pyramid, follow, forward_backward_check
 from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo import disparities
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import Stamps
 
 _CORNERS, _MIN_POINTS = 250, 25
 _WINDOW_PX, _LEVELS, _RETURNED_PX = 15, 4, 0.5
 _STEREO = StereoSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTurns:
+    """Motion seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
+
+    ways_m (K, 3): where the body was at the end, in its axes at the start and the calibration's metres; NaN with one camera.
+    """
+
+    starts_ns: Stamps
+    ends_ns: Stamps
+    rates_body_radps: Array
+    ways_m: Array
+
+    @classmethod
+    def of(cls, motions: Iterable[tuple[int, int, Array | None]]) -> "CameraTurns":
+        """Of what `body_motion` found."""
+        found = [each for each in motions if each[2] is not None]
+        spans = np.array([[start_ns, end_ns] for start_ns, end_ns, _ in found], np.int64).reshape(-1, 2)
+        moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
+        rates = np.array([so3_log(motion[:3, :3]) for motion in moved]).reshape(-1, 3) / (np.diff(spans) * 1e-9)
+        return cls(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
+
+    def only(self, kept: AnyArray) -> "CameraTurns":
+        """Those of a mask or of numbers."""
+        return CameraTurns(self.starts_ns[kept], self.ends_ns[kept], self.rates_body_radps[kept], self.ways_m[kept])
+
+
+def body_motion(
+    rig: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
+) -> tuple[int, int, Array | None]:
+    """Stamps of two frames and the body's motion (4, 4) between them, earlier_from_later. rig: the camera, and body_from_cam."""
+    (camera, body_from_cam), (before, after) = rig, pair
+    motion = motion_between(before, after, camera)
+    if motion is None:
+        return before.stamp_ns, after.stamp_ns, None
+    axes, place = body_from_cam[:3, :3], body_from_cam[:3, 3]
+    turn = axes @ motion[:3, :3] @ axes.T  # known, where the way may not be
+    return before.stamp_ns, after.stamp_ns, se3(turn, axes @ motion[:3, 3] + place - turn @ place)
 
 
 def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> Array | None:

@@ -1,35 +1,24 @@
 """The gyro against the images: time offset, scale and axes of their rotation rates."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_between_vectors
 from fleetmap.sensors.axes import SIGNED_AXES, axes_in_words, in_axes
-from fleetmap.sensors.samples import ImuSamples, Stamps
+from fleetmap.sensors.samples import ImuSamples
+from mapserver.doctor.camera_motion import CameraTurns
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
-from mapserver.doctor.timing import RECORD_IMU
+from mapserver.doctor.sensors import NO_IMU
 
+OFFSET, SCALE, AXES = "camera-imu time offset", "gyro scale", "gyro axes"
 _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
 _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
-AXES = "gyro axes"
-_NAMES = ("camera-imu time offset", "gyro scale", AXES)
-
-
-@dataclass(frozen=True, slots=True)
-class CameraTurns:
-    """Motion seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
-
-    ways_m (K, 3): where the body was at the end, in its axes at the start and the calibration's metres; NaN with one camera, or empty.
-    """
-
-    starts_ns: Stamps
-    ends_ns: Stamps
-    rates_body_radps: Array
-    ways_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+_REACH, _NOISE_RADPS = 4.0, 0.01  # intervals further off than so many typical ones: someone stood in the picture
+_PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not move by half a frame within seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +26,7 @@ class GyroFit:
     """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images.
 
     signed: the order and signs of the axes (3, 3) that explain them about as well and change least, None where none does.
+    offsets_s: of stretches of the run that show it each for itself, empty where fewer than two do.
     """
 
     offset_s: float
@@ -45,26 +35,37 @@ class GyroFit:
     correlation: float
     axes_seen: int
     signed: Array | None
+    offsets_s: Array
+
+    @property
+    def is_unsteady(self) -> bool:
+        """True for stamps that move against each other within the run."""
+        return len(self.offsets_s) > 1 and float(np.ptp(self.offsets_s)) > _UNSTEADY_S
 
 
-def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None]:
+def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None, bool]:
     """Time offset (beyond the calibrated one), scale and axes of the gyro; not judged without turns to judge by.
 
-    With them the offset in seconds, where images and gyro agree well enough to correct the calibration by it.
+    With them the offset in seconds, where images and gyro agree well enough to correct the calibration by it, and whether it changes.
     """
     unknown = _why_not(turns, imu, imu_minus_cam_s)
     if unknown:
-        return [not_judged(name, *unknown) for name in _NAMES], None
+        return [not_judged(name, *unknown) for name in (OFFSET, SCALE, AXES)], None, False
     fit = fit_gyro(turns, imu, imu_minus_cam_s)
     if fit.correlation < 0.6:
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
         advice = "check that the IMU belongs to this camera and that both are stamped by one clock"
-        return [
-            Finding(AXES, Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
-            *(not_judged(name, words, "check the gyro's axes first") for name in _NAMES[:2]),
-        ], None
+        return (
+            [
+                Finding(AXES, Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
+                *(not_judged(name, words, "check the gyro's axes first") for name in (OFFSET, SCALE)),
+            ],
+            None,
+            False,
+        )
     findings = [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
-    return findings, fit.offset_s if fit.correlation > _SURE_CORRELATION else None
+    is_sure = fit.correlation > _SURE_CORRELATION and not fit.is_unsteady
+    return findings, fit.offset_s if is_sure else None, fit.is_unsteady
 
 
 def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float, body_from_cam: Array) -> bool | None:
@@ -80,23 +81,53 @@ def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float
 def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> GyroFit:
     """The offset (beyond imu_minus_cam_s), rotation or mirror, and scale that make the gyro fit the images' rates best.
 
-    First the offset by the magnitudes, which know no axes, then the axes by orthogonal Procrustes, then the offset by the vectors.
+    First the offset by the magnitudes, which know no axes, then the axes by orthogonal Procrustes, then the offset by the vectors; then
+    all of it again without the minority of intervals in which the images turn otherwise.
     """
     offsets_s = np.arange(-_SEARCH_S, _SEARCH_S + _STEP_S / 2, _STEP_S)
-    seen = turns.rates_body_radps - turns.rates_body_radps.mean(axis=0)
-    gyro = np.stack([_gyro_rates(turns, imu, imu_minus_cam_s + d) for d in offsets_s])
-    speeds = np.linalg.norm(turns.rates_body_radps, axis=1)
-    offset = int(np.argmax([_correlation(np.linalg.norm(rates, axis=1), speeds) for rates in gyro]))
-    body_from_gyro = np.eye(3)
-    for _ in range(3):
-        body_from_gyro, _ = _axes(seen, gyro[offset])
-        scores = np.array([_correlation((rates - rates.mean(0)) @ body_from_gyro.T, seen) for rates in gyro])
-        offset = int(np.argmax(scores))
-    body_from_gyro, axes_seen = _axes(seen, gyro[offset])
-    turned = (gyro[offset] - gyro[offset].mean(axis=0)) @ body_from_gyro.T
+    all_seen = turns.rates_body_radps
+    all_gyro = np.stack([_gyro_rates(turns, imu, imu_minus_cam_s + d) for d in offsets_s])
+    kept = np.ones(len(all_seen), bool)
+    for _ in range(2):
+        seen, gyro = all_seen[kept] - all_seen[kept].mean(axis=0), all_gyro[:, kept]
+        speeds = np.linalg.norm(all_seen[kept], axis=1)
+        offset = int(np.argmax([_correlation(np.linalg.norm(rates, axis=1), speeds) for rates in gyro]))
+        for _ in range(3):
+            body_from_gyro, _ = _axes(seen, gyro[offset])
+            scores = _scores(gyro, seen, body_from_gyro)
+            offset = int(np.argmax(scores))
+        body_from_gyro, axes_seen = _axes(seen, gyro[offset])
+        inliers = _inliers(all_seen, all_gyro[offset] @ body_from_gyro.T)
+        if inliers.all():
+            break
+        kept = inliers
+    centred = gyro[offset] - gyro[offset].mean(axis=0)
+    turned = centred @ body_from_gyro.T
     scale = float((turned * turned).sum() / max((turned * seen).sum(), 1e-12))
-    signed = _signed_axes(seen, (gyro[offset] - gyro[offset].mean(axis=0)) / scale, turned / scale)
-    return GyroFit(_peak(offsets_s, scores, offset), body_from_gyro, scale, float(scores[offset]), axes_seen, signed)
+    signed = _signed_axes(seen, centred / scale, turned / scale)
+    parts = []
+    for part in np.array_split(np.arange(len(all_seen)), _PARTS):
+        shown = _scores(all_gyro[:, part], all_seen[part], body_from_gyro)
+        spread = float(np.sqrt(all_seen[part].var(axis=0).sum()))
+        if len(part) >= _MIN_PAIRS and spread > _LEAST_RATE_RADPS and shown.max() > _SURE_CORRELATION:
+            parts.append(_peak(offsets_s, shown, int(np.argmax(shown))))
+    best_s = _peak(offsets_s, scores, offset)
+    return GyroFit(best_s, body_from_gyro, scale, float(scores[offset]), axes_seen, signed, np.array(parts))
+
+
+def _scores(gyro: Array, seen: Array, body_from_gyro: Array) -> Array:
+    """Correlation with the images' rates (K, 3) of the gyro's at every offset (D, K, 3)."""
+    return np.array([_correlation(rates @ body_from_gyro.T, seen) for rates in gyro])
+
+
+def _inliers(seen: Array, turned: Array) -> Array:
+    """(K,) mask of the intervals in which the gyro turns as the images, by a scale and a bias that the median shows."""
+    squares = (turned * turned).sum(axis=1)
+    moving = squares > _LEAST_RATE_RADPS**2
+    share = float(np.median((turned * seen).sum(axis=1)[moving] / squares[moving])) if moving.any() else 1.0
+    apart = seen - share * turned
+    off = np.linalg.norm(apart - np.median(apart, axis=0), axis=1)
+    return np.asarray(off <= _REACH * max(float(np.median(off)), _NOISE_RADPS))
 
 
 def _signed_axes(seen: Array, gyro: Array, best: Array) -> Array | None:
@@ -108,19 +139,15 @@ def _signed_axes(seen: Array, gyro: Array, best: Array) -> Array | None:
 def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[str, str] | None:
     """Why the gyro cannot be judged and what recording could; None where it can."""
     if len(imu) < 10:
-        return "there is no IMU", RECORD_IMU
-    if len(turns.starts_ns) < _MIN_PAIRS:
-        return (
-            f"{len(turns.starts_ns)} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed",
-            "record every frame",
-        )
+        return NO_IMU
+    pairs = len(turns.starts_ns)
+    if pairs < _MIN_PAIRS:
+        return f"{pairs} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed", "record every frame"
     rates = turns.rates_body_radps, _gyro_rates(turns, imu, imu_minus_cam_s)
     spreads = [float(np.sqrt(seen.var(axis=0).sum())) for seen in rates]  # an IMU that turns alone is another robot's
     if max(spreads) < _LEAST_RATE_RADPS:
-        return (
-            f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)",
-            "drive curves, to the left and to the right",
-        )
+        hardly = f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)"
+        return hardly, "drive curves, to the left and to the right"
     return None
 
 
@@ -145,12 +172,10 @@ def _axes(seen: Array, gyro: Array) -> tuple[Array, int]:
     """Orthogonal body_from_gyro (3, 3) and about how many axes both turn. Where one axis is not seen it completes a rotation."""
     u, singular, vt = np.linalg.svd(seen.T @ (gyro - gyro.mean(axis=0)))
     axes_seen = int((singular > 0.03 * singular[0]).sum())
+    if axes_seen < 2:  # the smallest rotation that brings the two axes together, or its reverse
+        return rotation_between_vectors(vt[0], u[:, 0]), axes_seen
     sign = 1.0 if axes_seen == 3 else float(np.sign(np.linalg.det(u @ vt)))
-    full = u @ np.diag([1.0, 1.0, sign]) @ vt
-    if axes_seen > 1:
-        return full, axes_seen
-    # About one axis only: the smallest rotation that brings the axes together, or its reverse
-    return rotation_between_vectors(vt[0], u[:, 0]), axes_seen
+    return u @ np.diag([1.0, 1.0, sign]) @ vt, axes_seen
 
 
 def _peak(offsets_s: Array, scores: Array, index: int) -> float:
@@ -162,9 +187,17 @@ def _peak(offsets_s: Array, scores: Array, index: int) -> float:
 
 
 def _offset_finding(fit: GyroFit, imu_minus_cam_s: float) -> Finding:
+    if fit.is_unsteady:
+        low_ms, high_ms = 1e3 * fit.offsets_s.min(), 1e3 * fit.offsets_s.max()
+        words = (
+            f"the IMU's stamps move against those of the images, from {low_ms:+.0f} to {high_ms:+.0f} ms beyond the calibration: no "
+            "timeshift mends that; stamp both by one clock, each image at its exposure"
+        )
+        limit = f"fail where it changes by more than {1e3 * _UNSTEADY_S:g} ms"
+        return Finding(OFFSET, Verdict.FAIL, float(high_ms - low_ms), limit, words)
     words = f"the IMU's stamps are {fit.offset_s * 1e3:+.1f} ms from what the calibration says"
     advice = f"set timeshift_cam_imu to {imu_minus_cam_s + fit.offset_s:+.4f} s, or stamp both by one clock"
-    return judge(_NAMES[0], abs(fit.offset_s) * 1e3, Limits(6.0, 25.0, "ms"), words, f"{words}; {advice}")
+    return judge(OFFSET, abs(fit.offset_s) * 1e3, Limits(6.0, 25.0, "ms"), words, f"{words}; {advice}")
 
 
 def _scale_finding(fit: GyroFit) -> Finding:
@@ -175,7 +208,7 @@ def _scale_finding(fit: GyroFit) -> Finding:
         words += "; it is in degrees per second, multiply it by pi/180"
     elif verdict is not Verdict.OK:
         words += "; check its unit, and the focal length in the calibration"
-    return Finding(_NAMES[1], verdict, fit.scale, "warn 0.1, fail 0.3 from 1", words)
+    return Finding(SCALE, verdict, fit.scale, "warn 0.1, fail 0.3 from 1", words)
 
 
 def _axes_finding(fit: GyroFit) -> Finding:
@@ -184,14 +217,12 @@ def _axes_finding(fit: GyroFit) -> Finding:
     if fit.signed is not None and np.trace(fit.signed) < 3.0:
         words = f"the gyro {axes_in_words(fit.signed)}: so the images turn, {about}"
         advice = "mend its driver's signs, or how the calibration mounts it (T_cam_imu)"
-        return Finding(_NAMES[2], Verdict.FAIL, None, limit, f"{words}; {advice}")
+        return Finding(AXES, Verdict.FAIL, None, limit, f"{words}; {advice}")
     if np.linalg.det(fit.body_from_gyro) < 0:
-        words = (
-            f"the gyro's axes are mirrored ({in_axes(fit.body_from_gyro)}); one has the wrong sign or two are exchanged"
-        )
-        return Finding(_NAMES[2], Verdict.FAIL, None, limit, words)
+        axes = in_axes(fit.body_from_gyro)
+        words = f"the gyro's axes are mirrored ({axes}); one has the wrong sign or two are exchanged"
+        return Finding(AXES, Verdict.FAIL, None, limit, words)
     angle_deg = float(np.degrees(rotation_angle_rad(fit.body_from_gyro)))
     words = f"the gyro's axes are {angle_deg:.1f} degrees from the calibration, {about}"
-    advice = "check body_from_cam (T_cam_imu) and how the IMU is mounted"
-    bad = f"{words} ({in_axes(fit.body_from_gyro)}); {advice}"
-    return judge(_NAMES[2], angle_deg, Limits(4.0, 15.0, "degrees"), words, bad)
+    bad = f"{words} ({in_axes(fit.body_from_gyro)}); check body_from_cam (T_cam_imu) and how the IMU is mounted"
+    return judge(AXES, angle_deg, Limits(4.0, 15.0, "degrees"), words, bad)

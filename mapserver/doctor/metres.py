@@ -3,13 +3,16 @@
 Two that agree contradict the third. Wheels also have a direction and a yaw rate, which no baseline explains.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.sensors.samples import WheelSample
 from mapserver.doctor.accelerometer_images import AxesFit
+from mapserver.doctor.camera_motion import CameraTurns
 from mapserver.doctor.findings import Finding, Verdict, not_judged
-from mapserver.doctor.wheel_images import WheelFit
 
 WHEELS, METRES = "wheels", "metric scale"
 _RESTS_MPS = 0.05  # images of a camera at rest show less, by their noise
@@ -19,170 +22,223 @@ _KNOWN_SHARE = 0.2  # a ratio that is not known to a fifth decides nothing
 _UNITS = {1000.0: "mm/s", 100.0: "cm/s", 3.6: "km/h", 2.237: "miles per hour"}
 # What no robot has: cameras that far apart (m), a median depth (m), a speed of cameras and of wheels (m/s)
 _BASELINES_M, _DEPTHS_M, _FASTEST_MPS, _FASTEST_WHEELS_MPS = (0.005, 3.0), (0.05, 500.0), 70.0, 25.0
-_LEFT_OUT = "the wheels are left out"
 _LIMIT = f"fail where a ratio is beyond {_OFF:g} for sure, or its sign is wrong"
 
 
 @dataclass(frozen=True, slots=True)
+class WheelFit:
+    """Wheels over images: medians, which a minority of slips and of people in the pictures does not move.
+
+    speed: complex, forward and left: -1 for wheels that count backwards, 1j for a base that is turned by 90 degrees. yaw: of the rates.
+    Both 0 for wheels that rest while the images move, infinite for images that rest, None where too little moves. speed_sigma: of its size.
+    image_mps, wheel_mps: median speeds where one of them moves.
+    """
+
+    speed: complex | None
+    speed_sigma: float
+    yaw: float | None
+    image_mps: float
+    wheel_mps: float
+
+    @property
+    def size(self) -> float | None:
+        """Wheels over images where both drive in about one direction."""
+        speed = self.speed
+        if speed is None or not np.isfinite(speed) or speed.real <= abs(speed.imag) or abs(speed) < 1e-6:
+            return None
+        return abs(speed)
+
+    @property
+    def is_unsteady(self) -> bool:
+        """True for images that move by their own metres, but in no ratio to the wheels, as with depths ten times too small."""
+        return self.speed is not None and not np.isfinite(self.speed) and self.image_mps > _RESTS_MPS
+
+
+@dataclass(frozen=True, slots=True)
 class ImageMetres:
-    """What the images' metres rest on. baseline_m: of a pair, None for depth images; the median depth that is seen with it."""
+    """What the images' metres rest on. baseline_m: of a pair, None for depth images; the median depth and speed that are seen with it."""
 
     baseline_m: float | None
     depth_m: float
+    speed_mps: float
 
     @property
     def source(self) -> str:
         """In words."""
         return "the unit of the depth images" if self.baseline_m is None else f"the baseline of {self.baseline_m:.4g} m"
 
-    def implausible(self, speed_mps: float) -> str:
-        """Which of them, and of the speed that they show, no robot has; empty if all may be."""
+    @property
+    def implausible(self) -> str:
+        """Which of them no robot has; empty if all may be."""
         checks = [
             ("a baseline", self.baseline_m, _BASELINES_M, "m"),
             ("a median depth", self.depth_m, _DEPTHS_M, "m"),
-            ("a speed", speed_mps, (0.0, _FASTEST_MPS), "m/s"),
+            ("a speed", self.speed_mps, (0.0, _FASTEST_MPS), "m/s"),
         ]
-        odd = [
-            f"{what} of {v:.4g} {unit}"
-            for what, v, (low, high), unit in checks
-            if v is not None and (v < low or v > high)
-        ]
-        return " and ".join(odd)
-
-
-@dataclass(frozen=True, slots=True)
-class Metres:
-    """What is known: the wheels, None without any; true metres in one of the images by gravity, with sigma, None if unknown; the images."""
-
-    wheels: WheelFit | None
-    by_gravity: tuple[float, float] | None
-    images: ImageMetres | None
-    image_mps: float
-
-    @classmethod
-    def of(
-        cls, wheels: WheelFit | None, given: AxesFit | None, images: ImageMetres | None, image_mps: float
-    ) -> "Metres":
-        """given: the accelerometer's axes as given, None where those may be wrong. image_mps: a typical speed by the images."""
-        is_known = given is not None and given.sigma < _KNOWN_SHARE * abs(given.metres)
-        return cls(wheels, (given.metres, given.sigma) if given is not None and is_known else None, images, image_mps)
-
-    def wheels_finding(self) -> Finding:
-        """Whether the wheels drive as the images move; a failure says that they are left out."""
-        fit = self.wheels
-        if fit is None:
-            return not_judged(WHEELS, "nothing to compare", "there is no wheel odometry")
-        fault = self._wheel_fault(fit)
-        if fault:
-            value = None if fit.speed is None else float(np.copysign(abs(fit.speed), fit.speed.real))
-            return Finding(WHEELS, Verdict.FAIL, value, _LIMIT, f"{fault}; {_LEFT_OUT}")
-        if fit.speed is None and fit.yaw is None:
-            return not_judged(WHEELS, "nothing moves, or one camera shows no metres", "drive, and record a pair")
-        return Finding(
-            WHEELS,
-            Verdict.OK,
-            None if fit.speed is None else abs(fit.speed),
-            _LIMIT,
-            "the wheels drive as the images move",
+        return " and ".join(
+            f"{what} of {value:.4g} {unit}"
+            for what, value, (low, high), unit in checks
+            if value is not None and not low <= value <= high
         )
 
-    def metres_finding(self) -> Finding:
-        """Whether a metre of the images may be one."""
-        images, fit = self.images, self.wheels
-        if images is None:
-            return not_judged(METRES, "one camera shows no metres", "record a pair or depth")
-        odd = images.implausible(self.image_mps)
-        ratio = None if fit is None else _size(fit)
-        by_wheels = "" if ratio is None else f"{ratio:.3g} m by the wheels"
-        by_gravity = "" if self.by_gravity is None else f"{self.by_gravity[0]:.3g} m by the accelerometer"
-        measured = f"a metre of the images is {' and '.join(each for each in (by_wheels, by_gravity) if each)}"
-        advice = f"check {images.source}"
-        is_off = (
-            self.by_gravity is not None
-            and _is_off(*self.by_gravity)
-            and (ratio is None or fit is None or _is_off(ratio, fit.speed_sigma))
-        )
-        if self._disagree and fit is not None:
-            measured = f"the wheels drive at {fit.wheel_mps:.2g} m/s where the images move at {fit.image_mps:.2g} m/s, in no steady ratio"
-        if self._blamed() in ("images", "either") or (is_off and self._blamed() != WHEELS):
-            if self._blamed() == "either":
-                advice += " and the wheels' unit and radius: nothing tells which of them is wrong"
-            return Finding(
-                METRES, Verdict.FAIL, ratio or (self.by_gravity or (None,))[0], _LIMIT, f"{measured}; {advice}"
-            )
-        if odd:
-            return Finding(
-                METRES, Verdict.FAIL, None, "fail for what no robot has", f"by {images.source} there is {odd}; {advice}"
-            )
-        if by_wheels or by_gravity:
-            return Finding(METRES, Verdict.OK, ratio or (self.by_gravity or (None,))[0], _LIMIT, measured)
-        shown = f"nothing but {images.source} tells metres: by it things are {images.depth_m:.2g} m away in the median"
-        shown += f" and the cameras move at {self.image_mps:.2g} m/s" if self.image_mps else ""
-        return not_judged(METRES, shown, "record an IMU, with starts, stops and turns, or wheel odometry")
 
-    @property
-    def _disagree(self) -> bool:
-        """True for images that move by their own metres, but in no ratio to the wheels, as with depths ten times too small."""
-        fit = self.wheels
-        is_unknown = fit is not None and fit.speed is not None and not np.isfinite(fit.speed)
-        return fit is not None and is_unknown and fit.image_mps > _RESTS_MPS
+def judge_metres(
+    wheels: WheelFit | None, given: AxesFit | None, images: ImageMetres | None, *, has_imu: bool
+) -> tuple[Finding, Finding]:
+    """Whether the wheels drive as the images move (a failure says that they are left out), and whether a metre of the images may be one.
 
-    def _wheel_fault(self, fit: WheelFit) -> str:
-        speed = fit.speed
-        if speed is not None:
-            if not np.isfinite(speed) and not self._disagree:
-                return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: see whether the pictures change"
-            if self._disagree:
-                return ""
-            if abs(speed) < 0.01 and fit.wheel_mps < 0.01 * fit.image_mps:
-                return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: see whether odometry is published"
-            angle_deg = float(np.degrees(np.angle(speed)))
-            if abs(angle_deg) > 135.0:
-                return "the wheels drive backwards while the images move forwards: negate their speed, or mend base_from_body"
-            if abs(angle_deg) > 45.0:
-                return f"the wheels drive {angle_deg:+.0f} degrees away from where the images move: mend base_from_body"
-            if self._blamed() == WHEELS:
-                unit = next(
-                    (
-                        f": they are in {unit}"
-                        for factor, unit in _UNITS.items()
-                        if abs(abs(speed) / factor - 1.0) < 0.1
-                    ),
-                    "",
-                )
-                return f"the wheels drive {abs(speed):.3g} times as fast as the images move{unit}; check their unit and radius"
-        if fit.yaw is not None:
-            if not np.isfinite(fit.yaw):
-                return "the wheels turn while the images do not"
-            if abs(np.degrees(1.0) / fit.yaw - 1.0) < 0.2:
-                return "the wheels' yaw rate is in degrees per second: multiply it by pi/180"
-            if not 1.0 / (2.0 * _OFF) < fit.yaw < 2.0 * _OFF:
-                return f"the wheels' yaw rate is {fit.yaw:.2g} times that of the images: check its sign and unit"
+    given: the accelerometer's axes as given, None where those may be wrong; images: None for one camera.
+    """
+    by_gravity = given if given is not None and given.sigma < _KNOWN_SHARE * abs(given.metres) else None
+    blamed = _blamed(wheels, by_gravity, images)
+    return _wheels_finding(wheels, blamed), _metres_finding(wheels, by_gravity, images, blamed, has_imu=has_imu)
+
+
+def _blamed(fit: WheelFit | None, by_gravity: AxesFit | None, images: ImageMetres | None) -> str:
+    """Which of wheels and images is wrong about metres: `either` where nothing tells, empty where they agree or one is not known."""
+    if fit is None:
         return ""
-
-    def _blamed(self) -> str:
-        """Which of wheels and images is wrong about metres: `either` where nothing tells, empty where they agree or one is not known."""
-        fit = self.wheels
-        if self._disagree:
-            return "either"
-        ratio = None if fit is None else _size(fit)
-        if fit is None or ratio is None or not _is_off(ratio, fit.speed_sigma):
-            return ""
-        if self.by_gravity is not None and self.by_gravity[0] > 0:
-            gravity = np.log(self.by_gravity[0])
-            return WHEELS if abs(gravity) < abs(gravity - np.log(ratio)) else "images"
-        if self.images is not None and self.images.implausible(self.image_mps):
-            return "images"
-        return WHEELS if fit.wheel_mps > _FASTEST_WHEELS_MPS else "either"
-
-
-def _size(fit: WheelFit) -> float | None:
-    """Wheels over images where both drive in about one direction."""
-    speed = fit.speed
-    if speed is None or not np.isfinite(speed) or speed.real <= abs(speed.imag) or abs(speed) < 1e-6:
-        return None
-    return abs(speed)
+    if fit.is_unsteady:
+        return "either"
+    if fit.size is None or not _is_off(fit.size, fit.speed_sigma):
+        return ""
+    if by_gravity is not None and by_gravity.metres > 0:
+        gravity = np.log(by_gravity.metres)
+        return WHEELS if abs(gravity) < abs(gravity - np.log(fit.size)) else "images"
+    if images is not None and images.implausible:
+        return "images"
+    return WHEELS if fit.wheel_mps > _FASTEST_WHEELS_MPS else "either"
 
 
 def _is_off(ratio: float, sigma: float) -> bool:
     return ratio <= 0 or abs(np.log(ratio)) - _SURE_SIGMAS * sigma / ratio > np.log(_OFF)
+
+
+def _wheels_finding(fit: WheelFit | None, blamed: str) -> Finding:
+    if fit is None:
+        return not_judged(WHEELS, "nothing to compare", "there is no wheel odometry")
+    fault = _speed_fault(fit, blamed) or ("" if fit.is_unsteady else _yaw_fault(fit))
+    if fault:
+        value = None if fit.speed is None else float(np.copysign(abs(fit.speed), fit.speed.real))
+        return Finding(WHEELS, Verdict.FAIL, value, _LIMIT, f"{fault}; the wheels are left out")
+    if fit.speed is None and fit.yaw is None:
+        return not_judged(WHEELS, "nothing moves, or one camera shows no metres", "drive, and record a pair")
+    value = None if fit.speed is None else abs(fit.speed)
+    return Finding(WHEELS, Verdict.OK, value, _LIMIT, "the wheels drive as the images move")
+
+
+def _speed_fault(fit: WheelFit, blamed: str) -> str:
+    speed = fit.speed
+    if speed is None or fit.is_unsteady:
+        return ""
+    if not np.isfinite(speed):
+        return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: see whether the pictures change"
+    if abs(speed) < 0.01 and fit.wheel_mps < 0.01 * fit.image_mps:
+        return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: see whether odometry is published"
+    angle_deg = float(np.degrees(np.angle(speed)))
+    if abs(angle_deg) > 135.0:
+        return "the wheels drive backwards while the images move forwards: negate their speed, or mend base_from_body"
+    if abs(angle_deg) > 45.0:
+        return f"the wheels drive {angle_deg:+.0f} degrees away from where the images move: mend base_from_body"
+    if blamed != WHEELS:
+        return ""
+    units = (f": they are in {unit}" for factor, unit in _UNITS.items() if abs(abs(speed) / factor - 1.0) < 0.1)
+    return f"the wheels drive {abs(speed):.3g} times as fast as the images move{next(units, '')}; check their unit and radius"
+
+
+def _yaw_fault(fit: WheelFit) -> str:
+    if fit.yaw is None:
+        return ""
+    if not np.isfinite(fit.yaw):
+        return "the wheels turn while the images do not"
+    if abs(np.degrees(1.0) / fit.yaw - 1.0) < 0.2:
+        return "the wheels' yaw rate is in degrees per second: multiply it by pi/180"
+    if not 1.0 / (2.0 * _OFF) < fit.yaw < 2.0 * _OFF:
+        return f"the wheels' yaw rate is {fit.yaw:.2g} times that of the images: check its sign and unit"
+    return ""
+
+
+def _metres_finding(
+    fit: WheelFit | None, by_gravity: AxesFit | None, images: ImageMetres | None, blamed: str, *, has_imu: bool
+) -> Finding:
+    if images is None:
+        return not_judged(METRES, "one camera shows no metres", "record a pair or depth")
+    ratio = None if fit is None else fit.size
+    value = ratio or (None if by_gravity is None else by_gravity.metres)
+    said = [] if ratio is None else [f"{ratio:.3g} m by the wheels"]
+    said += [] if by_gravity is None else [f"{by_gravity.metres:.3g} m by the accelerometer"]
+    measured = f"a metre of the images is {' and '.join(said)}"
+    advice = f"check {images.source}"
+    if fit is not None and fit.is_unsteady:
+        measured = f"the wheels drive at {fit.wheel_mps:.2g} m/s where the images move at {fit.image_mps:.2g} m/s, in no steady ratio"
+    is_off = by_gravity is not None and _is_off(by_gravity.metres, by_gravity.sigma)
+    if fit is not None and ratio is not None:
+        is_off = is_off and _is_off(ratio, fit.speed_sigma)
+    if blamed in ("images", "either") or (is_off and blamed != WHEELS):
+        if blamed == "either":
+            advice += " and the wheels' unit and radius: nothing tells which of them is wrong"
+        return Finding(METRES, Verdict.FAIL, value, _LIMIT, f"{measured}; {advice}")
+    if odd := images.implausible:
+        words = f"by {images.source} there is {odd}; {advice}"
+        return Finding(METRES, Verdict.FAIL, None, "fail for what no robot has", words)
+    if said:
+        return Finding(METRES, Verdict.OK, value, _LIMIT, measured)
+    shown = f"nothing but {images.source} tells metres: by it things are {images.depth_m:.2g} m away in the median"
+    shown += f" and the cameras move at {images.speed_mps:.2g} m/s" if images.speed_mps else ""
+    if has_imu:
+        return not_judged(
+            METRES, shown, "start, stop and turn more often, so that the IMU tells them, or record wheel odometry"
+        )
+    return not_judged(METRES, shown, "record an IMU, with starts, stops and turns, or wheel odometry")
+
+
+_LEAST_MPS, _LEAST_RADPS = 0.1, 0.1  # below, a robot may as well rest
+_MIN_MOVING = 5
+_SAMPLES = 5  # of an interval
+_STEADY_SIGMAS = 5.0
+
+
+def fit_wheels(
+    turns: CameraTurns, wheel: Sequence[WheelSample], base_from_body: Array, imu_minus_cam_s: float
+) -> WheelFit:
+    """The wheels over what the images say of the same intervals; wheels are on the IMU's clock."""
+    seen: list[Array] = []
+    rolled: list[Array] = []
+    stamps_s = (np.array([sample.stamp_ns for sample in wheel], np.int64) - wheel[0].stamp_ns) * 1e-9
+    columns = np.array([[*sample.velocity_base_mps[:2], sample.yaw_rate_radps] for sample in wheel]).T
+    spans_s = (np.stack([turns.starts_ns, turns.ends_ns], axis=1) - wheel[0].stamp_ns) * 1e-9 + imu_minus_cam_s
+    for (start_s, end_s), rate, way_m in zip(spans_s, turns.rates_body_radps, turns.ways_m, strict=True):
+        if start_s < stamps_s[0] or end_s > stamps_s[-1]:
+            continue
+        turn = rate * (end_s - start_s)
+        base = base_from_body @ se3(so3_exp(turn), way_m) @ se3_inverse(base_from_body)
+        turn_base = base_from_body[:3, :3] @ turn
+        way_base = so3_exp(-0.5 * turn_base) @ base[:3, 3]
+        seen.append(np.array([way_base[0], way_base[1], turn_base[2]]) / (end_s - start_s))
+        times = np.linspace(start_s, end_s, _SAMPLES)
+        rolled.append(np.array([np.interp(times, stamps_s, column).mean() for column in columns]))
+    by_images, by_wheels = (np.array(each).reshape(-1, 3) for each in (seen, rolled))
+    image_speeds, wheel_speeds = (each[:, 0] + 1j * each[:, 1] for each in (by_images, by_wheels))
+    moving = np.fmax(np.abs(image_speeds), np.abs(wheel_speeds)) > _LEAST_MPS
+    image_mps, wheel_mps = (
+        float(np.median(np.abs(each[moving]))) if moving.any() else 0.0 for each in (image_speeds, wheel_speeds)
+    )
+    speed, sigma = _ratio(image_speeds, wheel_speeds, _LEAST_MPS)
+    yaw, _ = _ratio(by_images[:, 2], by_wheels[:, 2], _LEAST_RADPS)
+    return WheelFit(speed, sigma, None if yaw is None else yaw.real, image_mps, wheel_mps)
+
+
+def _ratio(seen: Array, rolled: Array, least: float) -> tuple[complex | None, float]:
+    """Wheels over images, and the sigma of its size: where the wheels move, or else where the images do."""
+    known = np.isfinite(seen)
+    drives, moves = known & (np.abs(rolled) > least), known & (np.abs(seen) > least)
+    if drives.sum() >= _MIN_MOVING:
+        shares = seen[drives] / rolled[drives]
+        median = complex(np.median(shares.real), np.median(shares.imag))
+        sigma = 1.25 * 1.4826 * float(np.median(np.abs(shares - median))) / float(np.sqrt(len(shares)))
+        if abs(median) <= _STEADY_SIGMAS * sigma:
+            return complex(np.inf), np.inf
+        return 1.0 / median, sigma / abs(median) ** 2
+    if moves.sum() >= _MIN_MOVING:
+        return complex(np.median((rolled[moves] / seen[moves]).real)), 0.0
+    return None, np.inf

@@ -1,27 +1,22 @@
 """Reads the frames that the checks need and runs all of them."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, se3, so3_log
+from fleetmap.geometry import Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from mapserver.doctor import accelerometer_images, inertial, timing
+from mapserver.doctor import accelerometer_images, images, sensors
 from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accelerometer
-from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration
-from mapserver.doctor.camera_motion import motion_between
-from mapserver.doctor.depth import depth_share, measured_depth
+from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
+from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
-from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
-from mapserver.doctor.flicker import flicker_check
-from mapserver.doctor.gyro_images import AXES, CameraTurns, gyro_check, turn_upside_down
-from mapserver.doctor.lens import lens_check
-from mapserver.doctor.metres import ImageMetres, Metres
-from mapserver.doctor.sharpness import laplacian_variance, sharpness
+from mapserver.doctor.gyro_images import AXES, gyro_check, turn_upside_down
+from mapserver.doctor.metres import ImageMetres, WheelFit, fit_wheels, judge_metres
 from mapserver.doctor.stereo import (
     ROTATE_BACK,
     SWAPPED,
@@ -30,7 +25,6 @@ from mapserver.doctor.stereo import (
     match_stereo,
     swapped_cameras,
 )
-from mapserver.doctor.wheel_images import WheelFit, fit_wheels
 from mapserver.survey.executor import SERIAL, Executor
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
@@ -88,72 +82,62 @@ def run_checks(
     Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair the busiest 30 s; `on_frame` is
     called after each.
     """
-    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
-    frames = _Frames(recording, on_frame)
+    imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
-    findings = [
-        timing.camera_rate(stamps_ns),
-        timing.camera_gaps(stamps_ns),
-        timing.imu_rate(imu.stamps_ns),
-        timing.imu_gaps(imu.stamps_ns),
-        timing.stamp_order(recording.issues),
-        *timing.imu_noise(recording.calibration),
-    ]
-    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    calibration = MeasuredCalibration([], None)
+    frames = _Frames(recording, on_frame)
+    rectifier = _rectifier(recording)
     seen = _sampled(recording, frames, rectifier, sampled, executor)
-    findings += _soon_seen(recording, rectifier, seen, frames)
-    turns: CameraTurns | None = None
+    soon = _soon_seen(recording, rectifier, seen, frames)
 
-    def judged(turns: CameraTurns) -> tuple[Finding, Metres]:
-        """The accelerometer's axes, and who is right about metres."""
-        fits = fit_accelerometer(turns, imu, shift_s) if has_gravity else []
-        axes = not_judged(accelerometer_images.NAME, "there is no IMU", timing.RECORD_IMU)
-        if len(imu):
-            axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
-        given = next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
-        return axes, Metres.of(seen.wheels, given, seen.images, seen.image_mps)
-
-    has_gravity = not any(f.name == inertial.NAME and f.verdict is Verdict.FAIL for f in findings)
-    metres = Metres.of(seen.wheels, None, seen.images, seen.image_mps)
-    used = recording
-    if metres.wheels_finding().verdict is Verdict.FAIL or metres.metres_finding().verdict is Verdict.FAIL:
-        turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
-        if judged(turns)[1].wheels_finding().verdict is Verdict.FAIL:
-            used = replace(recording, wheel=())
-
-    if recording.sensor_set in _PAIRS:
-        calibration = measure_calibration(used, on_frame, executor)
-    if turns is None:
-        turns = _camera_turns(recording, frames, rectifier, turn_frames, executor)
-    checked, measured_offset_s = gyro_check(turns, imu, shift_s)
+    rig = rectifier.camera, rectifier.body_from_cam
+    turns = CameraTurns.of(executor.map(body_motion, rig, _consecutive(recording, frames, rectifier, turn_frames)))
+    gyro, measured_offset_s, is_unsteady = gyro_check(turns, imu, shift_s)
     upside_down = turn_upside_down(turns, imu, shift_s, rectifier.body_from_cam)
-    if recording.sensor_set in _PAIRS:
-        findings = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in findings]
+    if has_pair:
+        soon = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in soon]
     if upside_down:
         words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
-        checked = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in checked]
-    axes, metres = judged(turns)
-    findings += [*checked, axes, metres.wheels_finding(), metres.metres_finding()]
-    findings += [*calibration.findings, sharpness(seen.variances), flicker_check(recording, frames.read)]
-    findings += [_readable(frames)]
-    findings += [repeated_images(frames.repeats, min(turn_frames, len(recording)))] if len(imu) else []
-    return CheckResults(findings + timing.other_issues(recording.issues), measured_offset_s, calibration)
+        gyro = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in gyro]
+
+    axes, given = not_judged(accelerometer_images.NAME, *sensors.NO_IMU), None
+    if len(imu):
+        has_gravity = not any(f.name == sensors.GRAVITY and f.verdict is Verdict.FAIL for f in soon)
+        fits = fit_accelerometer(turns, imu, shift_s) if has_gravity else []
+        axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
+        if axes.verdict is Verdict.OK:
+            given = next((fit for fit in fits if fit.is_given), None)
+    wheels, metres = judge_metres(seen.wheels, given, seen.images, has_imu=len(imu) > 0)
+
+    calibration = MeasuredCalibration([], None)
+    if has_pair and is_unsteady:
+        reason = "the stamps of images and IMU move against each other"
+        calibration = unknown_calibration(reason, "stamp both by one clock, each image at its exposure")
+    elif has_pair:
+        used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
+        calibration = measure_calibration(used, on_frame, executor)
+
+    findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres, *calibration.findings]
+    findings += [images.sharpness(seen.variances), images.flicker_check(recording, frames.read), _readable(frames)]
+    if len(imu):
+        findings.append(_repeated_images(frames.repeats, min(turn_frames, len(recording))))
+    return CheckResults(findings + sensors.other_issues(recording.issues), measured_offset_s, calibration)
 
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
     """Those of `run_checks` for which the IMU and `sampled` frames will do: what can be said before a long drive begins."""
-    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    frames = _Frames(recording, lambda: None)
-    seen = _sampled(recording, frames, rectifier, sampled, SERIAL)
-    return _soon_seen(recording, rectifier, seen, frames)
+    rectifier, frames = _rectifier(recording), _Frames(recording, lambda: None)
+    return _soon_seen(recording, rectifier, _sampled(recording, frames, rectifier, sampled, SERIAL), frames)
+
+
+def _rectifier(recording: Recording) -> Rectifier:
+    return Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
 
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
     """What frames all over the recording show.
 
-    depth_shares: of pixels that have a depth. wheels: against the images, None without wheels. image_mps: median speed by the images.
+    depth_shares: of pixels that have a depth. wheels: against the images, None without wheels; images: None for one camera.
     """
 
     pairs: list[StereoMatches]
@@ -162,42 +146,42 @@ class _Seen:
     structures: list[tuple[Array, Array]]
     images: ImageMetres | None
     wheels: WheelFit | None
-    image_mps: float
 
 
 def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen, frames: _Frames) -> list[Finding]:
     imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
-    overlap = timing.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
-    shutter = inertial.rolling_shutter(recording.calibration.cameras[0], imu)
-    findings = [overlap, inertial.gravity_magnitude(imu), *shutter, fixed_pattern(seen.structures)]
+    overlap = sensors.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
+    shutter = sensors.rolling_shutter(recording.calibration.cameras[0], imu)
+    findings = [overlap, sensors.gravity_magnitude(imu), *shutter, images.fixed_pattern(seen.structures)]
     if recording.sensor_set in _PAIRS:
         findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
     if recording.sensor_set is SensorSet.RGBD:
-        findings.append(measured_depth(seen.depth_shares))
-    return [*findings, lens_check(recording, frames.read)]
+        findings.append(images.measured_depth(seen.depth_shares))
+    return [*findings, images.lens_check(recording, frames.read)]
 
 
 def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
-    looks = list(
-        executor.map(_look, (rectifier.camera, rectifier.body_from_cam), _moments(recording, frames, rectifier, count))
-    )
-    pairs = [look.pair for look in looks if look.pair is not None]
+    rig = rectifier.camera, rectifier.body_from_cam
+    looks = list(executor.map(_look, rig, _moments(recording, frames, rectifier, count)))
     depths = [look.depth_m for look in looks if np.isfinite(look.depth_m)]
-    turns = _turns(look.motion for look in looks if look.motion is not None)
-    speeds = np.linalg.norm(turns.ways_m, axis=1) / ((turns.ends_ns - turns.starts_ns) * 1e-9)
-    wheels, rig = None, recording.calibration
+    turns = CameraTurns.of(look.motion for look in looks if look.motion is not None)
+    wheels, calibration = None, recording.calibration
     if recording.wheel:
-        wheels = fit_wheels(turns, recording.wheel, rig.base_from_body, rig.cameras[0].imu_minus_cam_s)
-    baseline_m = rectifier.camera.baseline_m if recording.sensor_set in _PAIRS else None
-    shows_metres = recording.sensor_set in _PAIRS or recording.sensor_set is SensorSet.RGBD
+        shift_s = calibration.cameras[0].imu_minus_cam_s
+        wheels = fit_wheels(turns, recording.wheel, calibration.base_from_body, shift_s)
+    metres = None
+    if depths and (recording.sensor_set in _PAIRS or recording.sensor_set is SensorSet.RGBD):
+        speeds = np.linalg.norm(turns.ways_m, axis=1) / ((turns.ends_ns - turns.starts_ns) * 1e-9)
+        speed_mps = float(np.nanmedian(speeds)) if np.isfinite(speeds).any() else 0.0
+        baseline_m = rectifier.camera.baseline_m if recording.sensor_set in _PAIRS else None
+        metres = ImageMetres(baseline_m, float(np.median(depths)), speed_mps)
     return _Seen(
-        pairs,
-        [look.variance for look in looks],
-        [look.depth_share for look in looks if look.depth_share is not None],
-        [look.structure for look in looks],
-        ImageMetres(baseline_m, float(np.median(depths))) if shows_metres and depths else None,
-        wheels,
-        float(np.nanmedian(speeds)) if np.isfinite(speeds).any() else 0.0,
+        pairs=[look.pair for look in looks if look.pair is not None],
+        variances=[look.variance for look in looks],
+        depth_shares=[look.depth_share for look in looks if look.depth_share is not None],
+        structures=[look.structure for look in looks],
+        images=metres,
+        wheels=wheels,
     )
 
 
@@ -210,7 +194,9 @@ def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
         after = int(np.searchsorted(stamps_ns, stamps_ns[index] + int(_STEP_S * 1e9)))
-        is_near = needs_speed and after < len(recording) and stamps_ns[after] - stamps_ns[index] < timing.SPARSE_S * 1e9
+        is_near = (
+            needs_speed and after < len(recording) and stamps_ns[after] - stamps_ns[index] < sensors.SPARSE_S * 1e9
+        )
         other = frames.read(after) if is_near else None
         if frame is not None:
             yield frame, rectifier.rectify(frame), None if other is None else rectifier.rectify(other)
@@ -218,7 +204,7 @@ def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What one moment shows. depth_m: median, NaN if unknown."""
+    """What one moment shows. depth_m: median, NaN if unknown. motion: as `body_motion`, None where it was not looked for."""
 
     variance: float
     pair: StereoMatches | None
@@ -228,48 +214,20 @@ class _Look:
     motion: tuple[int, int, Array | None] | None
 
 
-def _look(shared: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
-    (camera, _), (frame, rectified, after) = shared, moment
+def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
+    (camera, _), (frame, rectified, after) = rig, moment
     pair = None if frame.right is None else match_stereo(rectified)
     share, depth_m = None, np.nan
     if frame.depth_m is not None:
-        share, known = depth_share(frame.depth_m), frame.depth_m[frame.depth_m > 0]
+        share, known = images.depth_share(frame.depth_m), frame.depth_m[frame.depth_m > 0]
         depth_m = float(np.median(known)) if len(known) else np.nan
     elif pair is not None and len(pair.disparities_px):
         depth_m = camera.focal_px * camera.baseline_m / max(float(np.median(pair.disparities_px)), 0.1)
-    motion = (
-        None if after is None or np.array_equal(rectified.left, after.left) else _motion(shared, (rectified, after))
-    )
-    return _Look(laplacian_variance(frame.left), pair, share, depth_m, fine_structure(frame.left), motion)
-
-
-def _camera_turns(
-    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor
-) -> CameraTurns:
-    pairs = _consecutive(recording, frames, rectifier, count)
-    return _turns(executor.map(_motion, (rectifier.camera, rectifier.body_from_cam), pairs))
-
-
-def _turns(motions: Iterable[tuple[int, int, Array | None]]) -> CameraTurns:
-    """Of what `_motion` found."""
-    found = [each for each in motions if each[2] is not None]
-    spans = np.array([[start_ns, end_ns] for start_ns, end_ns, _ in found], np.int64).reshape(-1, 2)
-    moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
-    rates = np.array([so3_log(motion[:3, :3]) for motion in moved]).reshape(-1, 3) / (np.diff(spans) * 1e-9)
-    return CameraTurns(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
-
-
-def _motion(
-    shared: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
-) -> tuple[int, int, Array | None]:
-    """Stamps of two frames and the body's motion (4, 4) between them, earlier_from_later."""
-    (camera, body_from_cam), (before, after) = shared, pair
-    motion = motion_between(before, after, camera)
-    if motion is None:
-        return before.stamp_ns, after.stamp_ns, None
-    axes, place = body_from_cam[:3, :3], body_from_cam[:3, 3]
-    turn = axes @ motion[:3, :3] @ axes.T  # known, where the way may not be
-    return before.stamp_ns, after.stamp_ns, se3(turn, axes @ motion[:3, 3] + place - turn @ place)
+    motion = None
+    if after is not None and not np.array_equal(rectified.left, after.left):
+        motion = body_motion(rig, (rectified, after))
+    variance, structure = images.laplacian_variance(frame.left), images.fine_structure(frame.left)
+    return _Look(variance, pair, share, depth_m, structure, motion)
 
 
 def _consecutive(
@@ -283,8 +241,8 @@ def _consecutive(
     previous: RectifiedFrame | None = None
     is_same = False
     for index in range(first, min(first + count, len(recording))):
-        is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < timing.SPARSE_S * 1e9
-        has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < timing.SPARSE_S * 1e9
+        is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < sensors.SPARSE_S * 1e9
+        has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < sensors.SPARSE_S * 1e9
         if not (is_close or has_next):
             continue
         frame = frames.read(index)
@@ -310,16 +268,11 @@ def _busiest_start(recording: Recording, count: int) -> int:
     return int(starts[np.argmax(total[b] - total[a])])
 
 
-def repeated_images(repeats: int, count: int) -> Finding:
+def _repeated_images(repeats: int, count: int) -> Finding:
     """How often among `count` frames an image is the one before, and the next one is another."""
     bad = f"an image is that of the frame before, {repeats} times in {count} frames; record each image once, with its own stamp"
-    return judge(
-        "repeated images",
-        repeats / count,
-        Limits(0.02, 0.1, "of the frames"),
-        "every frame has an image of its own",
-        bad,
-    )
+    limits, good = Limits(0.02, 0.1, "of the frames"), "every frame has an image of its own"
+    return judge("repeated images", repeats / count, limits, good, bad)
 
 
 def _readable(frames: _Frames) -> Finding:

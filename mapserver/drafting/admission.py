@@ -8,7 +8,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
-from mapserver.doctor import Finding, Verdict, accelerometer_images, fixed_pattern, lens, run_checks
+from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
 from mapserver.doctor.metres import METRES, WHEELS
@@ -24,8 +24,8 @@ DECISIVE |= {
     accelerometer_images.NAME,
     METRES,
     "repeated images",
-    fixed_pattern.NAME,
-    lens.NAME,
+    images.FIXED_PATTERN,
+    images.LENS,
     *(parameter.value for parameter in TOLERANCES),
 }
 # What nothing but the calibration tells a map, and the checks that judge it.

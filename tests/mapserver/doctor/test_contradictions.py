@@ -16,9 +16,9 @@ from fleetmap.geometry import Array
 from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
-from mapserver.doctor import Verdict
+from mapserver.doctor import Verdict, camera_motion
 from mapserver.doctor.calibration import MeasuredCalibration
-from mapserver.doctor.fixed_pattern import fine_structure, fixed_pattern
+from mapserver.doctor.images import fine_structure, fixed_pattern
 from mapserver.drafting.sensor_subset import reduced
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
@@ -39,8 +39,8 @@ def ride(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def _quick(monkeypatch: pytest.MonkeyPatch, seen: dict[object, object]) -> None:
     """Without the adjustment of the calibration, and with what was seen in the same images before."""
     monkeypatch.setattr(run_checks, "measure_calibration", lambda *_: MeasuredCalibration([], None))
-    for name in ("motion_between", "match_stereo"):
-        monkeypatch.setattr(run_checks, name, remembered(getattr(run_checks, name), seen))
+    for module, name in ((camera_motion, "motion_between"), (run_checks, "match_stereo")):
+        monkeypatch.setattr(module, name, remembered(getattr(module, name), seen))
 
 
 @pytest.fixture(scope="module")

@@ -18,15 +18,20 @@ from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorS
 from mapserver.calibration import CalibrationParameter
 from mapserver.commands.doctor import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import grouped, not_judged, summary
-from mapserver.doctor.flicker import flicker_check
-from mapserver.doctor.gyro_images import CameraTurns, fit_gyro, gyro_check
-from mapserver.doctor.inertial import gravity_magnitude, rolling_shutter
-from mapserver.doctor.run_checks import TURN_FRAMES, _camera_turns, _Frames
-from mapserver.doctor.sharpness import sharpness
-from mapserver.doctor.timing import camera_gaps, camera_imu_overlap, camera_rate, imu_gaps, imu_rate, stamp_order
+from mapserver.doctor.gyro_images import fit_gyro, gyro_check
+from mapserver.doctor.images import flicker_check, sharpness
+from mapserver.doctor.run_checks import TURN_FRAMES, _consecutive, _Frames
+from mapserver.doctor.sensors import (
+    camera_checks,
+    camera_imu_overlap,
+    gravity_magnitude,
+    imu_checks,
+    rolling_shutter,
+    stamp_order,
+)
 from mapserver.drafting.sensor_subset import reduced
-from mapserver.survey.executor import SERIAL
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -60,8 +65,9 @@ def found(recording: Recording) -> dict[str, Finding]:
 @pytest.fixture(scope="module")
 def turns(good: Recording) -> CameraTurns:
     """What the pictures of the good recording say about its turns."""
-    frames = _Frames(good, lambda: None)
-    return _camera_turns(good, frames, Rectifier(good.calibration), TURN_FRAMES, SERIAL)
+    rectifier = Rectifier(good.calibration)
+    pairs = _consecutive(good, _Frames(good, lambda: None), rectifier, TURN_FRAMES)
+    return CameraTurns.of(body_motion((rectifier.camera, rectifier.body_from_cam), pair) for pair in pairs)
 
 
 def gyro_found(turns: CameraTurns, imu: ImuSamples) -> dict[str, Finding]:
@@ -225,19 +231,33 @@ def stamps(step_s: float, count: int = 200) -> Stamps:
     return (np.arange(count) * step_s * 1e9).astype(np.int64)
 
 
-def test_timing() -> None:
-    assert camera_rate(stamps(0.05)).value == pytest.approx(20)
-    assert camera_rate(stamps(0.3)).verdict is Verdict.WARN
-    assert imu_rate(stamps(0.02)).verdict is Verdict.WARN
-    gap = np.delete(stamps(0.05), slice(50, 80))
-    assert camera_gaps(stamps(0.05)).verdict is Verdict.OK
-    assert camera_gaps(gap).verdict is Verdict.WARN
-    assert camera_gaps(gap).value == pytest.approx(31 * 0.05)
-    assert "2.5 s after the start" in camera_gaps(gap).sentence
-    assert imu_gaps(np.delete(stamps(0.005), slice(50, 100))).verdict is Verdict.FAIL
-    assert stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]).verdict is Verdict.FAIL
-    assert camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0).value == pytest.approx(0.9, abs=0.02)
-    assert camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0).verdict is Verdict.OK
+GAP = np.delete(stamps(0.05), slice(50, 80))
+HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
+
+
+@pytest.mark.parametrize(
+    ("finding", "verdict", "value", "says"),
+    [
+        (camera_checks(stamps(0.05))[0], Verdict.OK, 20.0, "20.0 Hz"),
+        (camera_checks(stamps(0.3))[0], Verdict.WARN, 3.33, "higher frame rate"),
+        (camera_checks(stamps(0.05))[1], Verdict.OK, 0.05, "longest step is 0.050 s"),
+        (camera_checks(GAP)[1], Verdict.WARN, 31 * 0.05, "2.5 s after the start; look at the recorder's disk"),
+        (camera_checks(HOURS)[1], Verdict.FAIL, 18000.05, "5.0 s after the start; the recorder was paused"),
+        (imu_checks(stamps(0.02))[0], Verdict.WARN, 50.0, "set the IMU to 200 Hz"),
+        (imu_checks(np.delete(stamps(0.005), slice(50, 100)))[1], Verdict.FAIL, 0.255, "the driver's queue"),
+        (
+            stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]),
+            Verdict.FAIL,
+            1.0,
+            "3 of 9; look for a clock",
+        ),
+        (camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0), Verdict.FAIL, 0.895, "of the frames have no IMU"),
+        (camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0), Verdict.OK, 0.0, "the IMU ran"),
+    ],
+)
+def test_timing(finding: Finding, verdict: Verdict, value: float, says: str) -> None:
+    assert (finding.verdict, finding.value) == (verdict, pytest.approx(value, rel=1e-2))
+    assert says in finding.sentence
 
 
 @pytest.mark.parametrize(("magnitude", "verdict"), [(9.81, Verdict.OK), (9.4, Verdict.WARN), (12.0, Verdict.FAIL)])
@@ -254,21 +274,54 @@ def test_sharpness_knows_blurred_stretches() -> None:
     assert sharpness([100.0] * 13 + [5.0] * 7).verdict is Verdict.WARN
 
 
+def shaken(axes: int) -> tuple[CameraTurns, ImuSamples]:
+    """Ten seconds of turns about z, or about all axes, that 198 intervals of 50 ms show as the gyro feels them."""
+    imu_stamps = stamps(0.005, 2000)
+    times = imu_stamps * 1e-9
+    gyro = np.stack([0.5 * np.sin((1.3 + k) * times) + 0.3 * np.cos((3.1 + k) * times) for k in range(3)], axis=1)
+    gyro[:, : 3 - axes] = 0.0
+    first = np.arange(10, 1990, 10)
+    rates = np.stack([0.05 * gyro[k : k + 10].mean(axis=0) / 0.05 for k in first])
+    rates += 1e-3 * np.random.default_rng(8).standard_normal(rates.shape)
+    turns = CameraTurns(imu_stamps[first], imu_stamps[first] + 50_000_000, rates, np.full(rates.shape, np.nan))
+    return turns, ImuSamples(imu_stamps, gyro, np.zeros((2000, 3)))
+
+
 def test_a_robot_that_turns_about_one_axis_only() -> None:
     """Nothing is said about axes that never turned; a wrong sign of the one that did is found."""
-    imu_stamps = stamps(0.005, 1000)
-    times = imu_stamps * 1e-9
-    gyro = np.stack([np.zeros(1000), np.zeros(1000), np.sin(2.2 * times) + 0.4 * np.sin(7 * times)], axis=1)
-    starts, ends = imu_stamps[20:900:10], imu_stamps[30:910:10]
-    rates = np.stack([gyro[20 + 10 * k : 30 + 10 * k].mean(axis=0) for k in range(len(starts))])
-    rates += 1e-4 * np.random.default_rng(8).standard_normal(rates.shape)
-    imu = ImuSamples(imu_stamps, gyro, np.zeros((1000, 3)))
-    fit = fit_gyro(CameraTurns(starts, ends, rates), imu, 0.0)
+    turns, imu = shaken(1)
+    fit = fit_gyro(turns, imu, 0.0)
     assert fit.axes_seen == 1
     np.testing.assert_allclose(fit.body_from_gyro, np.eye(3), atol=0.01)
-    wrong = fit_gyro(CameraTurns(starts, ends, -rates), imu, 0.0)
+    wrong = fit_gyro(replace(turns, rates_body_radps=-turns.rates_body_radps), imu, 0.0)
     assert wrong.body_from_gyro[2, 2] == pytest.approx(-1, abs=0.01)
     assert wrong.offset_s == pytest.approx(0, abs=0.003)
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+def test_a_person_before_the_cameras_is_no_fault_of_the_gyro(axes: int) -> None:
+    """Two fifths of the run the images show somebody who stands still before them."""
+    turns, imu = shaken(axes)
+    turns.rates_body_radps[60:139] *= 0.02
+    findings, offset_s, _ = gyro_check(turns, imu, 0.0)
+    assert {finding.verdict for finding in findings} == {Verdict.OK}
+    assert offset_s == pytest.approx(0.0, abs=0.004)
+
+
+def test_stamps_that_move_within_the_run_are_no_time_offset() -> None:
+    """For four seconds of ten images are stamped 50 ms late: no timeshift is right for all."""
+    turns, imu = shaken(3)
+    late = slice(100, 180)
+    moved = replace(turns, starts_ns=turns.starts_ns.copy(), ends_ns=turns.ends_ns.copy())
+    moved.starts_ns[late] += 50_000_000
+    moved.ends_ns[late] += 50_000_000
+    findings, offset_s, is_unsteady = gyro_check(moved, imu, 0.0)
+    offset = findings[0]
+    assert (offset.verdict, offset_s, is_unsteady) == (Verdict.FAIL, None, True)
+    assert offset.value == pytest.approx(50.0, abs=4.0)
+    assert "stamp both by one clock" in offset.sentence
+    assert "timeshift_cam_imu" not in offset.sentence
+    assert {finding.verdict for finding in findings[1:]} == {Verdict.OK}
 
 
 def run(*arguments: str) -> int:
