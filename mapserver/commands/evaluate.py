@@ -38,7 +38,7 @@ def evaluate(
 
     from fleetmap.console import plain_console
     from fleetmap.recordings.tum import read_covariances, read_tum
-    from mapserver.evaluation.summary_table import summary
+    from mapserver.evaluation.trajectory_error import summary
 
     covariances = None if options.covariances is None else read_covariances(options.covariances)
     trajectories = read_tum(estimate), read_tum(options.ground_truth)

@@ -87,7 +87,7 @@ def survey(case: Case, recording: Path, folder: Path) -> dict[str, Any]:
     with open_recording(recording) as opened:
         truth = opened.ground_truth
     shift = None if truth is None else best_clock_shift(read_tum(folder / f"{case.name}.tum"), truth)
-    return found | {"clock_shift": None if shift is None else asdict(shift)}
+    return found | {"clock_shift": None if shift is None else dict(zip(("shift_s", "rmse_m"), shift, strict=True))}
 
 
 def bench(names: list[str], recordings: Path | None = None) -> list[dict[str, Any]]:

@@ -1,18 +1,26 @@
-"""Evaluation against evo, and against errors that are known by construction."""
+"""Evaluation against evo, and against errors that are known by construction; and the command that prints it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
+from typer.testing import CliRunner
 
-from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, interpolate_se3, se3_exp, se3_inverse
+from fleetmap.errors import RecordingError, SurveyError
+from fleetmap.geometry import Array, interpolate_se3, se3, se3_exp, se3_inverse, so3_exp
+from fleetmap.recordings.tum import StampedCovariances, format_stamp, parse_covariances, read_covariances, write_tum
 from fleetmap.sensors.samples import Trajectory
+from mapserver.cli import app
 from mapserver.evaluation.trajectory_error import (
     absolute_trajectory_error,
+    at_first_stamp,
     best_clock_shift,
+    consistency,
     drift,
-    kitti_drift,
     paired,
     relative_trajectory_error,
     unaligned_errors,
@@ -60,6 +68,18 @@ def test_ate_agrees_with_evo(with_scale: bool) -> None:
     assert (result.matched, result.evaluated_share) == (400, 1.0)
 
 
+@pytest.mark.parametrize("step", [1, 10])
+def test_relative_error_agrees_with_evo(step: int) -> None:
+    truth = _truth()
+    estimate = _estimate(truth)
+    found = relative_trajectory_error(estimate, truth, step=step)
+    relations = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad
+    for relation, mine in zip(relations, found, strict=True):
+        rpe = metrics.RPE(relation, delta=step, delta_unit=metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((_path(truth), _path(estimate)))
+        assert mine == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
+
+
 def test_a_truth_on_another_clock_is_noticed() -> None:
     """The shift is found again, and what the ATE would be without it; a truth on the same clock gives none."""
     truth, estimate = _truth(), _estimate(_truth())
@@ -67,53 +87,37 @@ def test_a_truth_on_another_clock_is_noticed() -> None:
     shifted, same = best_clock_shift(estimate, late), best_clock_shift(estimate, truth)
     assert shifted is not None
     assert same is not None
-    assert shifted.shift_s - same.shift_s == pytest.approx(0.017, abs=5e-4)
-    assert same.shift_s == pytest.approx(0.0, abs=3e-3)  # noise of 2 cm at 2 m/s
-    assert shifted.rmse_m == pytest.approx(same.rmse_m, rel=0.03)
-    assert shifted.rmse_m < 0.98 * absolute_trajectory_error(estimate, late).rmse_m
+    assert shifted[0] - same[0] == pytest.approx(0.017, abs=5e-4)
+    assert same[0] == pytest.approx(0.0, abs=3e-3)  # noise of 2 cm at 2 m/s
+    assert shifted[1] == pytest.approx(same[1], rel=0.03)
+    assert shifted[1] < 0.98 * absolute_trajectory_error(estimate, late).rmse_m
     assert best_clock_shift(_estimate(_truth(2)), _truth(2)) is None
 
 
-@pytest.mark.parametrize("step", [1, 10])
-def test_relative_error_agrees_with_evo(step: int) -> None:
-    truth = _truth()
-    estimate = _estimate(truth)
-    result = relative_trajectory_error(estimate, truth, step=step)
-    for relation, mine in (
-        (metrics.PoseRelation.translation_part, result.rmse_m),
-        (metrics.PoseRelation.rotation_angle_rad, result.rmse_rad),
-    ):
-        rpe = metrics.RPE(relation, delta=step, delta_unit=metrics.Unit.frames, all_pairs=True)
-        rpe.process_data((_path(truth), _path(estimate)))
-        assert mine == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=1e-6)
-
-
-def test_the_alignment_is_the_one_that_was_put_in() -> None:
+def test_alignments_are_the_ones_that_were_put_in() -> None:
+    """By all stamps, by the first one, and by none."""
     truth = _truth()
     estimate_from_truth = se3_exp(np.array([0.1, 2.0, -0.3, 1.0, 2.0, 3.0]))
     exact = Trajectory(truth.stamps_ns, estimate_from_truth @ truth.frame_from_body)
     result = absolute_trajectory_error(exact, truth)
     np.testing.assert_allclose(result.frame_from_estimate, se3_inverse(estimate_from_truth), atol=1e-9)
     assert result.max_m < 1e-9
+    later = at_first_stamp(Trajectory(exact.stamps_ns[4:], exact.frame_from_body[4:]), truth)
+    np.testing.assert_allclose(later.frame_from_body, truth.frame_from_body[4:], atol=1e-9)
+    shifted = truth.frame_from_body @ se3_exp(np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]))
+    shifted[:, 0, 3] += 0.25
+    errors_m, errors_rad = unaligned_errors(Trajectory(truth.stamps_ns, shifted), truth)
+    np.testing.assert_allclose(errors_m, 0.25, atol=1e-9)
+    np.testing.assert_allclose(errors_rad, 0.05, atol=1e-9)
 
 
 def test_stamps_between_those_of_the_truth_are_interpolated() -> None:
     truth = _truth()
     between = [interpolate_se3(*truth.frame_from_body[k : k + 2], 0.3) for k in range(len(truth) - 1)]
-    estimate = Trajectory(truth.stamps_ns[:-1] + 15_000_000, np.array(between))
-    stamps, errors_m, errors_rad = unaligned_errors(estimate, truth)
-    assert len(stamps) == len(truth) - 1
+    errors_m, errors_rad = unaligned_errors(Trajectory(truth.stamps_ns[:-1] + 15_000_000, np.array(between)), truth)
+    assert len(errors_m) == len(truth) - 1
     assert errors_m.max() < 1e-9
     assert errors_rad.max() < 1e-7
-
-
-def test_unaligned_errors_are_not_aligned() -> None:
-    truth = _truth()
-    shifted = truth.frame_from_body @ se3_exp(np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]))
-    shifted[:, 0, 3] += 0.25
-    _, errors_m, errors_rad = unaligned_errors(Trajectory(truth.stamps_ns, shifted), truth)
-    np.testing.assert_allclose(errors_m, 0.25, atol=1e-9)
-    np.testing.assert_allclose(errors_rad, 0.05, atol=1e-9)
 
 
 def test_what_has_no_truth_is_not_counted() -> None:
@@ -136,33 +140,102 @@ def test_too_little_in_common_is_an_error() -> None:
         absolute_trajectory_error(other_clock, truth)
     with pytest.raises(SurveyError, match="too few"):
         relative_trajectory_error(truth, truth, step=10)
-    assert kitti_drift(other_clock, truth) is None
-    assert kitti_drift(truth, truth) is None
+    for pair in ((other_clock, truth), (_truth(8), _truth(8))):
+        assert drift(*pair)["drift_translation_share"] is None
 
 
-def _scaled(truth: Trajectory, factor: float) -> Array:
-    scaled = truth.frame_from_body.copy()
-    scaled[:, :3, 3] *= factor
-    return scaled
-
-
-def test_drift_of_a_wrong_scale_on_a_straight_road() -> None:
+@pytest.mark.parametrize(
+    ("step_m", "shortest_m", "longest_m", "segments"), [(0.5, 100.0, 200.0, 40 + 20), (0.1, 1.0, 50.0, 3112)]
+)
+def test_drift_of_a_wrong_scale_on_a_straight_road(
+    step_m: float, shortest_m: float, longest_m: float, segments: int
+) -> None:
+    """KITTI's lengths, and shorter ones on a road of 60 m."""
     frame_from_body = np.tile(np.eye(4), (600, 1, 1))
-    frame_from_body[:, 0, 3] = np.arange(600) * 0.5
+    frame_from_body[:, 0, 3] = np.arange(600) * step_m
     truth = Trajectory(np.arange(600, dtype=np.int64) * 10**8, frame_from_body)
-    drift = kitti_drift(Trajectory(truth.stamps_ns, _scaled(truth, 1.02)), truth, lengths_m=(100.0, 200.0))
-    assert drift is not None
-    assert drift.translation_share == pytest.approx(0.02, rel=0.02)
-    assert drift.rotation_radpm < 1e-9
-    assert drift.segments == 40 + 20
+    long = frame_from_body.copy()
+    long[:, :3, 3] *= 1.02
+    found = drift(Trajectory(truth.stamps_ns, long), truth)
+    assert found["drift_translation_share"] == pytest.approx(0.02, rel=0.05)
+    assert found["drift_rotation_radpm"] == pytest.approx(0.0, abs=1e-9)
+    assert (found["drift_shortest_m"], found["drift_longest_m"]) == (shortest_m, longest_m)
+    assert found["drift_segments"] == segments
 
 
-def test_short_runs_drift_over_short_lengths() -> None:
-    frame_from_body = np.tile(np.eye(4), (400, 1, 1))
-    frame_from_body[:, 0, 3] = np.arange(400) * 0.1
-    truth = Trajectory(np.arange(400, dtype=np.int64) * 10**8, frame_from_body)
-    found = drift(Trajectory(truth.stamps_ns, _scaled(truth, 1.03)), truth)
-    assert found is not None
-    assert found.lengths_m == (1.0, 2.0, 5.0, 10.0, 20.0)
-    assert found.translation_share == pytest.approx(0.03, rel=0.05)
-    assert drift(_truth(8), _truth(8)) is None
+COUNT = 3000
+
+
+def csv_lines(given: StampedCovariances) -> list[str]:
+    rows, columns = np.triu_indices(6)
+    lines = ["# timestamp_s, c00, ..."]
+    for stamp_ns, covariance in zip(given.stamps_ns.tolist(), given.covs_rot_trans, strict=True):
+        lines.append(", ".join([format_stamp(stamp_ns), *(f"{value:.9g}" for value in covariance[rows, columns])]))
+    return lines
+
+
+def drawn(scale: float = 1.0) -> tuple[Trajectory, StampedCovariances, Trajectory]:
+    """Estimate, covariances and truth; errors are `scale` times as large as the covariances say."""
+    rng = np.random.default_rng(5)
+    stamps = 10**18 + 50_000_000 * np.arange(COUNT, dtype=np.int64)
+    true, mine, covs = [], [], []
+    for k in range(COUNT):
+        root = 0.02 * rng.normal(size=(6, 6)) + 0.03 * np.eye(6)
+        error = scale * root @ rng.normal(size=6)
+        rotation, place = so3_exp(rng.normal(size=3)), np.array([0.1 * k, np.sin(0.1 * k), 0.0])
+        true.append(se3(rotation, place))
+        mine.append(se3(so3_exp(-error[:3]) @ rotation, place - error[3:]))
+        covs.append(root @ root.T)
+    every = StampedCovariances(stamps, np.array(covs))
+    return Trajectory(stamps, np.array(mine)), every, Trajectory(stamps, np.array(true))
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_nees_is_the_squared_ratio_of_error_and_promise(scale: float) -> None:
+    found = consistency(*drawn(scale))
+    assert found["nees_stamps"] == COUNT
+    for name in ("nees_position", "nees_rotation", "nees"):
+        assert found[name] == pytest.approx(scale**2, rel=0.06)
+    for name in ("nees_inside_share", "nees_position_inside_share"):
+        assert found[name] == pytest.approx(0.95 if scale == 1.0 else 0.35, abs=0.015 if scale == 1.0 else 0.2)
+
+
+def test_stamps_without_a_covariance_are_left_out() -> None:
+    estimate, covariances, truth = drawn()
+    some = StampedCovariances(covariances.stamps_ns[::3], covariances.covs_rot_trans[::3])
+    assert consistency(estimate, some, truth)["nees_stamps"] == COUNT / 3
+    with pytest.raises(SurveyError, match="nanosecond"):
+        consistency(estimate, StampedCovariances(some.stamps_ns + 1, some.covs_rot_trans), truth)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda line: line.replace(",", ", x", 1), "not all numbers"),
+        (lambda line: line.rsplit(",", 1)[0], "20 numbers"),
+        (lambda line: line.split(",")[0] + ", -1" + ", 0" * 20, "positive definite"),
+        (lambda line: line + "\n" + line, "does not rise"),
+    ],
+)
+def test_bad_lines_are_named(change: Callable[[str], str], says: str) -> None:
+    line = csv_lines(StampedCovariances(np.array([5], np.int64), np.eye(6)[None]))[1]
+    with pytest.raises(RecordingError, match=rf"line \d.*{says}"):
+        parse_covariances(change(line), "c.csv")
+
+
+def test_the_command_prints_it(tmp_path: Path) -> None:
+    estimate, covariances, truth = drawn()
+    names = ("e.tum", "t.tum", "c.csv")
+    write_tum(tmp_path / "e.tum", estimate)
+    write_tum(tmp_path / "t.tum", truth)
+    (tmp_path / "c.csv").write_text("\n".join(csv_lines(covariances)))
+    again: Array = read_covariances(tmp_path / "c.csv").covs_rot_trans
+    np.testing.assert_allclose(again, covariances.covs_rot_trans, rtol=1e-7, atol=1e-11)
+    e, t, c = (str(tmp_path / name) for name in names)
+    given = ["evaluate", e, "--ground-truth", t, "--covariances", c, "--frames", str(2 * COUNT), "--json"]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.output)
+    assert found["nees"] == pytest.approx(consistency(estimate, covariances, truth)["nees"], rel=1e-4)
+    assert found["evaluated_share"] == 0.5
+    assert found["drift_shortest_m"] == 100.0
