@@ -6,6 +6,7 @@
 #   make test-all              every test: with browser walks, fault sweeps, real recordings, nights and drills
 #   make test-ci               make test, and of the long tests one drive, one fault sweep and one browser walk
 #   make check                 format, lint, types, import contracts
+#   make docs                  write the tables of docs/command_line.md and docs/settings.md anew
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
@@ -29,7 +30,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test test-ci test-all check kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
+.PHONY: help demo demo-recording test test-ci test-all check docs kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -62,6 +63,9 @@ check: $(DEV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(DEV_STAMP)
+	$(BIN)/python docs/generate.py
 
 # With --jobs=2 side by side: most of what robots share with the server is there when they get to it.
 kernels: kernels-server kernels-robot kernels-simulator

@@ -3,10 +3,8 @@
 import dataclasses
 import inspect
 import re
-import tomllib
 from pathlib import Path
 
-import click
 import msgspec
 import pytest
 
@@ -18,56 +16,32 @@ from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.night import NightReport
 from mapserver.quality import figures
 from mapserver.survey.merge.pipeline import Counts
-from support.fleet.contracts_documents import REPOSITORY, click_command, code_words, rows, section, text
+from support.fleet.contracts_documents import REPOSITORY, code_words, generate_docs, rows, section, text
 
 ROOTS = ("shared", "mapserver", "locclient", "deploy", "docs", "examples", "tests")
-COMMANDS = "docs/command_line.md"
+GENERATE = generate_docs()
 SERVICE = "docs/service.md"
 REPORTS = "docs/reports.md"
 DOCUMENTS = sorted(str(path.relative_to(REPOSITORY)) for path in REPOSITORY.glob("docs/*.md"))
 LINKED = re.compile(r"\]\((?!https?:)([^)#]+)")
 
 
-def _scripts() -> list[str]:
-    return sorted(tomllib.loads(text("pyproject.toml"))["project"]["scripts"])
-
-
-def _documented_commands() -> list[str]:
-    return re.findall(r"^## `(\w+(?: [\w-]+)+)`", text(COMMANDS), re.MULTILINE)
-
-
-def _leaves(path: str) -> set[str]:
-    """The command itself, or all commands of a group and its groups."""
-    groups = getattr(click_command(path), "commands", None)
-    return {path} if groups is None else {leaf for name in groups for leaf in _leaves(f"{path} {name}")}
-
-
-def _arguments(command: click.Command) -> set[str]:
-    """Names of the arguments as the command's help shows them."""
-    arguments = (parameter for parameter in command.params if parameter.param_type_name == "argument")
-    return {argument.metavar or (argument.name or "").upper() for argument in arguments}
-
-
-@pytest.mark.parametrize("script", _scripts())
-def test_commands_are_documented(script: str) -> None:
-    assert _leaves(script) == {path for path in _documented_commands() if path.split()[0] == script}
-
-
-@pytest.mark.parametrize("path", _documented_commands())
-def test_options_are_documented(path: str) -> None:
-    command = click_command(path)
-    options = {parameter.opts[0] for parameter in command.params if parameter.param_type_name == "option"}
-    documented = {code_words(row[0])[0] for row in rows(section(COMMANDS, f"`{path}`"))}
-    assert {word.split()[0] for word in documented if word.startswith("--")} == options - {"--help"}
-    assert {word for word in documented if not word.startswith("--")} == _arguments(command)
+@pytest.mark.parametrize("page", ["command_page", "settings_page"])
+def test_generated_pages_are_current(page: str) -> None:
+    path = GENERATE.COMMANDS if page == "command_page" else GENERATE.SETTINGS
+    assert getattr(GENERATE, page)(path.read_text("utf-8")) == path.read_text("utf-8"), "`make docs` writes it anew"
 
 
 def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() -> None:
-    commands = {path: click_command(path) for path in _documented_commands()}
-    readers = {path: command for path, command in commands.items() if "RECORDING" in str(_arguments(command))}
+    commands = GENERATE.commands()
+    readers = {
+        path
+        for path, command in commands.items()
+        if any(p.param_type_name == "argument" and "RECORDING" in (p.metavar or p.name.upper()) for p in command.params)
+    }
     assert len(readers) >= 7
-    for path, command in (readers | {"mapserver nightly": click_command("mapserver nightly")}).items():
-        assert "--topic" in {option for parameter in command.params for option in parameter.opts}, path
+    for path in readers | {"mapserver nightly"}:
+        assert "--topic" in {option for parameter in commands[path].params for option in parameter.opts}, path
 
 
 def test_endpoints_are_documented(tmp_path: Path) -> None:

@@ -1,15 +1,26 @@
 """The project's documents, cut into sections and tables for the tests that compare them with the code."""
 
-import importlib
+import importlib.util
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import click
 import typer
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 _HEADING = re.compile(r"^#{1,6} .*$", re.MULTILINE)
+
+
+def generate_docs() -> Any:
+    """The module docs/generate.py, which is in no package."""
+    spec = importlib.util.spec_from_file_location("generate_docs", REPOSITORY / "docs/generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def text(path: str) -> str:
