@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from rich.console import Console
 
 from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
@@ -23,9 +23,9 @@ from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
+from fleetmap.version_grid import encode_grid, grid_report
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
-from mapserver.drafting.layers import covered_requests, grid_layer, layer_sessions, surfel_layer
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.drafting.report import (
@@ -54,15 +54,14 @@ from mapserver.drafting.survey_recordings import (
     survey_recording,
 )
 from mapserver.drafting.trajectory import OtherTrajectory
-from mapserver.drafting.worker import (
-    open_executor,
-    open_side_thread,
-    single_threaded_libraries,
-)
+from mapserver.drafting.worker import open_executor, single_threaded_libraries
+from mapserver.floor_plan.survey_requests import open_requests
+from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.surfels.surfel_map import Surfels, known_surfels
+from mapserver.surfels.surfel_map import Surfels, encode_surfels, known_surfels, surfel_report
+from mapserver.surfels.survey_surfels import grow_surfels
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
@@ -255,18 +254,16 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
 
-        pinhole, joining = None if base is None else base.camera, MapMerger(base, settings)
-        with open_side_thread(options.threads) as beside:
+        def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+            options.look_at([path])
+            return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
 
-            def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
-                options.look_at([path])
-                done = survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
-                beside(partial(joining.add, Session(done.survey, done.map_from_survey)))
-                return done
-
-            surveyed = survey_all(list(admitted), survey_one, pinhole, run.unusable)
-            options.look_at(list(admitted))
-            tools.progress("joining", 0, 1)
+        surveyed = survey_all(list(admitted), survey_one, None if base is None else base.camera, run.unusable)
+        options.look_at(list(admitted))
+        tools.progress("joining", 0, 1)
+        joining = MapMerger(base, settings)
+        for done in surveyed:
+            joining.add(Session(done.survey, done.map_from_survey))
         joined = joining.finish()
     run.times.begin("storing")
     say_left_out(run.console, run.request.site, surveyed, joined)
@@ -288,11 +285,20 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
     run.times.begin("grid")
-    sessions = layer_sessions(built.taken, built.joined)
-    grid, grid_said = grid_layer(run.settings, sessions, {} if parent is None else parent.grid)
+    places = [trajectory.frame_from_body for trajectory in map_trajectories(built.joined)]
+    sessions = [GridSession(s.entry.name, s.survey, place) for s, place in zip(built.taken, places, strict=True)]
+    wanted_sessions = sessions if run.settings.occupancy_grid else []
+    grid_tiles, without = grow_grid({} if parent is None else parent.grid, wanted_sessions, run.settings.stereo)
+    grid = encode_grid(grid_tiles)
+    grid_said = grid_report(grid, without) if grid or without else None
     run.times.begin("surfels")
-    known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
-    surfels, surfels_said = surfel_layer(run.settings, sessions, known)
+    surfels: list[bytes] = []
+    surfels_said = None
+    if run.settings.surfel_map:
+        known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
+        grown, without = grow_surfels(known, sessions, run.settings.stereo)
+        surfels = encode_surfels(grown)
+        surfels_said = surfel_report(surfels, len(grown), without)
     run.times.begin("examining")
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
@@ -332,6 +338,24 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     )
     _write_files(run, built, draft)
     return draft
+
+
+_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: stamps before are no calendar's, but count from a start
+
+
+def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, float]:
+    """By id of each open request the share of its places that these recordings drove past; what is older counts for nothing."""
+    places = joined.map.map_from_body[:, :2, 3]
+    drives = map_trajectories(joined)
+    found = {}
+    for request in open_requests(maps, site):
+        later = [
+            drive.positions_m[:, :2]
+            for drive in drives
+            if len(drive) and not _CLOCKS_BEGIN_NS < int(drive.stamps_ns[-1]) < request.asked_ns
+        ]
+        found[request.id] = round(request.covered_share(places, np.concatenate([np.zeros((0, 2)), *later])), 3)
+    return {name: share for name, share in found.items() if share > 0}
 
 
 def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:

@@ -69,7 +69,8 @@ def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: b
     """One batch in a process of the cluster."""
     name, data = packed
     if name not in _unpacked:
-        _limit_libraries()
+        cv2.setNumThreads(1)  # as `single_threaded_libraries`, for good: this process does nothing else
+        threadpool_limits(1, user_api="blas")
         _unpacked.clear()
         _unpacked[name] = pickle.loads(data)
     return pickle.dumps(function(_unpacked[name], pickle.loads(batch)), protocol=5)
@@ -89,39 +90,12 @@ def _in_order(
 
 
 @contextmanager
-def open_side_thread(threads: int | None) -> Iterator[Callable[[Callable[[], None]], None]]:
-    """Does what it is given, one piece after the other, beside the caller, who waits at the block's end and gets its first error there.
-
-    Where a survey has but one core all is done at the block's end. An error of the block leaves out what has not begun.
-    """
-    if _cores(threads) == 1:
-        later: list[Callable[[], None]] = []
-        yield later.append
-        for work in later:
-            work()
-        return
-    with ThreadPoolExecutor(1, thread_name_prefix="joining") as pool:
-        begun: list[Future[None]] = []
-        try:
-            yield lambda work: begun.append(pool.submit(work))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        for each in begun:
-            each.result()
-
-
-def _cores(threads: int | None) -> int:
-    return threads or len(os.sched_getaffinity(0))
-
-
-@contextmanager
 def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Threads (as many as there are cores, without a number), or the cluster of a scheduler.
 
     Raises UsageError for a scheduler that is not reached by TLS, or that does not answer.
     """
-    count = _cores(threads)
+    count = threads or len(os.sched_getaffinity(0))
     if scheduler is not None:
         with _client(scheduler) as client:
             yield Cluster(client)
@@ -146,12 +120,6 @@ def single_threaded_libraries() -> Iterator[None]:
             yield
     finally:
         cv2.setNumThreads(before)
-
-
-def _limit_libraries() -> None:
-    """As `single_threaded_libraries`, for good: in a process that does nothing else."""
-    cv2.setNumThreads(1)
-    threadpool_limits(1, user_api="blas")
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """Gate before publishing: reasons against a draft, by itself and beside the version that robots use now. Pure."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 
@@ -53,10 +53,7 @@ class GateVerdict:
 
 
 def judge(
-    draft: Manifest,
-    current: Manifest | None,
-    settings: GateSettings,
-    evidence: Evidence | None = None,
+    draft: Manifest, current: Manifest | None, settings: GateSettings, evidence: Evidence | None = None
 ) -> GateVerdict:
     """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
 
@@ -65,141 +62,120 @@ def judge(
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
-    found = _Findings([], [] if "joins" in draft.report else ["joining"], [])
+    reasons: list[str] = []
+    not_judged = [] if "joins" in draft.report else ["joining"]
     for name, compared in (
         ("held_out_frames", examined.held_out),
         ("yesterdays_recordings", examined.replayed),
         ("last_versions_places", examined.last_version),
     ):
-        _compare(name, compared, settings, found)
-    _judge_aliasing(examined.aliasing, examined.aliasing_before, settings, found)
-    _judge_calibrations(draft, examined, found, is_first=current is None)
+        if compared is None or compared.draft.frames < settings.min_frames:
+            not_judged.append(name)
+        else:
+            over = f"over {compared.draft.frames} frames"
+            reasons += [f"{name}: {words}, {over}" for words in _frame_reasons(compared, settings)]
+    if examined.aliasing is None or examined.aliasing.offered < settings.min_frames:
+        not_judged.append("aliasing_probes")
+    else:
+        reasons += _aliasing_reasons(examined.aliasing, examined.aliasing_before, settings)
+    doubts, unjudged, unknown = _calibration_reasons(draft, examined, is_first=current is None)
+    reasons += [*doubts, *unjudged]
+    not_judged += unknown
     if examined.motion is None:
-        found.not_judged.append("motion")
+        not_judged.append("motion")
     elif examined.motion.breaks > settings.max_breaks:
-        found.reasons.append(
+        reasons.append(
             f"its trajectory is torn in {examined.motion.breaks} places, by up to {examined.motion.worst_m:.2f} m against "
             f"odometry; max_breaks is {settings.max_breaks}"
         )
     if current is None:
-        found.not_judged.append("size_against_last_version")
+        not_judged.append("size_against_last_version")
     else:
         shares = _shares(draft, current)
         report |= {"compared_with": current.version, **shares}
-        found.reasons.extend(_size_reasons(shares, current.version, settings))
-    report |= {"evidence": to_plain(examined), "not_judged": found.not_judged}
-    return GateVerdict(tuple(found.reasons), _hard_reasons(draft), report, tuple(found.unjudged))
+        reasons += _size_reasons(shares, current.version, settings)
+    report |= {"evidence": to_plain(examined), "not_judged": not_judged}
+    return GateVerdict(tuple(reasons), _hard_reasons(draft), report, tuple(unjudged))
 
 
-@dataclass(frozen=True, slots=True)
-class _Findings:
-    """Reasons against a draft so far, what could not be judged, and which of the reasons are about that."""
-
-    reasons: list[str]
-    not_judged: list[str]
-    unjudged: list[str]
-
-
-class _Bound(StrEnum):
-    """A limit's kind, as the word for a figure that breaks it."""
-
-    MIN = "below"
-    MAX = "above"
-
-    def is_broken(self, value: float, limit: float) -> bool:
-        """Whether the value lies on the wrong side; the limit itself is allowed."""
-        return value < limit if self is _Bound.MIN else value > limit
-
-
-class _Check(NamedTuple):
-    """A figure, None where unknown, and its limit with the name that people read."""
-
-    figure: str
-    value: float | None
-    bound: _Bound
-    limit: float
-    limit_name: str
-    relative_to: str = ""
-
-
-def _compare(name: str, compared: Compared | None, settings: GateSettings, found: _Findings) -> None:
-    """The reasons of one kind of frames."""
-    if compared is None or compared.draft.frames < settings.min_frames:
-        found.not_judged.append(name)
-        return
-    for check in _checks(compared, settings):
-        if check.value is not None and check.bound.is_broken(check.value, check.limit):
-            words = f"{check.relative_to}{check.bound} {check.limit_name} ({check.limit:.3f})"
-            over = f"over {compared.draft.frames} frames"
-            found.reasons.append(f"{name}: {check.figure} {check.value:.3f} is {words}, {over}")
-
-
-def _checks(compared: Compared, settings: GateSettings) -> list[_Check]:
+def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
+    """What one kind of frames says against a draft: figures on the wrong side of their limit, which itself is allowed."""
     draft, before = compared.draft, compared.before
-    absolute = (
-        ("localised_share", _Bound.MIN, "min_localised_share"),
-        ("wrong_share", _Bound.MAX, "max_wrong_share"),
-        ("median_error_m", _Bound.MAX, "max_median_error_m"),
-        ("residual_px", _Bound.MAX, "max_residual_px"),
-    )
-    checks = [_Check(name, getattr(draft, name), kind, getattr(settings, key), key) for name, kind, key in absolute]
-    if before is None:
-        return checks
-    least = before.localised_share - settings.margin_localised_share
-    limit_name = "the current version's less its margin"
-    checks.append(_Check("localised_share", draft.localised_share, _Bound.MIN, least, limit_name))
-    if before.median_error_m is not None:
-        most, limit_name = before.median_error_m + settings.margin_error_m, "the current version's and its margin"
-        checks.append(_Check("median_error_m", draft.median_error_m, _Bound.MAX, most, limit_name))
-    limit = (_Bound.MIN, settings.min_inliers_share, "min_inliers_share")
-    return [*checks, _Check("inliers_share", compared.inliers_share, *limit, relative_to="of the current version ")]
+    least = [("localised_share", draft.localised_share, settings.min_localised_share, "min_localised_share")]
+    most = [
+        ("wrong_share", draft.wrong_share, settings.max_wrong_share, "max_wrong_share"),
+        ("median_error_m", draft.median_error_m, settings.max_median_error_m, "max_median_error_m"),
+        ("residual_px", draft.residual_px, settings.max_residual_px, "max_residual_px"),
+    ]
+    if before is not None:
+        limit = before.localised_share - settings.margin_localised_share
+        least.append(("localised_share", draft.localised_share, limit, "the current version's less its margin"))
+        if before.median_error_m is not None:
+            limit = before.median_error_m + settings.margin_error_m
+            most.append(("median_error_m", draft.median_error_m, limit, "the current version's and its margin"))
+    for sign, word, checks in ((-1, "below", least), (1, "above", most)):
+        for figure, value, limit, name in checks:
+            if value is not None and sign * (value - limit) > 0:
+                yield f"{figure} {value:.3f} is {word} {name} ({limit:.3f})"
+    share = compared.inliers_share
+    if before is not None and share is not None and share < settings.min_inliers_share:
+        limits = f"min_inliers_share ({settings.min_inliers_share:.3f})"
+        yield f"inliers_share {share:.3f} is of the current version below {limits}"
 
 
-def _judge_aliasing(
-    aliasing: Aliasing | None, before: Aliasing | None, settings: GateSettings, found: _Findings
-) -> None:
-    if aliasing is None or aliasing.offered < settings.min_frames:
-        found.not_judged.append("aliasing_probes")
-        return
+def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: GateSettings) -> list[str]:
     usual = 0.0 if before is None else before.accepted_share
-    if aliasing.accepted_share > max(settings.max_aliased_share, usual):
-        found.reasons.append(
-            f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are taken for another place that looks "
-            f"like theirs, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
-        )
+    if aliasing.accepted_share <= max(settings.max_aliased_share, usual):
+        return []
+    return [
+        f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are taken for another place that looks "
+        f"like theirs, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
+    ]
 
 
-def _judge_calibrations(draft: Manifest, examined: Evidence, found: _Findings, *, is_first: bool) -> None:
-    """Doubts are for a person. So is what nothing judged of a site's first map, with which later ones are compared."""
+def _calibration_reasons(
+    draft: Manifest, examined: Evidence, *, is_first: bool
+) -> tuple[list[str], list[str], list[str]]:
+    """Doubts, which are for a person; what nothing judged of a first map, with which later ones are compared; what else is unknown."""
     if examined.calibrations is None:
-        found.not_judged.append("calibration")
-        return
+        return [], [], ["calibration"]
     trusted = {choice.rig: choice for choice in trusted_calibrations(draft)}
+    doubts, unjudged, unknown = list[str](), list[str](), list[str]()
     for rig in examined.calibrations:
-        found.reasons.extend([f"calibration {rig.rig}: {subject}: {words}" for subject, words in rig.doubted.items()])
+        doubts += [f"calibration {rig.rig}: {subject}: {words}" for subject, words in rig.doubted.items()]
         choice = trusted.get(rig.rig)
         for subject, missing in rig.unknown().items():
             words = f"{subject} of calibration {rig.rig}: {missing}"
             if choice is not None:
-                found.not_judged.append(f"{words} ({choice.actor} trusts it: {choice.reason})")
+                unknown.append(f"{words} ({choice.actor} trusts it: {choice.reason})")
             elif is_first:
-                found.unjudged.append(f"nothing judged the {words}")
+                unjudged.append(f"nothing judged the {words}")
             else:
-                found.not_judged.append(words)
-    found.reasons.extend(found.unjudged)
+                unknown.append(words)
+    return doubts, unjudged, unknown
 
 
-def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> list[str]:
-    limits = (
-        ("landmarks_share", _Bound.MIN, settings.min_landmarks_share),
-        ("coverage_share", _Bound.MIN, settings.min_coverage_share),
-        ("bytes_share", _Bound.MAX, settings.max_bytes_share),
-    )
-    return [
-        f"{name} {shares[name]:.2f} of version {version} is {bound} {limit:g}"
-        for name, bound, limit in limits
-        if bound.is_broken(shares[name], limit)
-    ]
+def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
+    """A tile is covered where it has at least half as many landmarks as before."""
+    before = {(tile.x, tile.y): tile.landmarks for tile in current.tiles if tile.landmarks}
+    after = {(tile.x, tile.y): tile.landmarks for tile in draft.tiles}
+    covered = sum(count for cell, count in before.items() if 2 * after.get(cell, 0) >= count)
+    return {
+        "landmarks_share": round(draft.landmarks / max(1, current.landmarks), 4),
+        "coverage_share": round(covered / max(1, sum(before.values())), 4),
+        "bytes_share": round(draft.tile_bytes / max(1, current.tile_bytes), 4),
+    }
+
+
+def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> Iterator[str]:
+    for name, limit in (
+        ("landmarks_share", settings.min_landmarks_share),
+        ("coverage_share", settings.min_coverage_share),
+    ):
+        if shares[name] < limit:
+            yield f"{name} {shares[name]:.2f} of version {version} is below {limit:g}"
+    if shares["bytes_share"] > settings.max_bytes_share:
+        yield f"bytes_share {shares['bytes_share']:.2f} of version {version} is above {settings.max_bytes_share:g}"
 
 
 def _hard_reasons(draft: Manifest) -> tuple[str, ...]:
@@ -222,15 +198,3 @@ def _hard_reasons(draft: Manifest) -> tuple[str, ...]:
             "second camera, or past two docks"
         )
     return tuple(reasons)
-
-
-def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
-    """A tile is covered where it has at least half as many landmarks as before."""
-    before = {(tile.x, tile.y): tile.landmarks for tile in current.tiles if tile.landmarks}
-    after = {(tile.x, tile.y): tile.landmarks for tile in draft.tiles}
-    covered = sum(count for cell, count in before.items() if 2 * after.get(cell, 0) >= count)
-    return {
-        "landmarks_share": round(draft.landmarks / max(1, current.landmarks), 4),
-        "coverage_share": round(covered / max(1, sum(before.values())), 4),
-        "bytes_share": round(draft.tile_bytes / max(1, current.tile_bytes), 4),
-    }

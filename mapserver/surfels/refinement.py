@@ -16,7 +16,6 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.surfels.expected_view import brightness, pinhole, resized
 from mapserver.surfels.exposure import lens_factor
-from mapserver.surfels.picture_likeness import psnr_db, ssim
 from mapserver.surfels.splat_file import Splats
 from mapserver.surfels.splat_renderer import Renderer, bounds, draw, parameters_of, with_parameters
 from mapserver.surfels.surfel_map import Surfels
@@ -173,8 +172,31 @@ def _likeness(
             continue
         shown = look.gain * renderer(splats, parameters, look.camera, look.map_from_cam).picture
         grey = np.clip(np.round(255 * shown), 0, 255).astype(np.uint8)
-        rows.append((psnr_db(grey, look.picture, where), ssim(grey, look.picture, where), where.mean()))
+        rows.append((_psnr_db(grey, look.picture, where), _ssim(grey, look.picture, where), where.mean()))
     return Likeness(*np.mean(rows, axis=0).tolist())
+
+
+def _psnr_db(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
+    """Peak signal over noise of these pixels (H, W)."""
+    squared = (first.astype(np.float64) - second) ** 2
+    return float(10 * np.log10(255.0**2 / squared[where].mean()))
+
+
+_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
+
+
+def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
+    """Mean structural similarity of windows around these pixels. Source: Wang et al. 2004 (11 x 11 Gaussian window of 1.5 px)."""
+
+    def mean(values: Array) -> Array:
+        return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5))
+
+    a, b = first.astype(np.float64), second.astype(np.float64)
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b, both = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2, mean(a * b) - mean_a * mean_b
+    likeness = (2 * mean_a * mean_b + _C1) * (2 * both + _C2)
+    likeness /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
+    return float(likeness[where].mean())
 
 
 def _lens(camera: CameraCalibration, surfels: Surfels) -> Array:

@@ -11,7 +11,7 @@ from fleetmap.errors import StateError, UsageError
 from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, write_output
 
 SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")]
-SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply or .spz; replaced if it exists.")]
+SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply; replaced if it exists.")]
 
 
 def splats(
@@ -21,13 +21,13 @@ def splats(
     store: StoreFolder,
 ) -> None:
     """Write the surfels of a version as 3D Gaussians, in the frame of the map, for viewers of Gaussian splats."""
-    check_output("FILE", file, ".ply", ".spz")
-    from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
+    check_output("FILE", file, ".ply")
+    from mapserver.surfels.splat_file import Splats, splat_ply
     from mapserver.surfels.surfel_map import surfels_of
 
     with open_store(store, read_only=True) as maps:
         surfels = surfels_of(maps.manifest(site, version), maps.blob)
-    data = (splat_spz if file.suffix == ".spz" else splat_ply)(Splats.of(surfels))
+    data = splat_ply(Splats.of(surfels))
     write_output(file, data)
     typer.echo(f"site {site}: {len(surfels)} surfels of version {version} are in {file}, {len(data) / 1e6:.1f} MB")
 
@@ -81,14 +81,14 @@ def refine(
     options: RefineOptions,
 ) -> None:
     """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
-    check_output("FILE", file, ".ply", ".spz")
+    check_output("FILE", file, ".ply")
     import numpy as np
 
     from fleetmap.recordings import OpenOptions, named_topics, open_recording
     from mapserver.store.archive import decode_archive
     from mapserver.surfels.refinement import looks_of
     from mapserver.surfels.refinement import refine as refined_by
-    from mapserver.surfels.splat_file import Splats, splat_ply, splat_spz
+    from mapserver.surfels.splat_file import Splats, splat_ply
     from mapserver.surfels.surfel_map import surfels_of
 
     with open_store(store, read_only=True) as maps:
@@ -114,7 +114,7 @@ def refine(
             f"not better, nothing is written; {said}; `mapserver map splats {version} {file}` writes the surfels as "
             "they are"
         )
-    data = (splat_spz if file.suffix == ".spz" else splat_ply)(done.splats)
+    data = splat_ply(done.splats)
     write_output(file, data)
     typer.echo(f"{said}, from {done.learned} other views; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
 

@@ -3,18 +3,14 @@
 import json
 from pathlib import Path
 
-import gsply
 import numpy as np
 import pytest
 from plyfile import PlyData
 
-from fleetmap.errors import UsageError
-from fleetmap.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from fleetmap.geometry import quat_wxyz_from_rotation
 from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.sensors.samples import SensorSet
 from mapserver.store import MapStore
-from mapserver.surfels.splat_file import Splats, splat_spz
-from mapserver.surfels.surfel_map import Surfels
 from support.storage.map_samples import save_sample_draft, save_surfel_draft, seen_wall, wall
 
 
@@ -42,46 +38,6 @@ def test_another_reader_finds_the_wall(run, site, tmp_path: Path) -> None:
     assert np.abs(rotations @ wanted).min() == pytest.approx(1.0, abs=1e-4)
 
 
-SPZ_FROM_MAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # right, up, back
-
-
-def test_another_reader_finds_the_wall_in_spz(run, site, tmp_path: Path) -> None:
-    run("map", "splats", *site, 2, tmp_path / "a.ply")
-    run("map", "splats", *site, 2, tmp_path / "a.spz")
-    assert 10 * (tmp_path / "a.spz").stat().st_size < (tmp_path / "a.ply").stat().st_size
-    vertices, read = PlyData.read(tmp_path / "a.ply")["vertex"], gsply.read_spz(tmp_path / "a.spz")
-    places = np.stack([vertices[axis] for axis in "xyz"], axis=1) @ SPZ_FROM_MAP.T
-    np.testing.assert_allclose(read.means, places, atol=2**-13 + 1e-6)
-    np.testing.assert_allclose(read.scales, np.stack([vertices[f"scale_{i}"] for i in range(3)], axis=1), atol=0.04)
-    np.testing.assert_allclose(read.sh0[:, 1], vertices["f_dc_1"], atol=0.02)
-    np.testing.assert_allclose(np.ravel(read.opacities), vertices["opacity"], atol=0.15)
-    normals = np.array([rotation_from_quat_wxyz(q / np.linalg.norm(q))[:, 2] for q in read.quats[:50].astype(float)])
-    np.testing.assert_allclose(normals, np.tile(SPZ_FROM_MAP @ [-1.0, 0.0, 0.0], (50, 1)), atol=0.02)
-
-
-def test_spz_of_any_direction_and_of_large_sites(tmp_path: Path) -> None:
-    """Every normal comes back, and coordinates have fewer bits where 12 do not fit."""
-    rng = np.random.default_rng(1)
-    normals = rng.normal(size=(200, 3)).astype(np.float32)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
-    for far_m, exact_m in ((100.0, 2**-13), (5000.0, 2**-11)):
-        points = rng.uniform(-far_m, far_m, (200, 3)).astype(np.float32)
-        surfels = Surfels(points, normals, *np.full((2, 200), 3, np.uint8))
-        (tmp_path / "b.spz").write_bytes(splat_spz(Splats.of(surfels)))
-        read = gsply.read_spz(tmp_path / "b.spz")
-        np.testing.assert_allclose(read.means, points.astype(float) @ SPZ_FROM_MAP.T, atol=exact_m + 1e-3 * far_m / 1e3)
-        quats = read.quats.astype(float) / np.linalg.norm(read.quats, axis=1, keepdims=True)
-        found = np.array([rotation_from_quat_wxyz(q)[:, 2] for q in quats])
-        assert (found * (normals @ SPZ_FROM_MAP.T)).sum(axis=1).min() > np.cos(np.radians(3.0))
-    none = Surfels.joined([])
-    (tmp_path / "none.spz").write_bytes(splat_spz(Splats.of(none)))
-    assert len(gsply.read_spz(tmp_path / "none.spz").means) == 0
-    far = Surfels(np.array([[1e7, 0, 0]], np.float32), normals[:1], *np.full((2, 1), 3, np.uint8))
-    with pytest.raises(UsageError, match="write a PLY"):
-        splat_spz(Splats.of(far))
-
-
 def test_what_changed_is_written_as_a_plan_and_as_geojson(run, site, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store") as store:
         for with_board in (False, True):
@@ -101,14 +57,14 @@ def test_what_changed_is_written_as_a_plan_and_as_geojson(run, site, tmp_path: P
 def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
     assert "surfel_map = true" in run("map", "splats", *site, 1, tmp_path / "a.ply", status=2)
     assert "has no version 7" in run("map", "splats", *site, 7, tmp_path / "a.ply", status=2)
-    assert "must end in .ply or .spz" in run("map", "splats", *site, 2, tmp_path / "a.obj", status=2)
+    assert "must end in .ply" in run("map", "splats", *site, 2, tmp_path / "a.obj", status=2)
     assert not list(tmp_path.glob("a.*"))
 
 
 def test_refinement_refuses_what_does_not_fit(run, site, tmp_path: Path) -> None:
     write_ride(tmp_path / "other.mcap", Ride(), SensorSet.STEREO)
     wanted = (*site, 2, tmp_path / "other.mcap")
-    assert "must end in .ply or .spz" in run("map", "refine", *wanted, tmp_path / "a.obj", status=2)
+    assert "must end in .ply" in run("map", "refine", *wanted, tmp_path / "a.obj", status=2)
     assert "is not of version 2" in run("map", "refine", *wanted, tmp_path / "a.ply", status=2)
     assert "surfel_map = true" in run("map", "refine", *site, 1, tmp_path / "other.mcap", tmp_path / "a.ply", status=2)
     assert not list(tmp_path.glob("a.*"))

@@ -17,7 +17,7 @@ from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
 from mapserver.drafting import worker as workers
-from mapserver.drafting.worker import Cluster, Threads, open_executor, open_side_thread, read_ahead
+from mapserver.drafting.worker import Cluster, Threads, open_executor, read_ahead
 from mapserver.store.archive import encode_archive
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
@@ -140,44 +140,3 @@ def test_reading_ahead_keeps_order_and_errors() -> None:
 def test_batches_keep_everything() -> None:
     assert in_batches([1, 2, 3, 4, 5], 2) == [[1, 2], [3, 4], [5]]
     assert in_batches([], 2) == []
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_work_beside_is_done_in_its_order_before_the_block_ends(threads: int) -> None:
-    done: list[tuple[int, bool]] = []
-    with open_side_thread(threads) as beside:
-        for n in range(5):
-            beside(lambda n=n: done.append((n, threading.current_thread() is threading.main_thread())))
-    assert done == [(n, threads == 1) for n in range(5)]
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_an_error_beside_is_raised_when_the_block_ends(threads: int) -> None:
-    """Not before: it would be taken for one of the recording that is surveyed meanwhile."""
-
-    def refuse() -> None:
-        raise UsageError("no")
-
-    reached = []
-    with pytest.raises(UsageError, match="no"), open_side_thread(threads) as beside:
-        beside(refuse)
-        beside(lambda: None)
-        reached.append(True)
-    assert reached
-
-
-def test_an_error_of_the_block_leaves_out_what_has_not_begun() -> None:
-    begun, may_end, done = threading.Event(), threading.Event(), []
-
-    def first() -> None:
-        begun.set()
-        may_end.wait(10.0)
-        done.append(1)
-
-    with pytest.raises(UsageError), open_side_thread(2) as beside:
-        beside(first)
-        beside(lambda: done.append(2))
-        begun.wait(10.0)
-        threading.Timer(0.2, may_end.set).start()
-        raise UsageError("the second recording cannot be read")
-    assert done == [1]

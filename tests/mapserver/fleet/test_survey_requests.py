@@ -12,7 +12,7 @@ from fleetmap.errors import StateError, UsageError
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
 from mapserver.cli import app
-from mapserver.drafting.layers import covered_requests
+from mapserver.drafting.draft import covered_requests
 from mapserver.fleet import survey_requests as requests
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
