@@ -29,14 +29,13 @@ from mapserver.survey.keyframes.connected_components import (
     Component,
     SigmaBetween,
     between_kept,
-    covisibility_of,
     find_components,
     find_groups,
     only_kept,
 )
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.loops.loops import LoopCloser, Loops
-from mapserver.survey.loops.sim3_loops import gate_covariances, rigid, solve_scaled
+from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.odometry_pass import run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
@@ -110,7 +109,7 @@ def _finished(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, 
     odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
-    components = find_components(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
+    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
     state, odometry, loops = only_kept(state, odometry, loops, components.kept)
     placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
     survey_map, culled = assemble(state, odometry, placed, settings)
@@ -184,7 +183,7 @@ def close_loops(
     marginals = GraphMarginals(state.map_from_body, known)
     if odometry.scale_known:
         learn_priors(marginals, inputs.priors, inputs.calibration.base_from_body, odometry)
-    groups = find_groups(covisibility_of(state), _sigmas_m(odometry), settings.join_sigma_m)
+    groups = find_groups(state, _sigmas_m(odometry), settings.join_sigma_m)
     closer = LoopCloser(
         _posed(odometry, state),
         config,
@@ -204,7 +203,7 @@ def close_loops(
         solved = optimize_pose_graph(closer.begin, [*chain, *loops.edges])
         return state.moved(solved.map_from_body), loops.without_outliers(solved.loop_weights)
     scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
-    state = state.moved(rigid(scaled))
+    state = state.moved(scaled.map_from_body)
     factors = odometry_factors(odometry, state.map_from_body)
     return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(scaled.loop_weights)
 

@@ -1,19 +1,19 @@
 """Bundle adjustment of a survey: assembling the problem, rounds with outliers removed in between, local windows."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
-from fleetmap.inertial import preintegrate
+from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Landmarks, RelativeTerm, SurveyState
+from mapserver.survey.state import RelativeTerm, SurveyState
 
 
 def bundle_rounds(
@@ -124,40 +124,20 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
     used[marks.obs_keyframe[rows]] = True
     used[max(first - 1, 0) : last + 1] = True
     relative = [term for k in np.flatnonzero(used).tolist() for term in index.relative.get(k, ())]
-    keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]].astype(np.int32)
-    landmark = np.searchsorted(touched, marks.obs_landmark[rows]).astype(np.int32)
-    seen = marks.obs_feature[rows], marks.obs_pixels[rows], marks.obs_sigma_px[rows]
+    keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]]
+    landmark = np.searchsorted(touched, marks.obs_landmark[rows])
     part = replace(
         state,
         stamps_ns=state.stamps_ns[used],
         map_from_body=state.map_from_body[used],
         motion=replace(motion, relative=relative).of(used),
-        landmarks=Landmarks(marks.points_map[touched], keyframe, landmark, *seen),
+        landmarks=marks.taken(rows, marks.points_map[touched], keyframe, landmark),
     )
     result = optimize(bundle_problem(part, settings, free[used]), settings.rough_bundle)
     part = apply_result(part, result)
     state.map_from_body[used], marks.points_map[touched] = part.map_from_body, part.landmarks.points_map
     motion.velocities_mps[used], motion.gyro_bias_radps[used] = part.motion.velocities_mps, part.motion.gyro_bias_radps
     motion.accel_bias_mps2[used] = part.motion.accel_bias_mps2
-
-
-def with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
-    """`state` with the used keyframes (K,) as they are in `part`."""
-    motion, own = state.motion, part.motion
-    motion = replace(
-        motion,
-        velocities_mps=_put(motion.velocities_mps, used, own.velocities_mps),
-        gyro_bias_radps=_put(motion.gyro_bias_radps, used, own.gyro_bias_radps),
-        accel_bias_mps2=_put(motion.accel_bias_mps2, used, own.accel_bias_mps2),
-    )
-    map_from_body = _put(state.map_from_body, used, part.map_from_body)
-    return replace(state, map_from_body=map_from_body, motion=motion)
-
-
-def _put(values: Array, chosen: NDArray[np.bool_], new: Array) -> Array:
-    values = values.copy()
-    values[chosen] = new
-    return values
 
 
 def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
@@ -184,20 +164,26 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
 
 
 def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.bool_] | None) -> InertialTerms:
-    motion = state.motion
+    motion, edges = state.motion, inertial_edges(state, settings, held)
+    return InertialTerms(motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2, edges, fixed=held)
+
+
+def inertial_edges(
+    state: SurveyState, settings: SurveySettings, held: NDArray[np.bool_] | None = None, first: int = 0
+) -> list[tuple[int, int, Preintegrated]]:
+    """The IMU between neighbouring keyframes, which are numbered from `first` on; not between two that are held, nor over pauses."""
+    motion, edges = state.motion, []
     assert motion.noise is not None
     noise = scaled_noise(motion.noise, settings)
-    offset_ns = int(motion.imu_minus_cam_s * 1e9)
-    edges = []
-    for k in range(len(state.stamps_ns) - 1):
-        if (held is not None and held[k] and held[k + 1]) or (motion.goes_on is not None and not motion.goes_on[k + 1]):
-            continue
-        start, end = int(state.stamps_ns[k]) + offset_ns, int(state.stamps_ns[k + 1]) + offset_ns
-        if is_pause(motion.imu.stamps_ns, start, end):
+    stamps_ns = state.stamps_ns + int(motion.imu_minus_cam_s * 1e9)
+    for k, (start, end) in enumerate(pairwise(stamps_ns.tolist())):
+        is_held = held is not None and held[k] and held[k + 1]
+        goes_on = motion.goes_on is None or motion.goes_on[k + 1]
+        if is_held or not goes_on or is_pause(motion.imu.stamps_ns, start, end):
             continue
         biases = motion.gyro_bias_radps[k], motion.accel_bias_mps2[k]
-        edges.append((k, k + 1, preintegrate(motion.imu, start, end, *biases, noise)))
-    return InertialTerms(motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2, edges, fixed=held)
+        edges.append((first + k, first + k + 1, preintegrate(motion.imu, start, end, *biases, noise)))
+    return edges
 
 
 def scaled_noise(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:

@@ -15,7 +15,6 @@ from fleetmap.geometry import Array
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.state import OdometryPass, SurveyState
-from mapserver.survey.survey_map import SurveyMap
 
 MIN_SHARED = 15  # landmarks, as many as a loop needs matches
 MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
@@ -24,19 +23,6 @@ _SURE_SIGMAS = 3.0
 _LARGEST = "the largest part"
 _APART = "nothing says for sure where it lies to the largest part; drive it again"
 _BLIND = "too little was seen to tie it to anything; drive it again, with light"
-
-
-@dataclass(frozen=True, slots=True)
-class Covisibility:
-    """Observations of a survey that is no map yet: K keyframes, N landmarks, numbers (M,) of both for each observation."""
-
-    keyframe_stamps_ns: NDArray[np.int64]
-    landmark_ids: NDArray[np.int64]
-    obs_keyframe: NDArray[np.int32]
-    obs_landmark: NDArray[np.int32]
-
-
-Observations = SurveyMap | Covisibility
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,33 +54,50 @@ class Components:
         return np.asarray(self.labels == next(n for n, component in enumerate(self.components) if component.kept))
 
 
-def find_components(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Components:
-    """The components of a finished survey; SurveyError where no keyframes are connected.
+def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Components:
+    """The components of an adjusted survey, in the order of time; SurveyError where no keyframes are connected.
 
     Keyframes are connected where they share landmarks, and where the last one that saw something and the next one that does
     are known to `join_sigma_m` of each other by odometry. Blind ones in between are then connected too; other blind ones
     are with the component before or after as long as three sigmas of the odometry are within that limit.
     """
-    seeing = _seeing(survey_map)
-    groups = np.unique(_grouped(survey_map, seeing, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
-    return _named(survey_map, groups.astype(np.int64), np.flatnonzero(seeing))
+    groups = np.unique(find_groups(state, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
+    seeing = np.flatnonzero(_seeing(state))
+    sizes, seeing_sizes = np.bincount(groups), np.bincount(groups[seeing])
+    real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
+    if not real:
+        raise SurveyError(
+            f"none of {len(groups)} keyframes shares {MIN_SHARED} landmarks with another; look at the recording with "
+            "`mapserver doctor`: dark, blurred, or too few frames?"
+        )
+    largest = max(real, key=lambda g: int(seeing_sizes[g]))
+    labels = np.full(len(groups), -1, np.int64)
+    for number, group in enumerate(real):
+        labels[groups == group] = number
+
+    def component(members: NDArray[np.int64], kept: bool, reason: str) -> Component:
+        start_s, end_s = (round(float(state.stamps_ns[k] - state.stamps_ns[0]) * 1e-9, 3) for k in members[[0, -1]])
+        return Component(start_s, end_s, len(members), kept, reason)
+
+    components = [
+        component(np.flatnonzero(labels == n), group == largest, _LARGEST if group == largest else _APART)
+        for n, group in enumerate(real)
+    ]
+    stray = np.flatnonzero(labels < 0)
+    runs = np.split(stray, np.flatnonzero(np.diff(stray) > 1) + 1)
+    return Components(labels, components, [component(run, False, _BLIND) for run in runs if len(run)])
 
 
-def find_groups(survey_map: Observations, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> KeyframeGroups:
+def find_groups(state: SurveyState, sigmas_m: "SigmaBetween", join_sigma_m: float) -> KeyframeGroups:
     """The same before loops are closed, where groups may be many and none is chosen."""
-    return _grouped(survey_map, _seeing(survey_map), odometry_sigmas_m, join_sigma_m)
-
-
-def _seeing(survey_map: Observations) -> NDArray[np.bool_]:
-    return np.bincount(survey_map.obs_keyframe, minlength=len(survey_map.keyframe_stamps_ns)) >= MIN_SEEN
-
-
-def _grouped(
-    survey_map: Observations, seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float
-) -> KeyframeGroups:
-    rows, columns = shared_landmarks(survey_map, MIN_SHARED)
+    rows, columns = _shared_landmarks(state, MIN_SHARED)
+    seeing = _seeing(state)
     joins = [*zip(rows.tolist(), columns.tolist(), strict=True), *bridges(seeing, sigmas_m, join_sigma_m)]
     return KeyframeGroups(joins, len(seeing))
+
+
+def _seeing(state: SurveyState) -> NDArray[np.bool_]:
+    return np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns)) >= MIN_SEEN
 
 
 def bridges(
@@ -126,12 +129,6 @@ class SigmaBetween:
         return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
 
 
-def covisibility_of(state: SurveyState) -> Covisibility:
-    """The observations of an adjusted survey."""
-    marks = state.landmarks
-    return Covisibility(state.stamps_ns, np.arange(len(marks.points_map)), marks.obs_keyframe, marks.obs_landmark)
-
-
 def only_kept(
     state: SurveyState, odometry: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
 ) -> tuple[SurveyState, OdometryPass, Loops]:
@@ -144,46 +141,14 @@ def only_kept(
     return state.of(kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
 
 
-def shared_landmarks(survey_map: Observations, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of keyframes, the older one first, that share so many landmarks."""
-    ones = np.ones(len(survey_map.obs_keyframe), np.int32)
-    shape = len(survey_map.keyframe_stamps_ns), len(survey_map.landmark_ids)
-    seen = csr_matrix((ones, (survey_map.obs_keyframe, survey_map.obs_landmark)), shape)
+    marks = state.landmarks
+    ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(state.stamps_ns), len(marks.points_map))
+    seen = csr_matrix((ones, (marks.obs_keyframe, marks.obs_landmark)), shape)
     shared = coo_matrix(seen @ seen.T)
     enough = (shared.data >= at_least) & (shared.row < shared.col)
     return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)
-
-
-def _named(survey_map: Observations, groups: NDArray[np.int64], seeing: NDArray[np.int64]) -> Components:
-    """Components of at least two keyframes, one of which sees something, in the order of time."""
-    sizes, seeing_sizes = np.bincount(groups), np.bincount(groups[seeing])
-    real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
-    if not real:
-        raise SurveyError(
-            f"none of {len(groups)} keyframes shares {MIN_SHARED} landmarks with another; look at the recording with "
-            "`mapserver doctor`: dark, blurred, or too few frames?"
-        )
-    largest = max(real, key=lambda g: int(seeing_sizes[g]))
-    labels = np.full(len(groups), -1, np.int64)
-    for number, group in enumerate(real):
-        labels[groups == group] = number
-    components = [
-        _component(survey_map, np.flatnonzero(labels == n), group == largest, _LARGEST if group == largest else _APART)
-        for n, group in enumerate(real)
-    ]
-    stray = [_component(survey_map, run, False, _BLIND) for run in _runs(np.flatnonzero(labels < 0))]
-    return Components(labels, components, stray)
-
-
-def _component(survey_map: Observations, members: NDArray[np.int64], kept: bool, reason: str) -> Component:
-    stamps_ns = survey_map.keyframe_stamps_ns
-    start_s, end_s = (round(float(stamps_ns[k] - stamps_ns[0]) * 1e-9, 3) for k in members[[0, -1]])
-    return Component(start_s, end_s, len(members), kept, reason)
-
-
-def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Numbers that follow each other without a gap, run by run."""
-    return [run for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1) if len(run)]
 
 
 def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -14,7 +14,6 @@ from mapserver.survey.bundle.bundle_rounds import (
     apply_result,
     bundle_problem,
     bundle_rounds,
-    with_keyframes_of,
 )
 from mapserver.survey.keyframes.revisit_thinning_kernels import TrackMembers, mark_repeated
 from mapserver.survey.settings import SurveySettings
@@ -79,8 +78,19 @@ def adjust_visits(
     part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
     numbers = np.flatnonzero(~redundant)
     seen = _seen_by(redundant, state.landmarks, part.landmarks, numbers)
-    state = _localize(replace(with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
+    state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
     return replace(state, landmarks=_together(part.landmarks, numbers, state.landmarks))
+
+
+def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
+    """`state` with the used keyframes (K,) as they are in `part`."""
+    motion = state.motion
+    map_from_body, velocities = state.map_from_body.copy(), motion.velocities_mps.copy()
+    gyro_bias, accel_bias = motion.gyro_bias_radps.copy(), motion.accel_bias_mps2.copy()
+    map_from_body[used], velocities[used] = part.map_from_body, part.motion.velocities_mps
+    gyro_bias[used], accel_bias[used] = part.motion.gyro_bias_radps, part.motion.accel_bias_mps2
+    motion = replace(motion, velocities_mps=velocities, gyro_bias_radps=gyro_bias, accel_bias_mps2=accel_bias)
+    return replace(state, map_from_body=map_from_body, motion=motion)
 
 
 def _seen_by(
@@ -89,16 +99,14 @@ def _seen_by(
     """What redundant keyframes observe of `adjusted`, which is left of `marks`; numbers: those of the adjusted keyframes in `marks`."""
     stride = int(marks.obs_feature.max(initial=0)) + 1
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
-    first = np.searchsorted(adjusted.obs_landmark, np.arange(len(adjusted.points_map)))
+    first = adjusted.firsts
     sought = numbers[adjusted.obs_keyframe[first]] * stride + adjusted.obs_feature[first]
     order = np.argsort(codes)
     found = order[np.searchsorted(codes, sought, sorter=order)]
     number = np.full(len(marks.points_map), -1, np.int32)
     number[marks.obs_landmark[found]] = np.arange(len(found))
     rows = np.flatnonzero(redundant[marks.obs_keyframe] & (number[marks.obs_landmark] >= 0))
-    keyframe, landmark = marks.obs_keyframe[rows], number[marks.obs_landmark[rows]]
-    seen = marks.obs_feature[rows], marks.obs_pixels[rows], marks.obs_sigma_px[rows]
-    return Landmarks(adjusted.points_map, keyframe, landmark, *seen)
+    return marks.taken(rows, adjusted.points_map, marks.obs_keyframe[rows], number[marks.obs_landmark[rows]])
 
 
 def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_]) -> SurveyState:
@@ -113,10 +121,7 @@ def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[n
 
 def _together(adjusted: Landmarks, numbers: NDArray[np.int64], placed: Landmarks) -> Landmarks:
     """The same landmarks with the observations of both; those that were adjusted first."""
-    landmark = np.concatenate([adjusted.obs_landmark, placed.obs_landmark])
-    order = np.argsort(landmark, kind="stable")
-    keyframes = np.concatenate([numbers[adjusted.obs_keyframe].astype(np.int32), placed.obs_keyframe])[order]
-    features = np.concatenate([adjusted.obs_feature, placed.obs_feature])[order]
-    pixels = np.concatenate([adjusted.obs_pixels, placed.obs_pixels])[order]
-    sigmas = np.concatenate([adjusted.obs_sigma_px, placed.obs_sigma_px])[order]
-    return Landmarks(adjusted.points_map, keyframes, landmark[order], features, pixels, sigmas)
+    adjusted = replace(adjusted, obs_keyframe=numbers[adjusted.obs_keyframe].astype(np.int32))
+    both = Landmarks.concatenated(adjusted.points_map, [adjusted, placed])
+    order = np.argsort(both.obs_landmark, kind="stable")
+    return both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])

@@ -21,8 +21,8 @@ from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBet
 from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe, joined_imu
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
-from mapserver.survey.loops.loops import CONTRADICTED, LoopCloser, LoopRecord, LoopVerdict, body_edge
-from mapserver.survey.loops.sim3_loops import gate_covariances, rigid, solve_scaled
+from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, body_edge
+from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 from mapserver.survey.state import Keyframe, KeyframeMotion, PosedKeyframes, RelativeTerm, SurveyState, survey_camera
@@ -59,8 +59,7 @@ class LiveMap:
         self._points_body: list[Array] = []  # of the landmarks whose reference each keyframe is
         self._step_covs: list[Array] = []
         self._chain: list[PoseEdge] = []
-        self._loops: list[PoseEdge] = []
-        self._believed: list[PoseEdge] = []
+        self._loop_weights = np.zeros(0)  # 1 believed, 0 not
         self._map_from_body = np.zeros((0, 4, 4))
         self._closer: LoopCloser | None = None
         self._marginals: GraphMarginals | None = None
@@ -86,41 +85,33 @@ class LiveMap:
 
     def loops(self) -> LiveLoops:
         """What became of revisits."""
-        refused: dict[str, int] = {}
-        for record in [] if self._closer is None else self._closer.loops.records:
+        found, refused, best = self._loops(), dict[str, int](), dict[int, LoopRecord]()
+        for record in found.records:
             if record.verdict is not LoopVerdict.ACCEPTED:
                 refused[record.verdict.value] = refused.get(record.verdict.value, 0) + 1 + len(record.also)
-        contradicted = len(self._loops) - len(self._believed)
-        if contradicted:
-            refused[LoopVerdict.REJECTED.value] = refused.get(LoopVerdict.REJECTED.value, 0) + contradicted
-        ends = np.array([(edge.i, edge.j) for edge in self._believed], np.int64).reshape(-1, 2)
-        return LiveLoops(ends, refused, self._newest())
-
-    def _newest(self) -> tuple[LiveRevisit, ...]:
-        best: dict[int, LoopRecord] = {}
-        for record in [] if self._closer is None else self._closer.loops.records:
             if record.inliers > (best[record.i].inliers if record.i in best else 0):
                 best[record.i] = record
-        believed = {(edge.i, edge.j) for edge in self._believed}
-        return tuple(
+        newest = tuple(
             LiveRevisit(
                 at_s=self._seconds(r.i),
                 seen_s=self._seconds(r.j),
-                verdict=r.verdict.value
-                if (r.i, r.j) in believed or r.verdict is not LoopVerdict.ACCEPTED
-                else "rejected",
-                words=r.reason[:200]
-                if (r.i, r.j) in believed or r.verdict is not LoopVerdict.ACCEPTED
-                else CONTRADICTED,
+                verdict=r.verdict.value,
+                words=r.reason[:200],
                 matches=r.inliers,
             )
             for _, r in sorted(best.items())[-_NEWEST:]
         )
+        ends = np.array([(edge.i, edge.j) for edge in found.edges], np.int64).reshape(-1, 2)
+        return LiveLoops(ends, refused, newest)
+
+    def _loops(self) -> Loops:
+        """All candidates so far, and the loops that the pose graph believes."""
+        return Loops() if self._closer is None else self._closer.loops.without_outliers(self._loop_weights)
 
     def parts(self) -> LiveParts:
         """What belongs together: by neighbours, by odometry, and by the loops that are believed."""
         whole = KeyframeGroups(enumerate(self._parts.labels().tolist()), len(self))
-        for edge in self._believed:
+        for edge in self._loops().edges:
             whole.join(edge.i, edge.j)
         firsts = whole.labels()
         seen = [p for p in np.unique(firsts[self._seeing]).tolist() if np.sum(firsts == p) > 1]
@@ -354,10 +345,12 @@ class LiveMap:
         posed = PosedKeyframes(self._keyframes, self._map_from_body, rig.body_from_cam, self._camera)
         matched = [(pair.i, pair.j) for pair in self._pairs if pair.j == newest]
         learned = [] if self._closer is None else self._closer.learned
-        marginals = GraphMarginals(self._map_from_body, [*self._known(), *learned])
+        scale_walk = self._settings.monocular.scale_walk
+        known = self._chain if rig.scale_known else gate_covariances(self._chain, scale_walk)
+        marginals = GraphMarginals(self._map_from_body, [*known, *learned])
         self._marginals = marginals
         if self._closer is None:
-            measures_scale = not self._rig.scale_known
+            measures_scale = not rig.scale_known
             self._closer = LoopCloser(
                 posed, self._options, marginals, matched, groups=self._joined, measures_scale=measures_scale
             )
@@ -366,22 +359,11 @@ class LiveMap:
             self._closer.grow(posed, marginals, matched)
         self._closer.close(newest)
         edges = self._closer.loops.edges
-        if len(edges) > len(self._loops):
-            self._loops = list(edges)
-            self._map_from_body, weights = self._solved(self._closer, edges)
-            self._believed = [e for e, w in zip(edges, weights, strict=True) if w >= 0.5]
-
-    def _known(self) -> list[PoseEdge]:
-        """The chain as the position gate must see it."""
-        if self._rig.scale_known:
-            return self._chain
-        return gate_covariances(self._chain, self._settings.monocular.scale_walk)
-
-    def _solved(self, closer: LoopCloser, edges: list[PoseEdge]) -> tuple[Array, Array]:
-        """(K, 4, 4) of the keyframes by chain and loops, and the loops' weights."""
-        if not self._rig.scale_known:
-            walk = self._settings.monocular.scale_walk
-            scaled = solve_scaled(closer.begin, self._chain, edges, closer.scales, walk)
-            return rigid(scaled), scaled.loop_weights
-        solved = optimize_pose_graph(closer.begin, [*self._chain, *edges])
-        return solved.map_from_body, solved.loop_weights
+        if len(edges) == len(self._loop_weights):
+            return
+        if rig.scale_known:
+            solved = optimize_pose_graph(self._closer.begin, [*self._chain, *edges])
+            self._map_from_body, self._loop_weights = solved.map_from_body, solved.loop_weights
+        else:
+            scaled = solve_scaled(self._closer.begin, self._chain, edges, self._closer.scales, scale_walk)
+            self._map_from_body, self._loop_weights = scaled.map_from_body, scaled.loop_weights

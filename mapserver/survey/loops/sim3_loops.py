@@ -4,12 +4,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, transform_points
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
-from mapserver.survey.pose_graph.sim3_pose_graph import (
-    Similarities,
-    SimilarityEdge,
-    SimilarityResult,
-    optimize_similarities,
-)
+from mapserver.survey.pose_graph.sim3_pose_graph import SimilarityEdge, SimilarityResult, optimize_similarities
 
 _MIN_SHARED = 8  # points with depth in both keyframes below which a loop says nothing about the scale
 _CORRELATION = 3.0  # depths of one keyframe share the errors of its neighbours
@@ -52,13 +47,13 @@ def solve_scaled(
     scales: dict[tuple[int, int], tuple[float, float]],
     scale_walk: float,
 ) -> SimilarityResult:
-    """The similarities (K,) of the bodies that agree best with chain and loops, each loop with its measured change of scale.
+    """The bodies that agree best with chain and loops, each loop with its measured change of scale.
 
-    `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. The result's translations are the places.
+    `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. Scales are in the distances between places.
     """
     edges = [_edge(edge, 0.0, scale_walk) for edge in chain]
     edges += [_edge(edge, *scales.get((edge.i, edge.j), (0.0, _UNKNOWN_SIGMA))) for edge in loops]
-    return optimize_similarities(Similarities.rigid(map_from_body), edges)
+    return optimize_similarities(map_from_body, edges)
 
 
 def _edge(edge: PoseEdge, log_scale: float, sigma: float) -> SimilarityEdge:
@@ -72,11 +67,3 @@ def _edge(edge: PoseEdge, log_scale: float, sigma: float) -> SimilarityEdge:
     i_from_j = edge.i_from_j.copy()
     i_from_j[:3, 3] *= scale
     return SimilarityEdge(edge.i, edge.j, i_from_j, scale, cov, edge.is_loop)
-
-
-def rigid(result: SimilarityResult) -> Array:
-    """map_from_body (K, 4, 4) of a result: places and directions; the scales are in the distances between the places."""
-    found = result.map_from_keyframe
-    placed = np.tile(np.eye(4), (len(found.scales), 1, 1))
-    placed[:, :3, :3], placed[:, :3, 3] = found.rotations, found.translations
-    return placed

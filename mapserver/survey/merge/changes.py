@@ -1,20 +1,26 @@
 """Changes of a map by a survey: keyframes and landmarks that moved, landmarks that stand elsewhere or are new."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, Rows, image_cells
 from mapserver.survey.finish.culling import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import JointSolution, free_observations
 from mapserver.survey.merge.landmark_persistence import Shift, shifts
-from mapserver.survey.merge.merge import Change, chosen, fewer_keyframes, joined, resighted
-from mapserver.survey.merge.new_landmarks import new_landmarks
+from mapserver.survey.merge.merge import Change
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
+from mapserver.survey.state import Keyframe, Landmarks
 
+_CELLS = COLUMNS * ROWS
+_MIN_IN_CELL = 3  # fewer confirmed landmarks do not show that the map lacks something there
+_LACKING_SHARE = 0.6
 _KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
 Mask = NDArray[np.bool_]
 
@@ -35,11 +41,14 @@ def what_changes(
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
-    fresh = new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
+    fresh = _new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
     fresh &= known_well(survey, joint, settings)
-    again = resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
-    new = chosen(marks, joint.own_points_map, fresh, free)
-    added = fewer_keyframes(joined(again, new), settings.sessions.min_confirmations)
+    again = _resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
+    own = free & fresh[marks.obs_landmark]
+    number = len(again.points_map) + np.cumsum(fresh) - 1
+    points_map = np.concatenate([again.points_map, joint.own_points_map[fresh]])
+    new = marks.taken(own, points_map, marks.obs_keyframe[own], number[marks.obs_landmark[own]])
+    added = fewer_keyframes(Landmarks.concatenated(points_map, [again, new]), settings.sessions.min_confirmations)
     rows = np.r_[judged.rows[alone], np.full(fresh.sum(), -1)]
     places = base.map.map_from_body.copy()
     places[moved_keyframes] = cameras[moved_keyframes] @ se3_inverse(base.map.body_from_cam)
@@ -82,3 +91,63 @@ def _moved_points(
     seen = joint.base_rows[moved[joint.base_rows]]
     points[seen] = joint.base_points_map[moved[joint.base_rows]]
     return points, moved
+
+
+def _new_landmarks(
+    base: BaseMap,
+    keyframes: Sequence[Keyframe],
+    marks: Landmarks,
+    joint: JointSolution,
+    free: NDArray[np.bool_],
+    settings: SessionSettings,
+) -> NDArray[np.bool_]:
+    """(N,) of the survey's own landmarks those that the map should gain; free (M,) are observations that show none of the map's.
+
+    A part of a picture (one of 48) is covered where landmarks of the map are seen in it, at least `covered_share` as many
+    as new ones; a landmark is new where most of the parts in which it is seen are not.
+    """
+    counts = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map))
+    confirmed = (counts >= settings.min_confirmations) & np.isfinite(joint.own_points_map).all(axis=1)
+    chosen = free & confirmed[marks.obs_landmark]
+    lacking = np.zeros(len(chosen), bool)
+    for k, (_, sighting) in enumerate(zip(keyframes, joint.sightings, strict=True)):
+        own = np.flatnonzero(chosen & (marks.obs_keyframe == k))
+        cells = image_cells(marks.obs_pixels[own, :2], base.camera)
+        fresh = np.bincount(cells, minlength=_CELLS)
+        known = np.zeros(_CELLS, np.int64)
+        if sighting is not None:
+            known = np.bincount(image_cells(sighting.pixels[:, :2], base.camera), minlength=_CELLS)
+        bare = (fresh >= _MIN_IN_CELL) & (known <= settings.covered_share * fresh)
+        lacking[own] = bare[cells] if sighting is not None else True
+    share = np.bincount(marks.obs_landmark[lacking], minlength=len(counts)) / np.maximum(counts, 1)
+    return np.asarray(confirmed & (share >= _LACKING_SHARE))
+
+
+def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence[Sighting | None]) -> Landmarks:
+    """Landmarks of the map as the new survey alone knows them: rows (R,) at points_map (R, 3) with their sightings."""
+    number = np.full(len(base.points_map), -1)
+    number[rows] = np.arange(len(rows))
+    seen = [(k, s.only(number[s.rows] >= 0)) for k, s in enumerate(sightings) if s is not None]
+    if not seen:
+        return Landmarks.empty()
+    keyframe = np.concatenate([np.full(len(s.rows), k, np.int32) for k, s in seen])
+    landmark = np.concatenate([number[s.rows] for _, s in seen]).astype(np.int32)
+    order = np.lexsort((keyframe, landmark))
+    features = np.concatenate([s.features for _, s in seen])[order]
+    pixels = np.concatenate([s.pixels for _, s in seen])[order]
+    sigmas_px = np.concatenate([s.sigmas_px for _, s in seen])[order]
+    return Landmarks(points_map, keyframe[order], landmark[order], features, pixels, sigmas_px)
+
+
+def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:
+    """The same landmarks with observations by fewer keyframes: taken in greedily until each has `enough`, or all it had."""
+    needed = np.minimum(np.bincount(marks.obs_landmark, minlength=len(marks.points_map)), enough)
+    taken: list[int] = []
+    left = np.unique(marks.obs_keyframe).tolist()
+    rows = {k: np.flatnonzero(marks.obs_keyframe == k) for k in left}
+    while needed.any():
+        best = max(left, key=lambda k: (int((needed[marks.obs_landmark[rows[k]]] > 0).sum()), -k))
+        needed[marks.obs_landmark[rows[best]]] = np.maximum(needed[marks.obs_landmark[rows[best]]] - 1, 0)
+        taken.append(best)
+        left.remove(best)
+    return marks.keep_observations(np.isin(marks.obs_keyframe, taken), 1)

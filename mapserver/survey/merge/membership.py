@@ -9,7 +9,7 @@ other way round or not at all, as like the map's as another building's.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -84,8 +84,16 @@ class SessionPlace:
     placed: Alignment
     believed: int
     seen: Confirmation
-    competitor_share: float | None
     priors_off_m: float | None
+    competitor_share: float | None = None
+
+    @property
+    def is_where_priors_say(self) -> bool:
+        return self.priors_off_m is not None and self.priors_off_m < _PRIOR_M
+
+    @property
+    def figures(self) -> str:
+        return f"of {self.seen.cells} parts of the map that it should see there it sees {self.seen.seen}"
 
 
 @dataclass(frozen=True)
@@ -103,31 +111,34 @@ class SessionKeyframes:
     body_from_cam: Array
     map_from_survey: Array | None = None
 
+    @property
+    def by_priors(self) -> Array | None:
+        """(K, 4, 4) map_from_body where position priors put the keyframes."""
+        return None if self.map_from_survey is None else self.map_from_survey @ self.survey_from_body
+
 
 class MembershipTest:
     """The test of one session in one map."""
 
     def __init__(
-        self,
-        relocalizer: Relocalizer,
-        firm: NDArray[np.bool_],
-        visit: SessionKeyframes,
-        settings: SessionSettings,
+        self, relocalizer: Relocalizer, firm: NDArray[np.bool_], session: SessionKeyframes, settings: SessionSettings
     ) -> None:
         """firm (N,): landmarks of the relocalizer's view that are expected to be found again."""
-        self._relocalizer, self._firm, self._visit, self._settings = relocalizer, firm, visit, settings
+        self._relocalizer, self._firm, self._session, self._settings = relocalizer, firm, session, settings
         self.tried = 0
 
     def locate(self) -> SessionPlace | Membership:
         """Where the session is, if fixes say so and nowhere else looks alike. The map's confirmation there is not judged yet."""
-        visit, settings = self._visit, self._settings
-        ks = self._chosen_keyframes(settings.fix_keyframes)
-        fixes = find_fixes(self._relocalizer, visit.keyframes, ks, visit.body_from_cam)
-        if visit.map_from_survey is not None:
-            expected = {k: visit.map_from_survey @ visit.survey_from_body[k] for k in ks}
-            fixes += fixes_around(self._relocalizer, visit.keyframes, expected, visit.body_from_cam)
+        session, settings, by_priors = self._session, self._settings, self._session.by_priors
+        ks = _spread(range(len(session.keyframes)), settings.fix_keyframes)
+        if by_priors is not None:  # as many again of those that priors put beside a place of the map
+            ks = sorted({*ks, *_spread(self._beside_the_map(by_priors), settings.fix_keyframes)})
+        fixes = find_fixes(self._relocalizer, session.keyframes, ks, session.body_from_cam)
+        if by_priors is not None:
+            expected = {k: by_priors[k] for k in ks}
+            fixes += fixes_around(self._relocalizer, session.keyframes, expected, session.body_from_cam)
         self.tried = len(ks)
-        found = alignments(fixes, visit.survey_from_body, GraphMarginals(visit.survey_from_body, visit.chain))
+        found = alignments(fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain))
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
         if not enough:
             most = found[0] if found else Alignment((), np.eye(4), 0)
@@ -138,34 +149,31 @@ class MembershipTest:
                 evidence=MembershipEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
             )
         # Where priors put it there may be few fixes: most of it is new, and a look-alike of what the map has has more.
-        ranked = sorted(enough, key=lambda placed: not self._is_where_priors_say(placed))
-        return self._chosen([self._located(placed) for placed in ranked[:_MOST_PLACES]])
-
-    def _chosen_keyframes(self, most: int) -> list[int]:
-        """Keyframes spread over the session, and as many again of those that position priors put beside a place of the map."""
-        visit = self._visit
-        spread = _spread(range(len(visit.keyframes)), most)
-        if visit.map_from_survey is None:
-            return spread
-        beside = self._beside_the_map(visit.map_from_survey @ visit.survey_from_body)
-        return sorted({*spread, *_spread(beside, most)})
+        places = []
+        for placed in sorted(enough, key=self._is_elsewhere_by_priors)[:_MOST_PLACES]:
+            map_from_body, believed = follow_fixes(placed, session.survey_from_body, session.chain)
+            apart_m = self._priors_off_m(placed, map_from_body)
+            priors_off_m = None if apart_m is None else round(apart_m, 2)
+            seen = self.confirmation(map_from_body)
+            places.append(SessionPlace(map_from_body, placed, believed, seen, priors_off_m))
+        return self._chosen(places)
 
     def _beside_the_map(self, map_from_body: Array) -> list[int]:
         """Keyframes at map_from_body (K, 4, 4) that look from beside a place of the map, its way."""
         places = self._relocalizer.view.map_from_cam
-        looking = map_from_body @ self._visit.body_from_cam
+        looking = map_from_body @ self._session.body_from_cam
         return [k for k, at in enumerate(looking) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
 
-    def _is_where_priors_say(self, placed: Alignment) -> bool:
-        visit = self._visit
-        if visit.map_from_survey is None:
-            return False
+    def _priors_off_m(self, placed: Alignment, map_from_body: Array) -> float | None:
+        """How far the keyframes with fixes are from where priors put them, at map_from_body (K, 4, 4); None without priors."""
+        if self._session.by_priors is None:
+            return None
         ks = [fix.k for fix in placed.fixes]
-        by_fixes, by_priors = (
-            placed.map_from_survey @ visit.survey_from_body[ks],
-            visit.map_from_survey @ visit.survey_from_body[ks],
-        )
-        return bool(np.median(np.linalg.norm((by_fixes - by_priors)[:, :3, 3], axis=1)) < _PRIOR_M)
+        return float(np.median(np.linalg.norm((map_from_body - self._session.by_priors)[ks, :3, 3], axis=1)))
+
+    def _is_elsewhere_by_priors(self, placed: Alignment) -> bool:
+        off_m = self._priors_off_m(placed, placed.map_from_survey @ self._session.survey_from_body)
+        return off_m is None or off_m >= _PRIOR_M
 
     def confirmation(self, map_from_body: Array) -> Confirmation:
         """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4).
@@ -173,22 +181,21 @@ class MembershipTest:
         Keyframes beside places of the map are asked: what an aisle's survey saw of the next one, through gaps in the racks, other goods
         hide from within that one. Without any of them all are asked, and few landmarks are expected.
         """
-        visit, view = self._visit, self._relocalizer.view
-        ks = _spread(self._beside_the_map(map_from_body) or range(len(visit.keyframes)), _MOST_LOOKS)
-        looks = [look(view, visit.camera, visit.keyframes[k], map_from_body[k] @ visit.body_from_cam) for k in ks]
+        session, view = self._session, self._relocalizer.view
+        ks = _spread(self._beside_the_map(map_from_body) or range(len(session.keyframes)), _MOST_LOOKS)
+        looks = [look(view, session.camera, session.keyframes[k], map_from_body[k] @ session.body_from_cam) for k in ks]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
     def evidence(self, located: SessionPlace, seen: Confirmation) -> MembershipEvidence:
         """The figures of a place at which the session sees so much of the map."""
-        placed, share, low, high = located.placed, *(round(value, 4) for value in (seen.share, seen.low, seen.high))
         return MembershipEvidence(
-            fixes=len(placed.fixes),
-            places=placed.places,
+            fixes=len(located.placed.fixes),
+            places=located.placed.places,
             cells_expected=seen.cells,
             cells_seen=seen.seen,
-            seen_share=share,
-            share_low=low,
-            share_high=high,
+            seen_share=round(seen.share, 4),
+            share_low=round(seen.low, 4),
+            share_high=round(seen.high, 4),
             error_rate=self._settings.join_error_rate,
             competitor_share=located.competitor_share,
             priors_off_m=located.priors_off_m,
@@ -198,35 +205,24 @@ class MembershipTest:
         """Why a session that sees so much of the map is not joined; None where it is."""
         if _speaks_for_itself(seen):
             return None
-        said = f"of {seen.cells} parts of the map that it should see there it sees {seen.seen}"
+        located = replace(located, seen=seen)
         evidence = self.evidence(located, seen)
         if not contradicts(seen):
             bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} for sure and half in all are needed"
             return Membership(
-                f"it is not certain that it belongs here: {said}, {bounds}; drive a longer way through places that are in the map, the "
-                "same way round",
+                f"it is not certain that it belongs here: {located.figures}, {bounds}; drive a longer way through places that are in the "
+                "map, the same way round",
                 evidence=evidence,
             )
-        said = f"{said}, at most {seen.high:.0%} where half is needed"
+        figures = f"{located.figures}, at most {seen.high:.0%} where half is needed"
         if located.priors_off_m is None:
             return Membership(
-                f"the place that is most like it is not its own: {said}; it was recorded elsewhere, or where or in a direction in which "
+                f"the place that is most like it is not its own: {figures}; it was recorded elsewhere, or where or in a direction in which "
                 "the map was not: drive past a dock, the same way round as the survey, or build it as another --site",
                 evidence=evidence,
             )
-        reason = f"it was recorded elsewhere, or all has changed: {said}; build it as another --site"
+        reason = f"it was recorded elsewhere, or all has changed: {figures}; build it as another --site"
         return Membership(reason, MembershipVerdict.FOREIGN, evidence)
-
-    def _located(self, placed: Alignment) -> SessionPlace:
-        visit = self._visit
-        map_from_body, believed = follow_fixes(placed, visit.survey_from_body, visit.chain)
-        off_m = None
-        if visit.map_from_survey is not None:
-            by_priors = visit.map_from_survey @ visit.survey_from_body
-            ks = [fix.k for fix in placed.fixes]
-            apart_m = np.linalg.norm((map_from_body - by_priors)[ks, :3, 3], axis=1)
-            off_m = round(float(np.median(apart_m)), 2)
-        return SessionPlace(map_from_body, placed, believed, self.confirmation(map_from_body), None, off_m)
 
     def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
         """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
@@ -235,35 +231,35 @@ class MembershipTest:
             one for n, one in enumerate(ranked) if not any(_same_place(one, other) for other in ranked[:n])
         ]
         alike = [best, *(one for one in others if one.seen.high >= max(_SHARED_SHARE, best.seen.low))]
-        near = [one for one in alike if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
+        near = [one for one in alike if one.is_where_priors_say]
         if not near:  # of a drive that adds new aisles its own place shows less than a look-alike elsewhere
-            near = [one for one in others if one.priors_off_m is not None and one.priors_off_m < _PRIOR_M]
-            near = [one for one in near if _speaks_for_itself(one.seen)]
+            near = [one for one in others if one.is_where_priors_say and _speaks_for_itself(one.seen)]
             alike = [best, *near] if len(near) == 1 else alike
+        chosen = near[0] if len(alike) > 1 and len(near) == 1 else best
         competitor_share = max((round(one.seen.share, 4) for one in others), default=None)
+        chosen = replace(chosen, competitor_share=competitor_share)
+        evidence = self.evidence(chosen, chosen.seen)
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
-            located = _with_competitor(best, competitor_share)
             return Membership(
                 f"{len(alike)} places of the map look alike to it: it sees {seen} parts of the map there; drive on to where they "
                 "differ, or past a dock",
-                evidence=self.evidence(located, located.seen),
+                evidence=evidence,
             )
-        chosen = _with_competitor(near[0] if len(alike) > 1 else best, competitor_share)
-        if chosen.priors_off_m is not None and chosen.priors_off_m >= _PRIOR_M:
-            if contradicts(chosen.seen):
-                return Membership(
-                    f"it was not found where its docks are, and the place that is most like it, {chosen.priors_off_m:.1f} m from there, is "
-                    f"not its own: of {chosen.seen.cells} parts of the map that it should see there it sees {chosen.seen.seen}; drive a "
-                    "longer way through places that are in the map, the same way round, or build it as another --site",
-                    evidence=self.evidence(chosen, chosen.seen),
-                )
+        if chosen.priors_off_m is None or chosen.is_where_priors_say:
+            return chosen
+        if contradicts(chosen.seen):
             return Membership(
-                f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
-                "them out",
-                evidence=self.evidence(chosen, chosen.seen),
+                f"it was not found where its docks are, and the place that is most like it, {chosen.priors_off_m:.1f} m from there, is "
+                f"not its own: {chosen.figures}; drive a longer way through places that are in the map, the same way round, or build it "
+                "as another --site",
+                evidence=evidence,
             )
-        return chosen
+        return Membership(
+            f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
+            "them out",
+            evidence=evidence,
+        )
 
 
 def _spread(keyframes: Sequence[int], most: int) -> list[int]:
@@ -272,19 +268,15 @@ def _spread(keyframes: Sequence[int], most: int) -> list[int]:
 
 
 def _speaks_for_itself(seen: Confirmation) -> bool:
-    """Whether more is seen, for sure, than another building would show, and half of the map or more."""
+    """True if more is seen, for sure, than another building would show, and half of the map or more."""
     return seen.blocks >= _MIN_BLOCKS and seen.low > _SHARED_SHARE and seen.share >= _REMAINING_SHARE
 
 
 def contradicts(seen: Confirmation) -> bool:
-    """Whether what was seen speaks, for sure, against the place."""
+    """True if the session's view speaks, for sure, against the place."""
     return seen.blocks >= _MIN_BLOCKS and seen.high < _REMAINING_SHARE
 
 
 def _same_place(one: SessionPlace, other: SessionPlace) -> bool:
     apart_m = np.linalg.norm((one.map_from_body - other.map_from_body)[:, :3, 3], axis=1)
     return bool(np.median(apart_m) < _SAME_PLACE_M)
-
-
-def _with_competitor(one: SessionPlace, competitor_share: float | None) -> SessionPlace:
-    return SessionPlace(one.map_from_body, one.placed, one.believed, one.seen, competitor_share, one.priors_off_m)

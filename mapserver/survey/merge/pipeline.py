@@ -1,19 +1,18 @@
 """Stages that make the next map of a survey and a map: found, adjusted together, compared, merged."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
-from mapserver.survey.merge.guided_matching import Sighting, keyframe_features, match_keyframe, session_relocalizer
-from mapserver.survey.merge.joint_adjustment import JointSolution, adjust_jointly
+from mapserver.survey.merge.guided_matching import keyframe_features, match_keyframe, session_relocalizer
+from mapserver.survey.merge.joint_adjustment import adjust_jointly
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.membership import (
     Membership,
@@ -22,7 +21,7 @@ from mapserver.survey.merge.membership import (
     SessionKeyframes,
     contradicts,
 )
-from mapserver.survey.merge.merge import SessionFrames, merged
+from mapserver.survey.merge.merge import merged
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap
@@ -75,37 +74,7 @@ def extend(
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
-    test = _join_test(base, survey, relocalizer, map_from_survey, settings)
-    located = test.locate()
-    if isinstance(located, Membership):
-        return located
-    refused = test.judged(located, located.seen)
-    if refused is not None and contradicts(located.seen):
-        return refused
-
-    def sightings(places_map_from_body: Array, radius_px: float) -> list[Sighting | None]:
-        return [
-            match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
-            for keyframe, place in zip(guess.keyframes, places_map_from_body, strict=True)
-        ]
-
-    found = sightings(located.map_from_body, settings.sessions.search_px)
-    joint = adjust_jointly(base, state, located.map_from_body, found, settings, anchored=anchored)
-    found = sightings(joint.map_from_body, settings.sessions.guided_px)
-    joint = adjust_jointly(base, state, joint.map_from_body, found, settings, anchored=anchored)
-    seen = test.confirmation(joint.map_from_body)
-    refused = test.judged(located, seen)
-    if refused is not None:
-        return refused
-    result, counts = _compare(base, survey, joint, settings, anchored, (test.tried, located.believed))
-    return Extension(result, counts, test.evidence(located, seen))
-
-
-def _join_test(
-    base: BaseMap, survey: Survey, relocalizer: Relocalizer, map_from_survey: Array | None, settings: SurveySettings
-) -> MembershipTest:
-    state, guess = survey.state, survey.odometry
-    visit = SessionKeyframes(
+    session = SessionKeyframes(
         keyframes=[keyframe_features(keyframe) for keyframe in guess.keyframes],
         survey_from_body=state.map_from_body,  # the survey's own frame, named `map` before there was another
         chain=[*chain_edges(guess, state), *survey.loops.edges],
@@ -114,41 +83,49 @@ def _join_test(
         map_from_survey=map_from_survey,
     )
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
-    return MembershipTest(relocalizer, firm, visit, settings.sessions)
-
-
-def _compare(
-    base: BaseMap,
-    survey: Survey,
-    joint: JointSolution,
-    settings: SurveySettings,
-    anchored: bool,
-    fixes: tuple[int, int],
-) -> tuple[SurveyMap, Counts]:
-    state, guess = survey.state, survey.odometry
-    map_from_cam = joint.map_from_body @ state.body_from_cam
-    seen = count_landmarks(base, guess.keyframes, map_from_cam, joint.sightings)
-    gone = faded(base, seen, settings) if anchored else np.zeros(len(base.points_map), bool)
+    test = MembershipTest(relocalizer, firm, session, settings.sessions)
+    located = test.locate()
+    if isinstance(located, Membership):
+        return located
+    refused = test.judged(located, located.seen)
+    if refused is not None and contradicts(located.seen):
+        return refused
+    map_from_body = located.map_from_body
+    for radius_px in (settings.sessions.search_px, settings.sessions.guided_px):
+        sightings = [
+            match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
+            for keyframe, place in zip(guess.keyframes, map_from_body, strict=True)
+        ]
+        joint = adjust_jointly(base, state, map_from_body, sightings, settings, anchored=anchored)
+        map_from_body = joint.map_from_body
+    seen = test.confirmation(map_from_body)
+    refused = test.judged(located, seen)
+    if refused is not None:
+        return refused
+    found = count_landmarks(base, guess.keyframes, map_from_body @ state.body_from_cam, joint.sightings)
+    gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
     # Between keyframes the survey's own frames were placed by what they saw; they follow the keyframes that moved.
     stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
-    numbers = [k.frame_index for k in guess.keyframes]
-    trajectory = Trajectory(stamps_ns, frame_trajectory(stamps_ns, survey_from_body, numbers, joint.map_from_body))
-    frames = SessionFrames(guess.keyframes, trajectory, survey.map.trajectory_estimated)
-    result = merged(base, change, seen, frames, settings.sessions.new_place_landmarks)
+    placed = frame_trajectory(stamps_ns, survey_from_body, guess.keyframe_frames, map_from_body)
+    result = replace(
+        merged(base, change, found, guess.keyframes, settings.sessions.new_place_landmarks),
+        trajectory=Trajectory(stamps_ns, placed),
+        trajectory_estimated=survey.map.trajectory_estimated,
+    )
     fresh = int((change.added_rows < 0).sum())
     counts = Counts(
-        fixes=fixes[0],
-        believed_fixes=fixes[1],
+        fixes=test.tried,
+        believed_fixes=located.believed,
         keyframes_in_map=sum(s is not None for s in joint.sightings),
         keyframes_added=len(np.unique(change.added.obs_keyframe)),
         keyframes_moved=moved_keyframes,
-        landmarks_expected=int((seen.expected > 0).sum()),
-        landmarks_seen=int((seen.seen > 0).sum()),
+        landmarks_expected=int((found.expected > 0).sum()),
+        landmarks_seen=int((found.seen > 0).sum()),
         landmarks_kept=len(result.landmark_ids) - fresh - moved_landmarks,
         landmarks_moved=moved_landmarks,
         landmarks_faded=int(gone.sum()),
         landmarks_added=fresh,
-        seen_rate=round(seen.rate, 4),
+        seen_rate=round(found.rate, 4),
     )
-    return result, counts
+    return Extension(result, counts, test.evidence(located, seen))

@@ -50,7 +50,7 @@ def _anneal(
     values = start
     for _ in range(_MAX_UPDATES):
         weights = truncated_weights(squared_residuals(loops, values), bound, control)
-        values = _improved(certain, loops, weights, values)
+        values = improved(certain, loops, weights, values, _STEPS)
         if (np.minimum(weights, 1.0 - weights) < _UNSURE).all() and control > 1.0:
             break
         control *= _GROWTH
@@ -70,9 +70,14 @@ def squared_residuals(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values)
     return 2.0 * np.array([loop.error(values) for loop in loops])
 
 
-def _improved(
-    certain: gtsam.NonlinearFactorGraph, loops: list[gtsam.NoiseModelFactor], weights: Array, values: gtsam.Values
+def improved(
+    certain: gtsam.NonlinearFactorGraph,
+    loops: list[gtsam.NoiseModelFactor],
+    weights: Array,
+    values: gtsam.Values,
+    steps: int,
 ) -> gtsam.Values:
+    """The values after so many steps of Levenberg-Marquardt in which each loop has its weight."""
     graph = gtsam.NonlinearFactorGraph(certain)
     for loop, weight in zip(loops, weights, strict=True):
         if weight >= 1.0 - _UNSURE:
@@ -84,5 +89,5 @@ def _improved(
             graph.push_back(loop.cloneWithNewNoiseModel(weaker))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
-    settings.setMaxIterations(_STEPS)
+    settings.setMaxIterations(steps)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()

@@ -11,7 +11,6 @@ from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.keyframes.connected_components import (
     SigmaBetween,
     between_kept,
-    covisibility_of,
     find_components,
     only_kept,
 )
@@ -70,7 +69,7 @@ BLIND = [range(0), range(0)]
 
 def test_an_unbroken_survey_is_one_part_and_stays_as_it_is() -> None:
     whole = survey(chain(0, 6))
-    found = find_components(covisibility_of(whole), sigmas([9.0] * 5), 0.1)
+    found = find_components(whole, sigmas([9.0] * 5), 0.1)
     assert [(p.kept, p.keyframes) for p in found.components] == [(True, 6)]
     assert not found.stray
     assert only_kept(whole, guessed(whole), Loops(), found.kept)[0] is whole
@@ -78,7 +77,7 @@ def test_an_unbroken_survey_is_one_part_and_stays_as_it_is() -> None:
 
 def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
     dark = survey(chain(0, 4) + BLIND + chain(1000, 6))
-    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    found = find_components(dark, sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
     assert [(p.start_s, p.end_s, p.kept) for p in found.components] == [(0.0, 3.0, False), (6.0, 11.0, True)]
     assert [(p.start_s, p.end_s, p.kept) for p in found.stray] == [(4.0, 5.0, False)]
     assert "left out: 4 keyframes from 0.0 to 3.0 s" in found.components[0].remark()
@@ -98,7 +97,7 @@ def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
 
 def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
     blink = survey(chain(0, 4) + BLIND + chain(1000, 6))
-    found = find_components(covisibility_of(blink), sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
+    found = find_components(blink, sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
     assert [(p.kept, p.keyframes) for p in found.components] == [(True, 12)]
     assert not found.stray
 
@@ -106,33 +105,31 @@ def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
 def test_what_leads_nowhere_is_taken_only_as_far_as_it_is_sure() -> None:
     """0.04 m is within the joining sigma of 0.1 m, three times that is not."""
     dark = survey(chain(0, 8) + BLIND + chain(1000, 4))
-    found = find_components(covisibility_of(dark), sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
+    found = find_components(dark, sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
     assert [(p.end_s, p.keyframes, p.kept) for p in found.components] == [(8.0, 9, True), (13.0, 4, False)]
     assert [(p.start_s, p.keyframes) for p in found.stray] == [(9.0, 1)]
 
 
 def test_the_largest_part_is_the_one_with_most_that_see() -> None:
     dark = survey(chain(0, 4) + BLIND * 3 + chain(1000, 3))
-    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
+    found = find_components(dark, sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
     assert [(p.keyframes, p.kept) for p in found.components] == [(4, True), (9, False)]
 
 
 def test_a_bridge_is_as_long_as_the_darkness_not_as_its_steps() -> None:
     """Each step alone would be sure enough."""
     dark = survey(chain(0, 4) + BLIND * 5 + chain(1000, 6))
-    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
+    found = find_components(dark, sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
     assert [p.kept for p in found.components] == [False, True]
 
 
 def test_a_loop_joins_what_darkness_parted() -> None:
     dark = survey(chain(0, 4) + BLIND + chain(1000, 6), loops=[(1, 9)])
-    found = find_components(covisibility_of(dark), sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
+    found = find_components(dark, sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
     assert [(p.kept, p.keyframes) for p in found.components] == [(True, 10)]
     assert [p.keyframes for p in found.stray] == [2]
 
 
 def test_nothing_that_hangs_together_is_refused() -> None:
     with pytest.raises(SurveyError, match="none of 3 keyframes"):
-        find_components(
-            covisibility_of(survey([range(0, 40), range(100, 140), range(200, 240)])), sigmas([1.0, 1.0]), 0.1
-        )
+        find_components(survey([range(0, 40), range(100, 140), range(200, 240)]), sigmas([1.0, 1.0]), 0.1)

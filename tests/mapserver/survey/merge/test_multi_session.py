@@ -11,9 +11,8 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
-from mapserver.survey.merge.changes import known_well
+from mapserver.survey.merge.changes import fewer_keyframes, known_well
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
-from mapserver.survey.merge.merge import fewer_keyframes
 from mapserver.survey.merge.multi_session import MapMerger, Session, chained
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
