@@ -90,15 +90,6 @@ def test_reduced_system(inertial: bool) -> None:
 
 
 @pytest.mark.parametrize("inertial", [False, True])
-def test_cost_is_half_the_sum_of_squares(inertial: bool) -> None:
-    problem = _problem(inertial=inertial)
-    count = len(problem.map_from_body)
-    plain = plain_residuals(problem, np.zeros((count, 6)), np.zeros((count, 9)), np.zeros((len(problem.points_map), 3)))
-    bundle = Bundle(problem, NO_ROBUSTNESS)
-    assert bundle.cost(bundle.state) == pytest.approx(0.5 * plain @ plain, rel=1e-4)
-
-
-@pytest.mark.parametrize("inertial", [False, True])
 def test_solvers_agree(inertial: bool) -> None:
     problem = _problem(inertial=inertial)
     bundle = Bundle(problem, NO_ROBUSTNESS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapserver.survey.bundle.bundle_rounds import ObservationIndex, bundle_rounds, local_windows
+from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
 from mapserver.survey.settings import NoiseSettings, SurveySettings
 from support.worlds.corridor_scene import neighbour_errors_m, scene
 
@@ -34,12 +34,6 @@ def test_outliers_are_dropped_and_hardly_anything_else() -> None:
     assert neighbour_errors_m(given).max() < 0.01
     counts = np.bincount(given.state.landmarks.obs_landmark, minlength=len(given.state.landmarks.points_map))
     assert counts.min() >= SurveySettings().min_observations
-
-
-def test_one_round_drops_nothing() -> None:
-    given = scene(6, 3, drift=0.01, outliers=0.05)
-    given.state = bundle_rounds(given.state, SurveySettings(), rounds=1)
-    assert len(given.state.landmarks.obs_landmark) == len(given.is_outlier)
 
 
 def test_a_lax_cut_keeps_what_a_strict_one_drops() -> None:
@@ -82,14 +76,3 @@ def test_a_survey_of_one_window_is_left_to_the_global_adjustment() -> None:
     start = given.state.map_from_body.copy()
     given.state = local_windows(given.state, SurveySettings(local_window=8))
     np.testing.assert_array_equal(given.state.map_from_body, start)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_index_finds_the_observations_that_masks_find(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    count = int(rng.integers(1, 60))
-    owners = rng.integers(0, count, int(rng.integers(0, 900))).astype(np.int32)
-    index = ObservationIndex.of(owners, count)
-    for size in {0, 1, count // 3, count}:
-        chosen = np.sort(rng.permutation(count)[:size]).astype(np.int64)
-        np.testing.assert_array_equal(index.of_all(chosen), np.flatnonzero(np.isin(owners, chosen)))

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from fleetmap.features.matching import packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 from mapserver.survey.finish.culling import cull, parallax_rad, redundant
+from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, medoids
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
 from support.worlds.session_scene import CAMERA, survey_state
@@ -104,3 +106,34 @@ def test_parallax_is_the_widest_angle_or_the_baselines() -> None:
             map_from_cam[state.landmarks.obs_keyframe[own], :3, 3] - state.landmarks.points_map[n], axis=1
         ).min()
         assert np.isclose(angles[n], max(widest, CAMERA.baseline_m / nearest), atol=1e-9)
+
+
+def test_the_medoid_is_the_nearest_to_all_others() -> None:
+    rng = np.random.default_rng(4)
+    rows = rng.integers(0, 256, (40, 32)).astype(np.uint8)
+    starts = np.array([0, 1, 4, 20, 40])
+    chosen = np.zeros(4, np.int64)
+    medoids(packed(rows), starts, chosen)
+    for n in range(4):
+        own = np.unpackbits(rows[starts[n] : starts[n + 1]], axis=1).astype(int)
+        total = np.abs(own[:, None] - own[None]).sum(axis=(1, 2))
+        assert chosen[n] == starts[n] + int(np.argmin(total))
+
+
+def test_only_what_could_be_one_landmark_is_a_duplicate() -> None:
+    """Five near pairs: alike; unlike; too far for their sigmas; seen side by side; alike again, the less observed one goes."""
+    rng = np.random.default_rng(5)
+    base = rng.integers(0, 256, (5, 32)).astype(np.uint8)
+    words = np.repeat(base, 2, axis=0)
+    words[3] = ~words[3]
+    points = np.repeat(10.0 * np.arange(5.0), 2)[:, None] * np.ones(3)
+    points[1::2] += 0.01
+    points[5] += 0.2
+    keyframes = [[0, 1], [2], [0, 1], [2], [0, 1], [2], [0, 1], [1, 2], [0], [2, 3]]
+    starts = np.cumsum([0, *(len(k) for k in keyframes)])
+    double = np.zeros(10, bool)
+    mark_duplicates(
+        np.arange(10).reshape(5, 2), points, np.full(10, 0.02), starts, np.concatenate(keyframes).astype(np.int32),
+        packed(words), 50, double,
+    )  # fmt: skip
+    assert np.flatnonzero(double).tolist() == [1, 8]

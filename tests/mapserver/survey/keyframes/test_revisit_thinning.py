@@ -1,7 +1,6 @@
 """Visits beyond enough take no part in the adjustment, and are placed as well as if they had."""
 
 from dataclasses import replace
-from itertools import groupby
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.settings import CullSettings, LoopSettings, SurveySettings
+from mapserver.survey.settings import CullSettings, SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
 from mapserver.survey.tracks.tracks import Tracks
 from support.worlds.bundle_scene import make_scene
@@ -95,44 +94,6 @@ def test_blind_keyframes_among_spare_ones_are_spare_too() -> None:
     )  # fmt: skip
     assert spare[95:98].all()
     assert not spare[:90].any()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_spare_keyframes_are_those_of_a_plain_twin(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    count = 60
-    who = [sorted(rng.choice(count, int(rng.integers(2, 30)), replace=False).tolist()) for _ in range(50)]
-    octaves = rng.integers(0, 4, count).tolist()
-    settings = SurveySettings(
-        loops=LoopSettings(min_gap_keyframes=int(rng.integers(2, 9)), alone_inliers=4),
-        cull=CullSettings(repeated_share=0.6, repeated_visits=int(rng.integers(1, 4))),
-    )
-    found = redundant_keyframes(tracks_seen_by(who), keyframes(octaves), settings)
-    np.testing.assert_array_equal(found, spare_by_hand(who, octaves, settings))
-    assert found.any()
-    assert not found.all()
-
-
-def spare_by_hand(who: list[list[int]], octaves: list[int], settings: SurveySettings) -> np.ndarray:
-    gap, gone = settings.loops.min_gap_keyframes, np.zeros(len(octaves), bool)
-    for k in range(len(octaves) - 1, 0, -1):
-        own, repeated = [members for members in who if k in members], 0
-        for members in own:
-            others = [m for m in members if not gone[m] and abs(m - k) > gap and octaves[m] <= octaves[k] + 1]
-            breaks = np.cumsum(np.diff(others, prepend=others[0]) > gap) if others else []
-            repeated += len(list(groupby(breaks))) >= settings.cull.repeated_visits
-        gone[k] = repeated >= max(settings.cull.repeated_share * len(own), settings.loops.alone_inliers)
-    while True:
-        left = [[m for m in members if not gone[m]] for members in who]
-        tied = [sum(k in members and len(members) > 1 for members in left) for k in range(len(gone))]
-        alone = [
-            k
-            for k in range(1, len(gone))
-            if not gone[k] and gone[k - 1 : k + 2].any() and tied[k] < settings.loops.alone_inliers
-        ]
-        if not alone:
-            return gone
-        gone[alone] = True
 
 
 def test_held_points_stay_and_keyframes_find_their_places_among_them() -> None:

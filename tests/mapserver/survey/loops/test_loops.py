@@ -3,6 +3,7 @@
 Keyframes 0-3 see a wall, 4-9 other things, 10-13 what 0-3 saw, pixel for pixel: a return, or the same aisle again.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -71,6 +72,28 @@ def closed(
     for k in range(len(whole)):
         closer.close(k)
     return closer.loops, map_from_body
+
+
+def looked(order: Sequence[int], path: Array, sigmas: Sequence[float], until: int) -> Loops:
+    """Loops of the first keyframes of a drive that sees rendered keyframes in an order, at places (K, 4, 4) that odometry believes.
+
+    sigmas: in metres, of each step.
+    """
+    keyframes, _, rectifier, vocabulary = seen()
+    whole = [replace(keyframes[k], frame_index=n) for n, k in enumerate(order)]
+    chain = [
+        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
+        for k, s in enumerate(sigmas)
+    ]
+    closer = LoopCloser(
+        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
+        SurveyConfig(SETTINGS, vocabulary, Zones()),
+        GraphMarginals(path, chain),
+        {(k, k + 1) for k in range(len(chain))},
+    )
+    for k in range(until):
+        closer.close(k)
+    return closer.loops
 
 
 def replace_loops(settings: SurveySettings, **changes: float) -> SurveySettings:
@@ -148,7 +171,7 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
 
     Only two keyframes see the second one: no step of the site is learnt of it.
     """
-    keyframes, places, rectifier, vocabulary = seen()
+    _, places, _, _ = seen()
     shift = np.array([0, 1.6, 0])
     moved = places[:2].copy()
     moved[:, :3, 3] += shift
@@ -156,26 +179,14 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
     between[:, :3, 3] += 0.5 * shift
     path = np.array([*places[:4], *places[4:10], *moved, *places[4:10], *between])
     order = [*range(10), *range(2), *range(4, 10), *range(4)]
-    whole = [replace(keyframes[k], frame_index=n) for n, k in enumerate(order)]
     sigmas = [0.005] * 11 + [0.5] * 10
-    chain = [
-        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
-        for k, s in enumerate(sigmas)
-    ]
-    closer = LoopCloser(
-        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
-        SurveyConfig(SETTINGS, vocabulary, Zones()),
-        GraphMarginals(path, chain),
-        {(k, k + 1) for k in range(len(chain))},
-    )
-    for k in range(19):
-        closer.close(k)
-    records = [r for r in closer.loops.records if r.i == 18 and r.j in (0, 10)]
+    loops = looked(order, path, sigmas, 19)
+    records = [r for r in loops.records if r.i == 18 and r.j in (0, 10)]
     assert {r.j for r in records} == {0, 10}
     assert {r.verdict for r in records} == {LoopVerdict.AMBIGUOUS}
     assert all("exclude each other" in r.reason for r in records)
-    assert not [e for e in closer.loops.edges if e.i == 18]
-    counts = closer.loops.counts()
+    assert not [e for e in loops.edges if e.i == 18]
+    counts = loops.counts()
     assert counts["rejected"] >= len(records)
 
 
@@ -185,28 +196,16 @@ def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(sigma_m:
 
     Only where the way there is known too well for that it is the first aisle.
     """
-    keyframes, places, rectifier, vocabulary = seen()
+    _, places, _, _ = seen()
     aside = np.array([0, 8.0, 0])
     path = np.array([*places, *places, *places[:4]])
     path[10:14, :3, 3] += aside
     path[20:, :3, 3] -= 0.25 * aside
-    whole = [replace(keyframes[n % 10], frame_index=n) for n in range(24)]
     sigmas = [0.005] * 19 + [sigma_m] + [0.005] * 3
-    chain = [
-        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
-        for k, s in enumerate(sigmas)
-    ]
-    closer = LoopCloser(
-        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
-        SurveyConfig(SETTINGS, vocabulary, Zones()),
-        GraphMarginals(path, chain),
-        {(k, k + 1) for k in range(len(chain))},
-    )
-    for k in range(21):
-        closer.close(k)
-    (record,) = (r for r in closer.loops.records if (r.i, r.j) == (20, 0))
+    loops = looked([n % 10 for n in range(24)], path, sigmas, 21)
+    (record,) = (r for r in loops.records if (r.i, r.j) == (20, 0))
     assert record.verdict is verdict
-    assert bool([e for e in closer.loops.edges if e.i == 20]) is (verdict is LoopVerdict.ACCEPTED)
+    assert bool([e for e in loops.edges if e.i == 20]) is (verdict is LoopVerdict.ACCEPTED)
 
 
 @pytest.mark.parametrize(("twins", "verdict"), [(4, LoopVerdict.AMBIGUOUS), (2, LoopVerdict.ACCEPTED)])
@@ -215,27 +214,15 @@ def test_a_step_of_the_site_is_learnt_where_it_is_seen_and_counts_everywhere(twi
 
     Two keyframes are not enough for it: one of them may have matched by chance.
     """
-    keyframes, places, rectifier, vocabulary = seen()
+    _, places, _, _ = seen()
     aside = np.array([0, 1.9, 0])
     path = np.array([*places, *places[:twins], *places[4:8]])
     path[10 : 10 + twins, :3, 3] += aside
     path[10 + twins :, :3, 3] += 0.4 * aside
     order = [*range(10), *range(twins), *range(4, 8)]
-    whole = [replace(keyframes[k], frame_index=n) for n, k in enumerate(order)]
     sigmas = [0.005] * (9 + twins) + [0.7] + [0.005] * 3
-    chain = [
-        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
-        for k, s in enumerate(sigmas)
-    ]
-    closer = LoopCloser(
-        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
-        SurveyConfig(SETTINGS, vocabulary, Zones()),
-        GraphMarginals(path, chain),
-        {(k, k + 1) for k in range(len(chain))},
-    )
-    for k in range(11 + twins):
-        closer.close(k)
-    (record,) = (r for r in closer.loops.records if (r.i, r.j) == (10 + twins, 4))
+    loops = looked(order, path, sigmas, 11 + twins)
+    (record,) = (r for r in loops.records if (r.i, r.j) == (10 + twins, 4))
     assert record.verdict is verdict
     if verdict is LoopVerdict.AMBIGUOUS:
         assert "1.90 m apart look the same" in record.reason

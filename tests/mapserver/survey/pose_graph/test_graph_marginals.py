@@ -1,13 +1,16 @@
 """Covariances of the pose graph against gtsam's marginals, and the loop gate's two tests against known truth."""
 
+import tracemalloc
+
 import gtsam
 import numpy as np
 import pytest
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inverse
+from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 from support.worlds.pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, make_drive, measured
 
 
@@ -40,11 +43,14 @@ def _gtsam_relative_cov(map_from_body: Array, edges: list[PoseEdge], i: int, j: 
 
 CHAIN = [(k, k + 1) for k in range(23)]
 RINGS = [(0, 20), (3, 17), (5, 6), (17, 3), (10, 22), (1, 23)]
+MANY = [
+    (k, (7 * k + 5) % 24) for k in range(24) if (7 * k + 5) % 24 != k
+]  # more anchors than there is room for at first
 TURNED = [(k + 1, k) if k % 3 else (k, k + 1) for k in range(23)]
 
 
 @pytest.mark.parametrize(
-    "pairs", [CHAIN, CHAIN + RINGS, TURNED, RINGS + TURNED], ids=["chain", "rings", "turned", "all"]
+    "pairs", [CHAIN, CHAIN + RINGS, TURNED, RINGS + TURNED + MANY], ids=["chain", "rings", "turned", "all"]
 )
 @pytest.mark.parametrize("is_loop", [False, True])
 def test_relative_covariances_are_gtsams(pairs: list[tuple[int, int]], is_loop: bool) -> None:
@@ -132,3 +138,77 @@ def test_reach_grows_with_uncertainty_and_never_rules_out_the_truth() -> None:
     wide, narrow = (GraphMarginals(drive.start, e).reachable(59, others, 2.0, 1e3) for e in (drive.edges, surer))
     assert (narrow <= wide).all()
     assert narrow.sum() < wide.sum()
+
+
+def test_memory_goes_with_the_measurements_and_an_answer_with_what_it_is_about() -> None:
+    rng, sizes, asked = np.random.default_rng(1), [], np.arange(100, 120)
+    for count in (200, 4000):
+        steps = np.tile(1e-4 * np.eye(6), (count - 1, 1, 1))
+        chain = ChainCovariance(np.concatenate([np.zeros((1, 6, 6)), np.cumsum(steps, axis=0)]))
+        for _ in range(20):
+            i, j = rng.choice(np.arange(1, count), 2, replace=False).tolist()
+            chain.measure(i, j, 1e-4 * np.eye(6))
+        tracemalloc.start()
+        chain.of_differences(30, asked)
+        sizes.append((chain._joint.nbytes, tracemalloc.get_traced_memory()[1]))
+        tracemalloc.stop()
+    assert sizes[0][0] == sizes[1][0]
+    assert sizes[1][1] < 1.1 * sizes[0][1]
+
+
+COUNT = 24
+CHAIN_COV = np.diag([2e-3**2] * 3 + [0.02**2] * 3)
+SURE_LOOP_COV = np.diag([1e-3**2] * 3 + [0.01**2] * 3)
+
+
+def drifting_circle(seed: int) -> tuple[Array, Array, list[PoseEdge]]:
+    """Truth (K, 4, 4) of one round, the same by odometry with noise, and the odometry's edges."""
+    rng = np.random.default_rng(seed)
+    step = se3_exp(np.array([0, 0, 2 * np.pi / COUNT, 0.5, 0, 0]))
+    true = [se3_exp(np.array([0.1, 0.2, 0.5, 40.0, -30.0, 2.0]))]
+    measured = [true[0]]
+    edges = []
+    for k in range(COUNT):
+        noisy = se3_exp(rng.normal(0, np.sqrt(np.diag(CHAIN_COV)))) @ step
+        edges.append(PoseEdge(k, k + 1, noisy, CHAIN_COV, is_loop=False))
+        true.append(true[-1] @ step)
+        measured.append(measured[-1] @ noisy)
+    return np.array(true), np.array(measured), edges
+
+
+def loop(true: Array, i: int, j: int) -> PoseEdge:
+    return PoseEdge(i, j, se3_inverse(true[i]) @ true[j], SURE_LOOP_COV, is_loop=True)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_loops_move_the_graph_to_the_optimum(seed: int) -> None:
+    true, measured, chain = drifting_circle(seed)
+    marginals = GraphMarginals(measured, chain)
+    np.testing.assert_allclose(marginals.map_from_body, measured, atol=1e-12)
+    loops = [loop(true, COUNT, 0), loop(true, COUNT - 1, 1)]
+    for edge in loops:
+        marginals.add(edge)
+    best = optimize_pose_graph(measured, [*chain, *loops], robust=False).map_from_body
+    found = marginals.map_from_body
+    found = best[0] @ se3_inverse(found[0]) @ found  # the marginals hold no keyframe fixed
+    correction_m = np.linalg.norm(best[:, :3, 3] - measured[:, :3, 3], axis=1).max()
+    assert correction_m > 0.05
+    assert np.linalg.norm(found[:, :3, 3] - best[:, :3, 3], axis=1).max() < 0.03 * correction_m
+    assert max(rotation_angle_rad(a[:3, :3].T @ b[:3, :3]) for a, b in zip(found, best, strict=True)) < 3e-4
+
+
+def test_after_a_loop_the_gate_is_around_the_true_place() -> None:
+    """Drift of several chain sigmas: the neighbouring true loop passes, one to where odometry was does not."""
+    true, measured, chain = drifting_circle(1)
+    pushed = se3_exp(np.array([0, 0, 0, 0.25, 0.15, 0.0]))  # two sigmas and more of the whole way
+    measured = np.array([*measured[:-2], measured[-2] @ pushed, measured[-1] @ pushed])
+    chain[-2] = PoseEdge(
+        COUNT - 2, COUNT - 1, se3_inverse(measured[-3]) @ measured[-2], np.diag([4e-6] * 3 + [0.01] * 3), is_loop=False
+    )
+    chain[-1] = PoseEdge(COUNT - 1, COUNT, se3_inverse(measured[-2]) @ measured[-1], CHAIN_COV, is_loop=False)
+    marginals = GraphMarginals(measured, chain)
+    first = loop(true, COUNT, 0)
+    assert marginals.innovation_squared(first) < CHI2_6_0999
+    marginals.add(first)
+    assert marginals.innovation_squared(loop(true, COUNT - 1, 1)) < CHI2_6_0999
+    assert marginals.innovation_squared(loop(measured, COUNT - 1, 1)) > CHI2_6_0999

@@ -104,34 +104,3 @@ def test_bad_graphs_are_refused_with_their_edge() -> None:
             optimize_pose_graph(drive.start, [*drive.edges[:5], spoiled, *drive.edges[6:]])
     with pytest.raises(SurveyError, match=r"keyframes \[41, 42"):
         optimize_pose_graph(drive.start, drive.edges[:40])
-
-
-_VERTEX = "VERTEX_SE3:QUAT {} 1 2 3 0 0 0 1"
-_EDGE = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 " + " ".join(["1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 4 0 0 4 0 4"])
-
-
-def test_g2o_ids_need_not_be_dense() -> None:
-    lines = [_VERTEX.format(7), _VERTEX.format(3), "", "FIX 3", _EDGE.format(3, 7)]
-    map_from_body, edges = parse_g2o("\n".join(lines))
-    assert map_from_body.shape == (2, 4, 4)
-    assert (edges[0].i, edges[0].j, edges[0].is_loop) == (0, 1, False)
-    with pytest.raises(SurveyError, match=r"vertices \[9\]"):
-        parse_g2o("\n".join([*lines, _EDGE.format(3, 9)]))
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "VERTEX_SE2 0 0 0 0",
-        "VERTEX_SE3:QUAT 3 1 2 3 0 0 0 1",
-        "VERTEX_SE3:QUAT 1 1 2 3 0 0 0",
-        "VERTEX_SE3:QUAT x 1 2 3 0 0 0 1",
-        "VERTEX_SE3:QUAT 4 1 2 nan 0 0 0 1",
-        "VERTEX_SE3:QUAT 4 1 2 3 0 0 0 0",
-        "EDGE_SE3:QUAT 0 1 2",
-        "VERTEX_SE3:QUAT",
-    ],
-)
-def test_bad_g2o_lines_are_named(line: str) -> None:
-    with pytest.raises(SurveyError, match="line 2"):
-        parse_g2o(_VERTEX.format(3) + "\n" + line)

@@ -1,9 +1,9 @@
-"""A loop that is surer than the drift that it closes is large."""
+"""Loops that are surer than the drift that they close is large, and those of a corridor's doppelganger that fooled the gate."""
 
 import numpy as np
 import pytest
 
-from studies import square
+from studies import doppelganger, square
 
 
 @pytest.mark.parametrize("loop_sigma_deg", [0.1, 0.01])
@@ -28,3 +28,17 @@ def test_the_end_of_the_open_square_is_the_closed_form() -> None:
 def test_similarities_take_up_the_scale_that_rigid_poses_cannot() -> None:
     assert square.scaled(with_scale=True)["rms_m"] < 0.01
     assert square.scaled(with_scale=False)["rms_m"] > 0.2
+
+
+SEED, DRIFT_DEG = 4, 0.3  # the first drive along B lies five standard deviations from A, and A is all that is mapped
+
+
+def test_wrong_loops_that_agree_outvote_the_odometry() -> None:
+    assert doppelganger.mapped("robust", DRIFT_DEG, SEED)[1] > 10
+    assert doppelganger.mapped("gate", DRIFT_DEG, SEED)[1] > 10
+
+
+def test_who_asks_for_the_next_corridor_believes_none() -> None:
+    _, wrong, right, there = doppelganger.mapped("gate and step", DRIFT_DEG, SEED)
+    assert wrong == 0
+    assert right > 0.9 * there

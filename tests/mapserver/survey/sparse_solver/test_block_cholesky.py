@@ -101,23 +101,9 @@ def test_refuses_unknowns_that_nothing_measures_and_numbers_that_are_none(bad: f
     assert problem.solve(np.ones(len(problem.matrix))) is None
 
 
-def test_same_numbers_give_the_same_bytes() -> None:
-    pairs = PATTERNS["at random"](np.random.default_rng(5))
-    rhs = np.ones(Problem(pairs, 5).sizes.sum())
-    solutions = [Problem(pairs, 5).solve(rhs) for _ in range(2)]
-    assert solutions[0] is not None
-    np.testing.assert_array_equal(solutions[0], solutions[1])
-
-
 def test_a_chain_fills_in_nothing() -> None:
     """Whatever number its nodes have: a chain's factor has no more blocks than the chain, but for zeros taken in on purpose."""
     numbers = np.random.default_rng(1).permutation(5000)
     pattern = BlockCholesky.of(np.full(5000, 6), np.stack([numbers[:-1], numbers[1:]], axis=1))
     assert pattern.size < 4 * 5000 * 2 * 36
     assert sorted(pattern.order) == list(range(30000))
-
-
-def test_pairs_that_are_not_coupled_have_no_place() -> None:
-    pattern = BlockCholesky.of(np.full(200, 6), np.zeros((0, 2)))
-    with pytest.raises(AssertionError):
-        pattern.places(np.array([199]), np.array([0]))
