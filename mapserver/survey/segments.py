@@ -370,11 +370,11 @@ def _in_turn(parts: Sequence[Array]) -> Array:
 
 def _joined_state(placed: Sequence[_Placed], odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     """Landmarks of all segments; what two have seen is two landmarks, until landmarks are made anew."""
-    velocities, poses, points, marks, number = [], [], [], [], 0
+    velocities, places, points, marks, number = [], [], [], [], 0
     for each in placed:
         own, turn = each.made.state, each.joined_from_map
         velocities.append(own.motion.velocities_mps @ turn[:3, :3].T)
-        poses.append(turn @ own.map_from_body)
+        places.append(turn @ own.map_from_body)
         points.append(own.landmarks.points_map @ turn[:3, :3].T + turn[:3, 3])
         seen_by = own.landmarks.obs_keyframe + np.int32(each.first_keyframe)
         owners = (own.landmarks.obs_landmark + number).astype(np.int32)
@@ -388,7 +388,7 @@ def _joined_state(placed: Sequence[_Placed], odometry: OdometryPass, inputs: Sur
         accel_bias_mps2=_in_turn([m.accel_bias_mps2 for m in motions]),
     )
     landmarks = Landmarks.concatenated(np.concatenate(points), marks)
-    state = replace(state, map_from_body=_in_turn(poses), motion=motion, landmarks=landmarks)
+    state = replace(state, map_from_body=_in_turn(places), motion=motion, landmarks=landmarks)
     if odometry.inertial:
         state = replace(state, motion=replace(motion, relative=blackout_factors(odometry, state)))
     return state
