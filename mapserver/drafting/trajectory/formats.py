@@ -11,7 +11,8 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray, Array, rotation_from_quat_wxyz, se3, se3_inverse
-from fleetmap.recordings.tum import parse_tum, read_text
+from fleetmap.recordings.files import read_text
+from fleetmap.recordings.tum import parse_tum
 from fleetmap.sensors.samples import Stamps
 
 _MOST_BYTES, _MOST_ROWS = 64 << 20, 500_000

@@ -110,14 +110,21 @@ def stamps_on_clock(
     Rows without stamps belong to all frames, or to the selected ones: UsageError where they are as many as neither. RecordingError for
     stamps of another clock.
     """
-    # The other system has read, and counted, the frames too that are damaged
-    clock, chosen = (
-        np.union1d(s, recording.damaged_ns) for s in (recording.frame_stamps_ns, recording.frame_stamps_ns[indices])
+    # The other system has read, and counted, the frames too that are damaged: of the selected ones those between them, and perhaps
+    # those next to them
+    frames, damaged = recording.frame_stamps_ns, recording.damaged_ns
+    clock, chosen = np.union1d(frames, damaged), frames[indices]
+    inner = np.union1d(chosen, damaged[(damaged > chosen[0]) & (damaged < chosen[-1])])
+    before_ns, after_ns = (
+        frames[frames < chosen[0]].max(initial=-(2**62)),
+        frames[frames > chosen[-1]].min(initial=2**62),
     )
+    chosen = np.union1d(chosen, damaged[(damaged > before_ns) & (damaged < after_ns)])
     count = len(rows.map_from_it)
     if rows.stamps_ns is None:
-        if count in (len(clock), len(chosen)):
-            return clock if count == len(clock) else chosen
+        for counted in (clock, chosen, inner):
+            if count == len(counted):
+                return counted
         raise UsageError(
             f"{other.file} has {count} poses without stamps, {recording.name} has {len(clock)} frames, of which {len(chosen)} are "
             "selected; select those that the poses belong to with --frames, or pass a file with stamps"

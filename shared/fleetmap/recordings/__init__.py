@@ -12,11 +12,11 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import video
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
+from fleetmap.recordings.files import what_file_instead
 from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, named_topics
-from fleetmap.recordings.strange_files import what_file_instead
 from fleetmap.sensors.source_settings import Topics
 
 __all__ = [

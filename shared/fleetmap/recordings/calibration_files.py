@@ -27,12 +27,12 @@ import yaml
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.recordings.strange_files import what_file_instead
+from fleetmap.recordings.files import read_text
+from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-MAX_CALIBRATION_BYTES = 1 << 20  # a camchain of two cameras has 2 kB
 _MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 20_000
 _WORDS = reprlib.Repr()
 _WORDS.maxlevel = 2
@@ -363,18 +363,8 @@ def _brief(value: object) -> str:
 
 
 def _read(path: Path) -> str:
-    if fault := what_file_instead(path):
-        raise CalibrationError(f"calibration file {path} is {fault}")
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_CALIBRATION_BYTES + 1)
-        return data.decode("utf-8-sig")
-    except OSError as error:
-        raise CalibrationError(f"calibration file {path} cannot be read ({error.strerror}); check the path") from error
-    except UnicodeDecodeError as error:
-        raise CalibrationError(
-            f"calibration file {path} cannot be read: byte {error.start} is no text; a Kalibr camchain (YAML) is expected"
-        ) from error
+    expected = "a Kalibr camchain (YAML) is expected"
+    return read_text(path, expected, most_bytes=MAX_CALIBRATION_BYTES, error_type=CalibrationError)
 
 
 def _parse_yaml(text: str, where: str) -> Values:

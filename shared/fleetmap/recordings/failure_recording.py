@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import MAX_FILE_BYTES
-from fleetmap.recordings.mcap.scan import McapScan
+from fleetmap.recordings.mcap.reader import McapFile
 
 SUMMARY, LOCALIZER = "failure.msgpack", "localizer.msgpack.zst"
 
@@ -28,21 +28,22 @@ def attachments_of(path: Path) -> dict[str, bytes]:
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise RecordingError(f"{path} has {size} bytes; a failure's recording has at most {MAX_FILE_BYTES}")
-    scan = _scanned(path)
-    damage = scan.damage.all()
-    if damage:
-        raise RecordingError(f"{path} is damaged: {damage[0].what} {damage[0].detail}; fetch it again")
-    missing = [name for name in (SUMMARY, LOCALIZER) if name not in scan.attachments]
+    scanned = _scanned(path)
+    if scanned.issues:
+        raise RecordingError(f"{path} is damaged: {scanned.issues[0].what} {scanned.issues[0].detail}; fetch it again")
+    missing = [name for name in (SUMMARY, LOCALIZER) if name not in scanned.attachments]
     if missing:
         raise RecordingError(
             f"{path} is no failure's recording: {missing[0]} is missing; `locclient replay` plays others"
         )
-    return {name: scan.attachments[name] for name in (SUMMARY, LOCALIZER)}
+    return {name: scanned.attachments[name] for name in (SUMMARY, LOCALIZER)}
 
 
-def _scanned(path: Path) -> McapScan:
-    with path.open("rb") as file:
-        scan = McapScan(path, file)
-        for _ in scan.messages():
+def _scanned(path: Path) -> McapFile:
+    file = McapFile(path)
+    try:
+        for _ in file.messages():
             pass
-    return scan
+    finally:
+        file.close()
+    return file

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic
-from fleetmap.recordings.ordering import ReadLog, check_together
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
@@ -20,6 +20,134 @@ _TRIED_FRAMES = 5
 _ACCEL_IN_G = (0.8, 1.25)
 _FASTEST_GYRO_RADPS = 35.0  # 2000 deg/s, the full scale of the usual sensors
 _WINDOW_S, _SMOOTH_S = 0.5, 0.1
+
+
+@dataclass(frozen=True)
+class RecordingParts:
+    """The parts that a format has read; `finalize` makes a Recording of them. The name is the path's unless given."""
+
+    path: Path
+    format: str
+    calibration: RigCalibration
+    frame_stamps_ns: Stamps
+    frames: FrameSource
+    has_right: bool = False
+    has_depth: bool = False
+    name: str = ""
+    imu: ImuSamples = field(default_factory=ImuSamples.empty)
+    wheel: tuple[WheelSample, ...] = ()
+    priors: tuple[PositionPrior, ...] = ()
+    ground_truth: Trajectory | None = None
+
+
+def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
+    """The calibration that the caller asked for, None where the recording's own shall be used."""
+    if options.calibration_file is None:
+        return None
+    log.files.append(options.calibration_file)
+    return load_calibration(options.calibration_file)
+
+
+def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
+    """The Recording of `parts`, with the issues of `log`.
+
+    RecordingError for no frame, for units that cannot be right and for a first image that contradicts the calibration;
+    CalibrationError for too few cameras in the calibration.
+    """
+    if len(parts.frame_stamps_ns) == 0:
+        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in log.issues)
+        raise RecordingError(f"{parts.path}: no frame is complete; {issues or 'the recording is empty'}")
+    cameras, count = parts.calibration.cameras, 2 if parts.has_right else 1
+    if len(cameras) < count:
+        raise CalibrationError(
+            f"{parts.path}: {count} cameras are recorded, the calibration describes {len(cameras)}; "
+            "pass one that has all with --calibration FILE"
+        )
+    if len(cameras) > count and not parts.has_depth:
+        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {count}")
+    imu, wheel, truth = parts.imu, parts.wheel, parts.ground_truth
+    check_together(imu.stamps_ns, "imu", parts.frame_stamps_ns)
+    for what, values in (("wheel odometry", wheel), ("position priors", parts.priors)):
+        check_together(np.array([value.stamp_ns for value in values], np.int64), what, parts.frame_stamps_ns)
+    if truth is not None:
+        check_together(truth.stamps_ns, "ground truth", parts.frame_stamps_ns)
+    if len(imu) and parts.calibration.imu is None:
+        how = "no calibration says how the IMU is mounted; pass one with --calibration FILE"
+        log.note("imu not used", f"{len(imu)} samples, but {how}")
+        imu = ImuSamples.empty()
+    if wheel and (fault := parts.calibration.wheels_fault):
+        log.note("wheels not used", f"{len(wheel)} samples, but {fault}")
+        wheel = ()
+    check_imu_units(imu, str(parts.path))
+    recording = Recording(
+        path=parts.path,
+        name=parts.name or parts.path.resolve().name,
+        format=parts.format,
+        sensor_set=_sensor_set(parts, imu),
+        calibration=RigCalibration(
+            cameras[:count],
+            parts.calibration.imu if len(imu) else None,
+            parts.calibration.base_from_body,
+            parts.calibration.assumed,
+        ),
+        frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
+        imu=imu,
+        frames=parts.frames,
+        wheel=wheel,
+        priors=parts.priors,
+        ground_truth=truth,
+        damaged_ns=_damaged_moments(log.damaged_ns, parts.frame_stamps_ns),
+    )
+    if isinstance(parts.frames, SeriesFrames) and (bits := _grey_bits(parts.frames)) < 16:
+        log.note(f"{bits} bits in 16", f"no value of the images is above {2**bits - 1}; they are used as {bits} bits")
+        parts.frames.grey_bits = bits
+    if is_mosaic(_first_frame(recording).left):
+        log.note("Bayer pattern", "a mosaic of colours remains in the left images; record them with its right encoding")
+    return replace(recording, issues=tuple(log.issues))
+
+
+def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:
+    if parts.has_depth:
+        return SensorSet.RGBD
+    if parts.has_right:
+        return SensorSet.STEREO_INERTIAL if len(imu) else SensorSet.STEREO
+    return SensorSet.MONO_INERTIAL if len(imu) else SensorSet.MONO
+
+
+def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
+    """(D,) one stamp for each moment of which an image is damaged and that is no frame: of a pair both may be."""
+    moments: list[int] = []
+    for stamp_ns in sorted(damaged_ns):
+        if np.abs(frame_stamps_ns - stamp_ns).min() > 0 and (not moments or stamp_ns - moments[-1] > PAIR_TOLERANCE_NS):
+            moments.append(stamp_ns)
+    return np.array(moments, np.int64)
+
+
+def _first_frame(recording: Recording) -> CameraFrame:
+    """The first frame that can be decoded, of a few; RecordingError of the first where none can."""
+    fault: RecordingError | None = None
+    for index in range(min(_TRIED_FRAMES, len(recording))):
+        try:
+            return recording.read_frame(index)
+        except RecordingError as error:
+            fault = fault or error
+    assert fault is not None
+    raise fault
+
+
+def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]
+    """How many bits of left images of 16 the sensor uses, by a few of them: drivers put 10 and 12 bits into the lower ones."""
+    peak = 0
+    for index in sorted({round(share * (len(frames.left) - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
+        try:
+            image = frames.reader.read(frames.left.sources[index], int(frames.left.stamps_ns[index]))
+            peak = max(peak, grey_peak(image))
+        except RecordingError:
+            continue
+    return grey_bits(peak)
+
+
+# ------------------------------------------------------------------------------------------------------- units of the IMU
 
 
 def check_imu_units(imu: ImuSamples, where: str) -> None:
@@ -46,6 +174,14 @@ def check_imu_units(imu: ImuSamples, where: str) -> None:
         )
 
 
+def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
+    as_radians = gravity_direction_errors_rad(imu, 1.0)
+    if len(as_radians) < 4 or np.median(as_radians) < np.radians(10):
+        return False
+    as_degrees = gravity_direction_errors_rad(imu, np.pi / 180)
+    return bool(np.median(as_radians) > 4 * np.median(as_degrees))
+
+
 def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
     """(K,) angle between the specific force that the gyro times `gyro_scale` predicts and the measured one.
 
@@ -63,19 +199,12 @@ def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
     starts = np.arange(smooth, len(imu) - window - smooth, window)
     starts = starts[usable[starts] & usable[starts + window]]
     starts = starts[imu.stamps_ns[starts + window] - imu.stamps_ns[starts] < 1.5e9 * _WINDOW_S]
-    predicted = accel[starts]
+    predicted, measured = accel[starts], accel[starts + window]
     for step in range(window):
         steps_s = (imu.stamps_ns[starts + step + 1] - imu.stamps_ns[starts + step]) * 1e-9
         predicted = _turned(predicted, -gyro_scale * steps_s[:, None] * imu.gyro_radps[starts + step])
-    return _angles_rad(predicted, accel[starts + window])
-
-
-def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
-    as_radians = gravity_direction_errors_rad(imu, 1.0)
-    if len(as_radians) < 4 or np.median(as_radians) < np.radians(10):
-        return False
-    as_degrees = gravity_direction_errors_rad(imu, np.pi / 180)
-    return bool(np.median(as_radians) > 4 * np.median(as_degrees))
+    norms = np.linalg.norm(predicted, axis=1) * np.linalg.norm(measured, axis=1)
+    return np.asarray(np.arccos(np.clip((predicted * measured).sum(axis=1) / norms, -1, 1)))
 
 
 def _turned(vectors: Array, rotvecs_rad: Array) -> Array:
@@ -84,125 +213,3 @@ def _turned(vectors: Array, rotvecs_rad: Array) -> Array:
     axes = rotvecs_rad / np.maximum(angles, 1e-300)
     along = axes * (axes * vectors).sum(axis=1, keepdims=True)
     return np.asarray(along + np.cos(angles) * (vectors - along) + np.sin(angles) * np.cross(axes, vectors))
-
-
-def _angles_rad(first: Array, second: Array) -> Array:
-    norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
-    return np.asarray(np.arccos(np.clip((first * second).sum(axis=1) / norms, -1, 1)))
-
-
-@dataclass(frozen=True)
-class RecordingParts:
-    """The parts that a format has read; `finalize` makes a Recording of them. The name is the path's unless given."""
-
-    path: Path
-    format: str
-    calibration: RigCalibration
-    frame_stamps_ns: Stamps
-    frames: FrameSource
-    has_right: bool = False
-    has_depth: bool = False
-    name: str = ""
-    imu: ImuSamples = field(default_factory=ImuSamples.empty)
-    wheel: tuple[WheelSample, ...] = ()
-    priors: tuple[PositionPrior, ...] = ()
-    ground_truth: Trajectory | None = None
-
-
-def calibration_of_options(options: OpenOptions) -> CalibrationFile | None:
-    """The calibration that the caller asked for, None where the recording's own shall be used."""
-    return None if options.calibration_file is None else load_calibration(options.calibration_file)
-
-
-def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
-    """The Recording of `parts`, with the issues of `log`.
-
-    RecordingError for no frame, for units that cannot be right and for a first image that contradicts the calibration;
-    CalibrationError for too few cameras in the calibration.
-    """
-    if len(parts.frame_stamps_ns) == 0:
-        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in log.issues)
-        raise RecordingError(f"{parts.path}: no frame is complete; {issues or 'the recording is empty'}")
-    cameras, count = parts.calibration.cameras, 2 if parts.has_right else 1
-    if len(cameras) < count:
-        raise CalibrationError(
-            f"{parts.path}: {count} cameras are recorded, the calibration describes {len(cameras)}; "
-            "pass one that has all with --calibration FILE"
-        )
-    if len(cameras) > count and not parts.has_depth:
-        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {count}")
-    wheel_ns, prior_ns = (np.array([v.stamp_ns for v in values], np.int64) for values in (parts.wheel, parts.priors))
-    truth_ns = np.zeros(0, np.int64) if parts.ground_truth is None else parts.ground_truth.stamps_ns
-    streams = {
-        "imu": parts.imu.stamps_ns,
-        "wheel odometry": wheel_ns,
-        "position priors": prior_ns,
-        "ground truth": truth_ns,
-    }
-    for what, stamps_ns in streams.items():
-        check_together(stamps_ns, what, parts.frame_stamps_ns)
-    imu = parts.imu
-    if len(imu) and parts.calibration.imu is None:
-        how = "no calibration says how the IMU is mounted; pass one with --calibration FILE"
-        log.note("imu not used", f"{len(imu)} samples, but {how}")
-        imu = ImuSamples.empty()
-    wheel = parts.wheel
-    if wheel and (fault := parts.calibration.wheels_fault):
-        log.note("wheels not used", f"{len(wheel)} samples, but {fault}")
-        wheel = ()
-    check_imu_units(imu, str(parts.path))
-    recording = Recording(
-        path=parts.path,
-        name=parts.name or parts.path.resolve().name,
-        format=parts.format,
-        sensor_set=_sensor_set(parts, imu),
-        calibration=RigCalibration(
-            cameras[:count],
-            parts.calibration.imu if len(imu) else None,
-            parts.calibration.base_from_body,
-            parts.calibration.assumed,
-        ),
-        frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
-        imu=imu,
-        frames=parts.frames,
-        wheel=wheel,
-        priors=parts.priors,
-        ground_truth=parts.ground_truth,
-    )
-    if isinstance(parts.frames, SeriesFrames) and (bits := _grey_bits(parts.frames, len(recording))) < 16:
-        log.note(f"{bits} bits in 16", f"no value of the images is above {2**bits - 1}; they are used as {bits} bits")
-        parts.frames.grey_bits = bits
-    if is_mosaic(_first_frame(recording).left):
-        log.note("Bayer pattern", "a mosaic of colours remains in the left images; record them with its right encoding")
-    return replace(recording, issues=tuple(log.issues))
-
-
-def _first_frame(recording: Recording) -> CameraFrame:
-    """The first frame that can be decoded, of a few; RecordingError of the first where none can."""
-    fault: RecordingError | None = None
-    for index in range(min(_TRIED_FRAMES, len(recording))):
-        try:
-            return recording.read_frame(index)
-        except RecordingError as error:
-            fault = fault or error
-    assert fault is not None
-    raise fault
-
-
-def _grey_bits(frames: FrameSource, count: int) -> int:
-    """How many bits of images of 16 the sensor uses, by a few of them: drivers put 10 and 12 bits into the lower ones."""
-    peaks = []
-    for index in sorted({round(share * (count - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
-        try:
-            peaks.append(grey_peak(frames.stored(index).left))
-        except RecordingError:
-            continue
-    return grey_bits(max(peaks, default=0))
-
-
-def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:
-    if parts.has_depth:
-        return SensorSet.RGBD
-    if parts.has_right:
-        return SensorSet.STEREO_INERTIAL if len(imu) else SensorSet.STEREO
-    return SensorSet.MONO_INERTIAL if len(imu) else SensorSet.MONO

@@ -1,19 +1,19 @@
 """Images of each camera by their stamps, paired to frames and read one frame at a time."""
 
-from collections.abc import Callable
+import hashlib
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_only, nearest, pair_stamps
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
 _DAY_NS = 86_400_000_000_000
-F = TypeVar("F", bound="SeriesFrames")  # type: ignore[type-arg]
 
 
 @dataclass(frozen=True)
@@ -49,52 +49,88 @@ def pair_images(
     alone = len(first) + len(second) - 2 * len(firsts)
     if alone:
         detail = f"{alone} of {len(first)} and {len(second)}; {len(firsts)} pairs remain"
-        log.note("images without their partner", detail + _apart(first.stamps_ns, second.stamps_ns, tolerance_ns))
+        if len(first) and len(second):
+            apart_ns = second.stamps_ns[nearest(second.stamps_ns, first.stamps_ns)] - first.stamps_ns
+            apart_ms, most_ms = float(np.median(apart_ns)) * 1e-6, tolerance_ns * 1e-6
+            if abs(apart_ms) > most_ms:
+                detail += (
+                    f"; the second is {apart_ms:+.3f} ms from the first in the median, {most_ms:g} ms are allowed: trigger both "
+                    "together, or stamp both by one clock; the stamps of one could be shifted by as much if that is constant"
+                )
+        log.note("images without their partner", detail)
     return first.take(firsts), second.take(seconds)
 
 
-def _apart(first_ns: Stamps, second_ns: Stamps, tolerance_ns: int) -> str:
-    """By how much the stamps of two cameras differ, where that is more than the tolerance and what to do; else nothing."""
-    if not len(first_ns) or not len(second_ns):
-        return ""
-    apart_ms = float(np.median(second_ns[nearest(second_ns, first_ns)] - first_ns)) * 1e-6
-    if abs(apart_ms) <= tolerance_ns * 1e-6:
-        return ""
-    advice = "trigger both together, or stamp both by one clock; the stamps of one could be shifted by as much if that is constant"
-    return f"; the second is {apart_ms:+.3f} ms from the first in the median, {tolerance_ns * 1e-6:g} ms are allowed: {advice}"
+class ImageReader(Protocol[T]):
+    """Reads the images of a recording where they are stored."""
+
+    def read(self, source: T, stamp_ns: int) -> StoredImage:
+        """One image, still encoded; RecordingError where its bytes are gone."""
+
+    def apart(self) -> "ImageReader[T]":
+        """Another reader of the same images, to be used and closed apart from this one, in other threads and processes too."""
+
+    def hash_into(self, digest: "hashlib._Hash", images: list[T]) -> None:
+        """Feeds all that was read of the recording, the images included, to `digest`."""
+
+    def close(self) -> None:
+        """Closes open files."""
 
 
+class DepthRegistration(Protocol):
+    """Brings depth images into the pixels of the left image."""
+
+    def registered(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
+        """(H, W) metres, 0 where unknown."""
+
+
+@dataclass
 class SeriesFrames(Generic[T]):
-    """Frames of paired series of equal length; `load` reads the image of a source with its stamp in ns.
+    """A FrameSource over paired series of equal length.
 
-    grey_bits: of left and right images of 16 bits, how many are used.
+    grey_bits: of left and right images of 16 bits, how many are used. registration: for depth that is not registered as it is stored.
     """
 
-    def __init__(
-        self,
-        load: Callable[[T, int], StoredImage],
-        left: ImageSeries[T],
-        right: ImageSeries[T] | None,
-        depth: ImageSeries[T] | None,
-    ) -> None:
-        self._load = load
-        self.left, self.right, self.depth = left, right, depth
-        self.grey_bits = 16
-
-    def taken(self, indices: NDArray[np.int64]) -> tuple[ImageSeries[T], ImageSeries[T] | None, ImageSeries[T] | None]:
-        """left, right, depth of the frames at indices (K,)."""
-        right, depth = (None if series is None else series.take(indices) for series in (self.right, self.depth))
-        return self.left.take(indices), right, depth
-
-    def like(self, part: F) -> F:
-        """`part`, whose grey images use as many bits as these."""
-        part.grey_bits = self.grey_bits
-        return part
+    reader: ImageReader[T]
+    left: ImageSeries[T]
+    right: ImageSeries[T] | None = None
+    depth: ImageSeries[T] | None = None
+    registration: DepthRegistration | None = None
+    grey_bits: int = 16
 
     def stored(self, index: int) -> StoredFrame:
-        """Frame `index` with its images as they are stored."""
+        """Frame `index` with its images as they are stored; registered depth as PNG in whole mm."""
+        stored = self._stored(index)
+        if stored.depth is None or self.registration is None:
+            return stored
+        depth_mm = self._registered_mm(decode_depth(stored.depth), stored.depth.where)
+        _, png = cv2.imencode(".png", depth_mm.astype(np.uint16))
+        return replace(stored, depth=StoredImage("file", png.tobytes(), stored.depth.where))
+
+    def frame(self, index: int) -> CameraFrame:
+        """Frame `index`, decoded; registered depth to one mm, as it is stored."""
+        stored = self._stored(index)
+        frame = decode_frame(stored)
+        if stored.depth is None or frame.depth_m is None or self.registration is None:
+            return frame
+        depth_mm = self._registered_mm(frame.depth_m, stored.depth.where)
+        return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
+
+    def part(self, indices: NDArray[np.int64]) -> "SeriesFrames[T]":
+        right, depth = (None if series is None else series.take(indices) for series in (self.right, self.depth))
+        return replace(self, reader=self.reader.apart(), left=self.left.take(indices), right=right, depth=depth)
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.reader.hash_into(
+            digest, [s for series in (self.left, self.right, self.depth) if series for s in series.sources]
+        )
+
+    def close(self) -> None:
+        self.reader.close()
+
+    def _stored(self, index: int) -> StoredFrame:
         left, right, depth = (
-            None if series is None else self._load(series.sources[index], int(series.stamps_ns[index]))
+            None if series is None else self.reader.read(series.sources[index], int(series.stamps_ns[index]))
             for series in (self.left, self.right, self.depth)
         )
         assert left is not None
@@ -103,6 +139,6 @@ class SeriesFrames(Generic[T]):
             right = None if right is None else replace(right, bits=self.grey_bits)
         return StoredFrame(int(self.left.stamps_ns[index]), left, right, depth)
 
-    def frame(self, index: int) -> CameraFrame:
-        """Frame `index`, decoded."""
-        return decode_frame(self.stored(index))
+    def _registered_mm(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
+        assert self.registration is not None
+        return np.round(self.registration.registered(depth_m, where) * 1000)

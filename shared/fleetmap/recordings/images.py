@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
 from fleetmap.recordings.decoder_messages import with_messages
-from fleetmap.recordings.strange_files import what_instead
+from fleetmap.recordings.files import what_instead
+from fleetmap.recordings.limits import MAX_PIXELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})(?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})[\s#]")
@@ -142,7 +143,6 @@ _UNREAD_STARTS = (
     (re.compile(rb"GIF8"), "a GIF image" + _OTHER_IMAGE),
 )
 _MOSAIC_SHARE, _LEAST_MOSAIC_PX, _LEAST_MOSAIC_GREY = 0.04, 100, 20.0
-MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of an image is an error of ours
 # What libjpeg and libpng say of pixels that are lost; colour profiles and comments may be damaged
 _DAMAGED = re.compile("Corrupt JPEG data|Premature end|libpng error|IDAT")

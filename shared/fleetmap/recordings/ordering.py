@@ -14,33 +14,33 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Trajectory
 
-_MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 # Of recordings whose stamps nobody took when the images were exposed
 UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's, which no exposure set and no other sensor shares")
-V = TypeVar("V")
 UNITS = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}  # by the nanoseconds in each
 _FINER = {1_000: "milliseconds", 1_000_000: "microseconds", 1_000_000_000: "nanoseconds"}  # by how many are in a second
-_SHORTEST_NS = {"imu": 100_000}  # between values in the median: no inertial sensor has more than 10 kHz
-_SHORTEST_OTHER_NS, _LONGEST_NS = (
-    500_000,
-    20_000_000_000,
-)  # no camera or odometry has more than 2 kHz or less than 0.05 Hz
+_MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
+# Between values in the median: no inertial sensor has more than 10 kHz; no camera or odometry more than 2 kHz or less than 0.05 Hz
+_SHORTEST_IMU_NS, _SHORTEST_NS, _LONGEST_NS = 100_000, 500_000, 20_000_000_000
 _EPOCH_NS = (9e17, 5e18)  # 1998 to 2128
 _FEWEST = 10  # values whose steps tell a unit
 # Of a part of a stream with a pause on either side: what is shorter than the second in which an odometry begins serves nothing, so
 # that a recording that was interrupted loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
 _SHORTEST_PART_NS, _PAUSE_STEPS, _STRAY_SHARE = 1_000_000_000, 10, 0.05
-_NEVER_STRAY = ("position priors", "ground truth")  # which come as they like
+V = TypeVar("V")
 
 
 @dataclass(slots=True)
 class ReadLog:
-    """Notes taken while a recording is read: what is missing or damaged, and the files read beside the images."""
+    """Notes taken while a recording is read: what is missing or damaged, and the files read beside the images.
+
+    damaged_ns: stamps of images that were left out because they cannot be decoded.
+    """
 
     issues: list[DataIssue] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    damaged_ns: list[int] = field(default_factory=list)
 
     def note(self, what: str, detail: str) -> None:
         """Adds an issue."""
@@ -76,10 +76,38 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
     another unit.
     """
     _check_steps(stamps_ns, what)
-    kept = np.flatnonzero(_increasing(stamps_ns, what, log))
-    mask = np.zeros(len(stamps_ns), np.bool_)
-    mask[kept if what in _NEVER_STRAY else kept[~_strays(stamps_ns[kept], what, log)]] = True
-    return mask
+    kept = _longest_increasing(stamps_ns)
+    _note_dropped(stamps_ns, kept, what, log)
+    if what not in ("position priors", "ground truth"):  # which come as they like
+        rows = np.flatnonzero(kept)
+        kept[rows[_strays(stamps_ns[rows], what, log)]] = False
+    return kept
+
+
+def _note_dropped(stamps_ns: Stamps, kept: NDArray[np.bool_], what: str, log: ReadLog) -> None:
+    dropped = np.flatnonzero(~kept)
+    if not len(dropped):
+        return
+    steps = np.diff(stamps_ns)
+    share, first = f"{len(dropped)} of {len(kept)}", int(dropped[0])
+    if (steps >= 0).all():
+        first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
+        log.note(
+            f"{what}: stamps repeated", f"{share} are that of the one before and left out; the first is {first_ns}"
+        )
+        fault = (
+            f"{share} stamps repeat the one before, the first is {first_ns}; the driver stamps several alike, or rounds: "
+            "let it stamp each one when it is measured"
+        )
+    else:
+        step_s = float(stamps_ns[first] - stamps_ns[max(first - 1, 0)]) * 1e-9
+        log.note(
+            f"{what}: stamps not increasing",
+            f"{share} left out; the first is {stamps_ns[first]}, {step_s:+.3f} s from the one before",
+        )
+        fault = f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
+    if len(dropped) > len(kept) // 2:
+        raise RecordingError(f"{what}: {fault}")
 
 
 def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
@@ -93,118 +121,24 @@ def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
     largest = max(parts, key=len)
     for part in parts:
         strays[part] = part is not largest and stamps_ns[part[-1]] - stamps_ns[part[0]] < _SHORTEST_PART_NS
-    if not 0 < strays.sum() <= max(1, _STRAY_SHARE * len(stamps_ns)):
+    count = int(strays.sum())
+    if not 0 < count <= max(1, _STRAY_SHARE * len(stamps_ns)):
         return np.zeros(len(stamps_ns), np.bool_)
-    others = stamps_ns[~strays]
-    away = [(stamp, (stamp - others[nearest(others, np.array([stamp]))[0]]) * 1e-9) for stamp in stamps_ns[strays]]
-    named = ", ".join(f"{stamp} ({seconds:+.1f} s)" for stamp, seconds in away[:3])
-    detail = (
-        f"{len(away)} of {len(stamps_ns)} left out: {named}{', ...' if len(away) > 3 else ''} from the nearest other"
+    first_ns, others = stamps_ns[strays][:3], stamps_ns[~strays]
+    away_s = (first_ns - others[nearest(others, first_ns)]) * 1e-9
+    named = ", ".join(f"{stamp} ({seconds:+.1f} s)" for stamp, seconds in zip(first_ns, away_s, strict=True))
+    more = ", ..." if count > 3 else ""
+    log.note(
+        f"{what}: stamps far apart",
+        f"{count} of {len(stamps_ns)} left out: {named}{more} from the nearest other; was the clock set?",
     )
-    log.note(f"{what}: stamps far apart", f"{detail}; was the clock set?")
     return strays
-
-
-def _increasing(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of `forward_only` before single stamps are looked for."""
-    steps = np.diff(stamps_ns)
-    odd = np.flatnonzero(steps <= 0)
-    if len(odd) == 0:
-        return np.ones(len(stamps_ns), np.bool_)
-    kept = _longest_increasing(stamps_ns)
-    dropped, first, out = int((~kept).sum()), int(odd[0]), int(np.flatnonzero(~kept)[0])
-    share, is_repeated = f"{dropped} of {len(kept)}", not (steps < 0).any()
-    if is_repeated:
-        log.note(
-            f"{what}: stamps repeated",
-            f"{share} are that of the one before and left out; the first is {stamps_ns[first]}",
-        )
-    else:
-        log.note(
-            f"{what}: stamps not increasing",
-            f"{share} left out; the first is {stamps_ns[out]}, {_step_s(stamps_ns, out):+.3f} s from the one before",
-        )
-    if dropped > len(kept) // 2:
-        fault = (
-            f"{share} stamps repeat the one before, the first is {stamps_ns[first]}; the driver stamps several alike, or rounds: "
-            "let it stamp each one when it is measured"
-            if is_repeated
-            else f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
-        )
-        raise RecordingError(f"{what}: {fault}")
-    return kept
-
-
-def _step_s(stamps_ns: Stamps, index: int) -> float:
-    return float(stamps_ns[index] - stamps_ns[max(index - 1, 0)]) * 1e-9
-
-
-def _check_steps(stamps_ns: Stamps, what: str) -> None:
-    """RecordingError for stamps whose median step no such sensor has, with the unit that they look like."""
-    if len(stamps_ns) < _FEWEST:
-        return
-    steps, shortest = np.diff(stamps_ns), _SHORTEST_NS.get(what, _SHORTEST_OTHER_NS)
-    step = int(np.median(steps[steps > 0])) if (steps > 0).any() else 0
-    middle = float(np.median(stamps_ns))
-    if step < shortest:
-        by_date = [ns for ns in UNITS if _EPOCH_NS[0] < middle * ns < _EPOCH_NS[1]]
-        for ns in by_date or [ns for ns in UNITS if step * ns >= shortest]:
-            why = f"as nanoseconds they are {step * 1e-9:.9f} s apart"
-            raise wrong_unit(what, UNITS[ns], why, f"multiply them by {ns}")
-    if step > _LONGEST_NS and what != "position priors":
-        finer = next((ns for ns in UNITS if step / ns < _LONGEST_NS), 1_000_000_000)
-        why = f"they are {step * 1e-9:.0f} s apart"
-        raise wrong_unit(what, f"{_FINER[finer]} that were read as seconds", why, f"divide them by {finer}")
-
-
-def check_seconds(value: float, where: str) -> None:
-    """RecordingError for what is too large for seconds since 1970, with the unit that it looks like."""
-    for ns, unit in _FINER.items():
-        if 1e10 < abs(value) < 1e11 * ns or (abs(value) > 1e10 and ns == 1_000_000_000):
-            raise wrong_unit(f"{where}:", unit, f"{value:.0f} is no time in seconds", f"divide them by {ns}")
-
-
-def check_together(stamps_ns: Stamps, what: str, frame_stamps_ns: Stamps) -> None:
-    """RecordingError where the stamps cover other times than the frames, and the same in another unit."""
-    if not len(stamps_ns) or not len(frame_stamps_ns) or _overlap(stamps_ns, 1, frame_stamps_ns):
-        return
-    for ns, unit in UNITS.items():
-        if _overlap(stamps_ns, ns, frame_stamps_ns):
-            raise wrong_unit(
-                what, unit, f"from {stamps_ns[0]}, the images' from {frame_stamps_ns[0]}", f"multiply them by {ns}"
-            )
-        if _overlap(frame_stamps_ns, ns, stamps_ns):
-            raise wrong_unit(
-                "images",
-                unit,
-                f"from {frame_stamps_ns[0]}, those of {what} from {stamps_ns[0]}",
-                f"multiply them by {ns}",
-            )
-
-
-def wrong_unit(what: str, unit: str, why: str, remedy: str) -> RecordingError:
-    """The error of stamps that are in another unit than they should be."""
-    name = what.replace("imu", "IMU")
-    return RecordingError(
-        f"{name} stamps look like {unit}: {why}; {remedy} where they are written, or leave this sensor out"
-    )
-
-
-def _overlap(stamps_ns: Stamps, factor: int, others_ns: Stamps) -> bool:
-    """Whether at least half of the shorter time is in the other, the stamps multiplied by `factor`."""
-    first, last = int(stamps_ns[0]) * factor, int(stamps_ns[-1]) * factor
-    begin, end = int(others_ns[0]), int(others_ns[-1])
-    return 2 * (min(last, end) - max(first, begin)) >= min(last - first, end - begin)
-
-
-def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:
-    """The values whose stamps increase, as `forward_only`."""
-    kept = forward_only(np.array(stamps_ns, np.int64), what, log)
-    return tuple(value for value, keep in zip(values, kept, strict=True) if keep)
 
 
 def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     """(N,) a longest strictly increasing subsequence. Source: patience sorting."""
+    if (np.diff(stamps_ns) > 0).all():
+        return np.ones(len(stamps_ns), np.bool_)
     ends: list[int] = []  # ends[k]: smallest stamp that ends an increasing run of k + 1
     end_index: list[int] = []
     before = np.full(len(stamps_ns), -1)
@@ -221,6 +155,66 @@ def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
     return kept
 
 
+def _check_steps(stamps_ns: Stamps, what: str) -> None:
+    """RecordingError for stamps whose median step no such sensor has, with the unit that they look like."""
+    if len(stamps_ns) < _FEWEST:
+        return
+    steps, shortest = np.diff(stamps_ns), _SHORTEST_IMU_NS if what == "imu" else _SHORTEST_NS
+    step = int(np.median(steps[steps > 0])) if (steps > 0).any() else 0
+    middle = float(np.median(stamps_ns))
+    if step < shortest:
+        by_date = [ns for ns in UNITS if _EPOCH_NS[0] < middle * ns < _EPOCH_NS[1]]
+        for ns in by_date or [ns for ns in UNITS if step * ns >= shortest]:
+            why = f"as nanoseconds they are {step * 1e-9:.9f} s apart"
+            raise wrong_unit(what, UNITS[ns], why, f"multiply them by {ns}")
+    if step > _LONGEST_NS and what != "position priors":
+        finer = next((ns for ns in UNITS if step / ns < _LONGEST_NS), 1_000_000_000)
+        why = f"they are {step * 1e-9:.0f} s apart"
+        raise wrong_unit(what, f"{_FINER[finer]} that were read as seconds", why, f"divide them by {finer}")
+
+
+def check_seconds(value: float, where: str) -> None:
+    """RecordingError for what is too large for seconds since 1970, with the unit that it looks like."""
+    if abs(value) > 1e10:
+        factor = next((factor for factor in _FINER if abs(value) < 1e11 * factor), 1_000_000_000)
+        why = f"{value:.0f} is no time in seconds"
+        raise wrong_unit(f"{where}:", _FINER[factor], why, f"divide them by {factor}")
+
+
+def check_together(stamps_ns: Stamps, what: str, frame_stamps_ns: Stamps) -> None:
+    """RecordingError where the stamps cover other times than the frames, and the same in another unit."""
+    if not len(stamps_ns) or not len(frame_stamps_ns) or _overlap(stamps_ns, 1, frame_stamps_ns):
+        return
+    for ns, unit in UNITS.items():
+        for name, some, other, others in (
+            (what, stamps_ns, "the images'", frame_stamps_ns),
+            ("images", frame_stamps_ns, f"those of {what}", stamps_ns),
+        ):
+            if _overlap(some, ns, others):
+                raise wrong_unit(name, unit, f"from {some[0]}, {other} from {others[0]}", f"multiply them by {ns}")
+
+
+def wrong_unit(what: str, unit: str, why: str, remedy: str) -> RecordingError:
+    """The error of stamps that are in another unit than they should be."""
+    name = what.replace("imu", "IMU")
+    return RecordingError(
+        f"{name} stamps look like {unit}: {why}; {remedy} where they are written, or leave this sensor out"
+    )
+
+
+def _overlap(stamps_ns: Stamps, factor: int, others_ns: Stamps) -> bool:
+    """True if at least half of the shorter time is in the other, the stamps multiplied by `factor`."""
+    first, last = int(stamps_ns[0]) * factor, int(stamps_ns[-1]) * factor
+    begin, end = int(others_ns[0]), int(others_ns[-1])
+    return 2 * (min(last, end) - max(first, begin)) >= min(last - first, end - begin)
+
+
+def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:
+    """The values whose stamps increase, as `forward_only`."""
+    kept = forward_only(np.array(stamps_ns, np.int64), what, log)
+    return tuple(value for value, keep in zip(values, kept, strict=True) if keep)
+
+
 def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: ReadLog) -> ImuSamples:
     """The samples with possible values and increasing stamps; the others are noted in `log`."""
     possible = np.asarray((np.abs(np.hstack([gyro_radps, accel_mps2])) < _MAX_IMU_VALUE).all(axis=1))
@@ -232,10 +226,7 @@ def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: Read
 
 
 def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLog) -> Trajectory | None:
-    """The ground truth of rows x y z qw qx qy qz (N, 7), None where no row is usable.
-
-    Rows without a unit quaternion are left out and noted.
-    """
+    """The ground truth of rows x y z qw qx qy qz (N, 7), None where no row is usable; those without a unit quaternion are noted."""
     norms = np.linalg.norm(position_quat_wxyz[:, 3:7], axis=1)
     good = np.isfinite(position_quat_wxyz).all(axis=1) & (np.abs(norms - 1) < 0.01)
     if not good.all():
@@ -252,10 +243,7 @@ def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLo
 def pair_stamps(
     left_ns: Stamps, right_ns: Stamps, tolerance_ns: int = PAIR_TOLERANCE_NS
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (P,), (P,) of increasing left and right stamps that belong together.
-
-    Two belong together where each is the other's nearest and they are within the tolerance.
-    """
+    """Indices (P,), (P,) of increasing left and right stamps that are each other's nearest, and within the tolerance."""
     if len(left_ns) == 0 or len(right_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     right_of_left, left_of_right = nearest(right_ns, left_ns), nearest(left_ns, right_ns)

@@ -96,7 +96,8 @@ class Recording:
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
     samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
     in issues). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
-    refers to without one). issues: what could not be read. damaged_ns (D,): frames that `readable` left out.
+    refers to without one). issues: what could not be read. damaged_ns (D,): frames that
+    opening, or `readable`, left out because an image of them cannot be decoded.
     """
 
     path: Path

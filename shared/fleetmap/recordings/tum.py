@@ -3,7 +3,6 @@
 Stamps are written with nine decimals and read as decimals, never through a float, so that nanoseconds survive.
 """
 
-import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -14,12 +13,12 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
-from fleetmap.recordings.strange_files import what_file_instead
+from fleetmap.recordings.files import read_text
 from fleetmap.sensors.samples import Stamps, Trajectory
 
-MAX_TABLE_BYTES = 1 << 30  # 13 hours of an IMU at 200 Hz
 _NS = 1_000_000_000
 _MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold
+_ROWS, _COLUMNS = np.triu_indices(6)
 
 
 def format_tum(trajectory: Trajectory) -> str:
@@ -78,63 +77,29 @@ class StampedLine(NamedTuple):
 def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
     """The lines of a table with rising stamps, comments and empty lines skipped; RecordingError for other lines."""
     last_ns: int | None = None
-    has_names = False
+    is_first = True
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
             continue
         where = f"{what}, line {number}"
-        try:
-            values = np.array([float(field) for field in fields])[1:]
-        except ValueError as error:
-            if last_ns is None and not has_names and not any(_is_number(field) for field in fields):
-                has_names = True  # of columns
-                continue
-            odd = next(field for field in fields if not _is_number(field))
-            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers, {odd[:40]!r} is none") from error
+        words = [field for field in fields if not _is_number(field)]
+        is_header, is_first = is_first and len(words) == len(fields), False
+        if is_header:
+            continue
+        if words:
+            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers, {words[0][:40]!r} is none")
         try:
             stamp_ns = parse_stamp_ns(fields[0])
         except ValueError as error:
             raise RecordingError(f"{where}: {error}; write seconds") from error
-        yield StampedLine(where, line[:80], stamp_ns, values)
-        if stamp_ns == last_ns:
-            raise RecordingError(
-                f"{where}: stamp {fields[0]} does not rise, it is that of the line before; write stamps with all their "
-                "digits (nine decimals), or leave out doubled lines"
-            )
-        if last_ns is not None and stamp_ns < last_ns:
-            raise RecordingError(f"{where}: stamp {fields[0]} does not rise; sort the lines by time")
+        yield StampedLine(where, line[:80], stamp_ns, np.array(fields[1:], np.float64))
+        if last_ns is not None and stamp_ns <= last_ns:
+            advice = "sort the lines by time"
+            if stamp_ns == last_ns:
+                advice = "it is that of the line before; write stamps with nine decimals, or leave out doubled lines"
+            raise RecordingError(f"{where}: stamp {fields[0]} does not rise, {advice}")
         last_ns = stamp_ns
-
-
-def check_table(path: Path) -> None:
-    """Raises RecordingError for what is no regular file, or too large for a table; OSError."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
-        raise RecordingError(f"{path} is no regular file; copy the recording again")
-    if status.st_size > MAX_TABLE_BYTES:
-        raise RecordingError(
-            f"{path} has {status.st_size} bytes; tables of at most {MAX_TABLE_BYTES >> 20} MiB are read, cut the recording"
-        )
-
-
-def read_text(path: Path, expected: str) -> str:
-    """The text in the file at `path`; RecordingError where it cannot be read or is no text."""
-    if fault := what_file_instead(path):
-        raise RecordingError(f"{path} is {fault}")
-    try:
-        check_table(path)
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path} is not a text file (byte {error.start} is no UTF-8); {expected}") from error
-
-
-def format_stamp(stamp_ns: int) -> str:
-    """Seconds with nine decimals."""
-    sign, (whole, rest) = "-" if stamp_ns < 0 else "", divmod(abs(stamp_ns), _NS)
-    return f"{sign}{whole}.{rest:09d}"
 
 
 def _is_number(field: str) -> bool:
@@ -143,6 +108,12 @@ def _is_number(field: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def format_stamp(stamp_ns: int) -> str:
+    """Seconds with nine decimals."""
+    sign, (whole, rest) = "-" if stamp_ns < 0 else "", divmod(abs(stamp_ns), _NS)
+    return f"{sign}{whole}.{rest:09d}"
 
 
 def parse_stamp_ns(field: str) -> int:
@@ -159,9 +130,6 @@ def parse_stamp_ns(field: str) -> int:
     return int(seconds * _NS)
 
 
-_ROWS, _COLUMNS = np.triu_indices(6)
-
-
 @dataclass(frozen=True, slots=True)
 class StampedCovariances:
     """stamps_ns (N,) rising, covs_rot_trans (N, 6, 6)."""
@@ -171,7 +139,7 @@ class StampedCovariances:
 
 
 def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """The covariances in the text of such a file.
+    """Covariances of a trajectory, as lines of a stamp and the 21 numbers of the upper triangle, rotation first.
 
     Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
     stamps that do not rise.

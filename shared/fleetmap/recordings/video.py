@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings.files import file_head, hash_file
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.folders.image_files import hash_file
-from fleetmap.recordings.images import MAX_PIXELS, StoredFrame, decode_frame, grey_image
+from fleetmap.recordings.images import StoredFrame, decode_frame, grey_image
+from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -32,26 +33,20 @@ _PLANES = ("yuv4", "yuvj4", "nv12", "nv21", "gray")  # pixel formats whose first
 _BOX = struct.Struct(">I4s")
 _NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
 _COUNTS = re.compile(rb"(?:stsz|stz2).{8}(.{4})|trun.{4}(.{4})", re.DOTALL)  # how many samples
-_MAX_TABLE_BYTES = 256 << 20
 _UNEVEN = 1.5  # longest step over the median of a constant rate
 
 
 def recognises(path: Path) -> bool:
     """Whether `path` is a file that is named, or begins, as an MP4 video."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return path.suffix.lower() in SUFFIXES or file.read(12)[4:8] == b"ftyp"
+    return path.is_file() and (path.suffix.lower() in SUFFIXES or file_head(path, 12)[4:8] == b"ftyp")
 
 
 def open_video(path: Path, options: OpenOptions) -> Recording:
     """The recording in a video: one camera, no IMU."""
-    given = calibration_of_options(options)
+    log = ReadLog(files=[path])
+    given = calibration_of_options(options, log)
     if given is None:
         raise CalibrationError(f"{path}: a video holds no calibration; pass one with --calibration FILE")
-    log = ReadLog(files=[path])
-    if options.calibration_file is not None:
-        log.files.append(options.calibration_file)
     index = _index(path, log)
     log.issues.append(UNCERTAIN_STAMPS)
     frames = VideoFrames(log.files, index.keys, index.pts, index.stamps_ns)
@@ -216,9 +211,9 @@ def _check_tables(path: Path, file: BinaryIO) -> None:
             length = int.from_bytes(file.read(8), "big")
         length = min(length if length >= _BOX.size else size, size - at)
         if kind not in _NO_TABLES:
-            if length > _MAX_TABLE_BYTES:
+            if length > MAX_VIDEO_TABLE_BYTES:
                 raise RecordingError(
-                    f"{path}: a table of {length} bytes; the limit is {_MAX_TABLE_BYTES}. {_conversion(path)}"
+                    f"{path}: a table of {length} bytes; the limit is {MAX_VIDEO_TABLE_BYTES}. {_conversion(path)}"
                 )
             content = file.read(length)
             told += sum(int.from_bytes(found[1] or found[2], "big") for found in _COUNTS.finditer(content))

@@ -114,6 +114,7 @@ def test_png_that_is_damaged_inside_costs_one_frame(tmp_path: Path, capfd: pytes
     assert SAMPLE.stamps_ns[2] not in recording.frame_stamps_ns
     assert len([recording.read_frame(index) for index in range(len(recording))]) == 3
     assert recording.issues[0] == DataIssue("cam0: images damaged inside", "1 of 4, the first is image2.png")
+    assert recording.damaged_ns.tolist() == [SAMPLE.stamps_ns[2]], "rows of a trajectory are counted with it"
     with pytest.raises(RecordingError, match="the png image is damaged"):
         decode_grey(StoredImage("file", bytes(data), "a robot's own"))
     assert capfd.readouterr().err == "", "libpng has nothing to say"

@@ -3,48 +3,33 @@
 Files may be hostile: what an index may make and a chunk may unpack to is limited. Source of the layout: ROS's bag format 2.0.
 """
 
-import bz2
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from io import BufferedReader, FileIO
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.codecs import ros1_digest
-from fleetmap.recordings.bags.container import MAX_MESSAGE_BYTES, Channel, KeptBytes, Message, Place, Schema
+from fleetmap.recordings.bags.container import Channel, Message, Place
+from fleetmap.recordings.bags.decoders import ros1_digest
 from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.bags.topics import KNOWN_TYPES, type_name, video_issues
+from fleetmap.recordings.bags.topics import KNOWN_TYPES, video_issues
+from fleetmap.recordings.files import file_head
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
-
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
 
 _MAGIC = b"#ROSBAG V"
 _ADVICE = {"not indexed": "rosbag reindex", "encryption": "rosbag decrypt", "Compression": "rosbag decompress"}
 # What rosbags raises of damaged files beside its ReaderError, which is not at hand where it is not installed
-_DAMAGED = (
-    struct.error,
-    ValueError,
-    KeyError,
-    IndexError,
-    AssertionError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    OverflowError,
-)
+_DAMAGED = (struct.error, ValueError, LookupError, AssertionError, EOFError, OSError, RuntimeError, OverflowError)
 
 
 def recognises(path: Path) -> bool:
-    """Whether `path` is a file that begins as a bag does or is named .bag."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return path.suffix == ".bag" or file.read(len(_MAGIC)) == _MAGIC
+    """True for a file that begins as a bag does or is named .bag."""
+    return path.is_file() and (path.suffix == ".bag" or file_head(path, len(_MAGIC)) == _MAGIC)
 
 
 def open_bag(path: Path, options: OpenOptions) -> Recording:
@@ -59,31 +44,31 @@ class BagFile(KeptBytes):
         super().__init__(path, path.stat().st_size)
         self.files: Sequence[Path] = (path,)
         self.name = ""
-        self.attachments: Mapping[str, bytes] = {}
-        self._issues: list[DataIssue] = []
+        self.attachments: dict[str, bytes] = {}
+        self.issues: list[DataIssue] = []
         self._reader = _bounded_reader()(_BagPath(path))
         self._reader.file_bytes = self.size
         try:
             self._reader.open()
         except (self._reader.error, *_DAMAGED) as error:
             raise RecordingError(f"{path} cannot be read: {_reason(error, path)}") from error
-        self._connections: dict[int, Connection] = {c.id: c for c in self._reader.connections}
+        self._connections = {connection.id: connection for connection in self._reader.connections}
 
     def messages(self) -> Iterator[Message]:
         """See Container: in the order of log times."""
         channels = {
-            number: Channel(number, connection.topic, "ros1", Schema(connection.msgtype))
+            number: Channel(number, connection.topic, "ros1", connection.msgtype.replace("/msg/", "/"))
             for number, connection in self._connections.items()
         }
-        known = [c for c in self._connections.values() if type_name(channels[c.id]) in KNOWN_TYPES]
-        strange = [c for c in known if c.digest not in ("*", ros1_digest(c.msgtype))]
+        known = [c for c in self._connections.values() if channels[c.id].type_name in KNOWN_TYPES]
+        strange = [c for c in known if c.digest not in ("*", ros1_digest(channels[c.id].type_name))]
         if strange:
             there = ", ".join(f"{c.topic} ({c.msgtype}, {c.digest})" for c in strange)
-            self._issues.append(DataIssue("messages of another definition than ROS's", f"{there} left out"))
+            self.issues.append(DataIssue("messages of another definition than ROS's", f"{there} left out"))
         if not known:
             there = ", ".join(f"{c.topic} ({c.msgtype})" for c in self._connections.values()) or "none"
-            self._issues.append(DataIssue("no topic of a known type", there[:500]))
-        self._issues += video_issues(channels.values())
+            self.issues.append(DataIssue("no topic of a known type", there[:500]))
+        self.issues += video_issues(channels.values())
         last: dict[int, tuple[int, int]] = {}
         wanted = [c for c in known if c not in strange]
         try:
@@ -93,12 +78,8 @@ class BagFile(KeptBytes):
                 last[connection.id] = stamp_ns, count
                 yield channels[connection.id], stamp_ns, (connection.id, stamp_ns, count), memoryview(data)
         except (self._reader.error, *_DAMAGED) as error:
-            self._issues.append(
-                DataIssue("the bag is damaged", f"what follows is not read: {_reason(error, self.path)}")
-            )
-
-    def issues(self) -> list[DataIssue]:
-        return self._issues
+            reason = _reason(error, self.path)
+            self.issues.append(DataIssue("the bag is damaged", f"what follows is not read: {reason}"))
 
     def read(self, place: Place) -> bytes:
         number, stamp_ns, count = place
@@ -145,26 +126,14 @@ class _BagPath:
 def _bounded_reader() -> Any:
     """rosbags' reader with limits."""
     try:
-        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
         from rosbags.rosbag1 import Reader, ReaderError
         from rosbags.rosbag1.reader import decompressors
     except ImportError as error:
         raise RecordingError(
             "ROS 1 bags need a library more: pip install '.[bags]' in fleetmap's source folder"
         ) from error
-
-    def bounded(unpack: Callable[[bytes, int], bytes]) -> Callable[[bytes], bytes]:
-        def unpacked(data: bytes) -> bytes:
-            found = unpack(data, MAX_MESSAGE_BYTES + 1)
-            if len(found) > MAX_MESSAGE_BYTES:
-                raise ReaderError(f"a chunk of {len(data)} bytes unpacks to more than {MAX_MESSAGE_BYTES}")
-            return found
-
-        return unpacked
-
-    unpackers = {
-        decompressors["bz2"]: bounded(lambda data, most: bz2.BZ2Decompressor().decompress(data, most)),
-        decompressors["lz4"]: bounded(lambda data, most: LZ4FrameDecompressor().decompress(data, max_length=most)),
+    unpackers: dict[Any, Callable[[bytes], bytes]] = {
+        decompressors[kind]: partial(unpack, kind) for kind in ("bz2", "lz4")
     }
 
     class BoundedReader(Reader):
@@ -187,9 +156,8 @@ def _bounded_reader() -> Any:
 
 
 def _reason(error: BaseException, path: Path) -> str:
-    is_told = (
-        type(error) is ValueError or type(error).__name__ == "ReaderError"
-    )  # others are of Python, about bytes that make no sense
+    # Others than these are of Python, about bytes that make no sense
+    is_told = type(error) is ValueError or type(error).__name__ == "ReaderError"
     words = " ".join(str(error).split())[:200].rstrip(".") if is_told else "a record makes no sense"
     for sign, advice in _ADVICE.items():
         if sign in words:

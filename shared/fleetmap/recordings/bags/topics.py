@@ -8,13 +8,14 @@ from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.samples import DataIssue
 from fleetmap.sensors.source_settings import Topics
 
+INFO_TYPES = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 _TYPES = {
     "left": IMAGE_TYPES,
     "right": IMAGE_TYPES,
     "depth": IMAGE_TYPES,
-    "left_info": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
-    "right_info": ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration"),
+    "left_info": INFO_TYPES,
+    "right_info": INFO_TYPES,
     "imu": ("sensor_msgs/Imu", "foxglove.Imu", "foxglove.IMU", "fleetmap.Imu"),
     "wheel": ("nav_msgs/Odometry",),
     "prior": ("geometry_msgs/PoseWithCovarianceStamped",),
@@ -41,15 +42,10 @@ def transports(topic: str, role: str) -> tuple[str, ...]:
     return (topic, *(topic + packed for packed in _PACKED[: 2 if role == "depth" else 1]))
 
 
-def type_name(channel: Channel) -> str:
-    """The message type without ROS 2's `/msg/`."""
-    return channel.schema.name.replace("/msg/", "/")
-
-
 def video_issues(channels: Iterable[Channel]) -> list[DataIssue]:
     """A note of the topics whose messages are pieces of a video; none without such topics."""
     names = sorted(
-        f"{channel.topic} ({type_name(channel)})" for channel in channels if type_name(channel) in _VIDEO_TYPES
+        f"{channel.topic} ({channel.type_name})" for channel in channels if channel.type_name in _VIDEO_TYPES
     )
     advice = "record JPEG or raw images, or write the video to an .mp4 file, which is read with --calibration FILE"
     return [DataIssue("video not read", f"{', '.join(names)}; {advice}")] if names else []
@@ -82,20 +78,20 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
     _choose_images(by_topic, chosen, where, log)
     _choose_infos(by_topic, chosen)
     for role, topic in chosen.items():
-        others = [channel for channel in by_topic[topic] if type_name(channel) not in _TYPES[role]]
+        others = [channel for channel in by_topic[topic] if channel.type_name not in _TYPES[role]]
         if others:
-            names = ", ".join(type_name(channel) for channel in others)
+            names = ", ".join(channel.type_name for channel in others)
             log.note(
                 "messages of another type", f"{topic}: {names} left out; {' or '.join(_TYPES[role])} is read as {role}"
             )
     return {
-        role: [channel.id for channel in by_topic[topic] if type_name(channel) in _TYPES[role]]
+        role: [channel.id for channel in by_topic[topic] if channel.type_name in _TYPES[role]]
         for role, topic in chosen.items()
     }
 
 
 def _has_type(by_topic: Mapping[str, list[Channel]], topic: str, types: tuple[str, ...]) -> bool:
-    return any(type_name(channel) in types for channel in by_topic.get(topic, ()))
+    return any(channel.type_name in types for channel in by_topic.get(topic, ()))
 
 
 def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str], where: str, log: ReadLog) -> None:
@@ -168,5 +164,5 @@ def _has(topic: str, hints: tuple[str, ...]) -> bool:
 
 
 def _listed(by_topic: Mapping[str, list[Channel]]) -> str:
-    names = (f"{topic} ({', '.join(type_name(channel) for channel in by_topic[topic])})" for topic in sorted(by_topic))
+    names = (f"{topic} ({', '.join(channel.type_name for channel in by_topic[topic])})" for topic in sorted(by_topic))
     return ", ".join(names) or "no topic at all"

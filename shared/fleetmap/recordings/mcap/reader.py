@@ -1,73 +1,270 @@
-"""Opens MCAP recordings: rosbag2 style (CDR) and Foxglove protobuf; whole, cut off or damaged."""
+"""Opens MCAP recordings: rosbag2 style (CDR) and Foxglove protobuf; whole, cut off or damaged, with or without their index.
 
-from collections.abc import Iterator, Mapping, Sequence
+The mcap library parses the records. Its readers are not used, because they stop at the first damage, take memory as the file says, and
+lose the chunk that a power failure cut: here what does not fit is noted as a DataIssue, the walk goes on at the next chunk where the file
+still has its index, and sizes are compared with limits before anything is read or unpacked.
+"""
+
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Generator, Iterator, Sequence
 from functools import partial
+from io import BytesIO
 from pathlib import Path
+from typing import Any
+
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Message, Place
+from fleetmap.recordings.bags.container import Channel, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.mcap.scan import MAGIC, Location, McapScan, MessageReader
+from fleetmap.recordings.files import file_head, what_file_instead
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
 
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD_HEAD = struct.Struct("<BQ")
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+_LARGEST_RECORD_BYTES = 1 << 31  # beyond it the bytes are no record at all
+_MAX_RECORD_BYTES = MAX_MESSAGE_BYTES + (64 << 10)  # a chunk that is not compressed, with its head
+_KEPT_CHUNKS = 2  # that were unpacked, so that going through in order is cheap
+_MOST_ISSUES = 20
+_PARSED: dict[int, Any] = {
+    Opcode.SCHEMA: records.Schema,
+    Opcode.CHANNEL: records.Channel,
+    Opcode.ATTACHMENT: records.Attachment,
+    Opcode.METADATA: records.Metadata,
+    Opcode.CHUNK: records.Chunk,
+    Opcode.CHUNK_INDEX: records.ChunkIndex,
+    Opcode.FOOTER: records.Footer,
+}
+
 
 def recognises(path: Path) -> bool:
-    """Whether `path` is a file that begins as MCAP does or is named .mcap, or a rosbag2 folder with one such file."""
+    """True for a file that begins as MCAP does or is named .mcap, or a rosbag2 folder with one such file."""
     return _mcap_file(path) is not None
 
 
 def open_mcap(path: Path, options: OpenOptions) -> Recording:
     """The recording in an MCAP file (or the one in a rosbag2 folder), as far as it is whole; its issues say what is not."""
     file_path = _mcap_file(path)
-    if file_path is None:
-        raise RecordingError(f"{path} is no MCAP file; choose a file that ends in .mcap")
+    assert file_path is not None
     pieces = len(list(path.glob("*.mcap"))) if path.is_dir() else 1
     if pieces > 1:
         raise RecordingError(f"{path} holds {pieces} .mcap files; choose one of them, or merge them with `mcap merge`")
     return open_messages(path, "mcap", partial(McapFile, file_path), options)
 
 
-class McapFile:
-    """An open MCAP file as a Container."""
+def _mcap_file(path: Path) -> Path | None:
+    if path.is_dir():
+        return min(path.glob("*.mcap"), default=None)
+    is_one = path.is_file() and (path.suffix == ".mcap" or file_head(path, len(MAGIC)) == MAGIC)
+    return path if is_one else None
+
+
+class McapFile(KeptBytes):
+    """An open MCAP file as a Container. A place: byte, length, and -1 or the byte of the compressed chunk that it lies in unpacked."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path, path.stat().st_size)
         self.files: Sequence[Path] = (path,)
+        self.attachments: dict[str, bytes] = {}
+        self.issues: list[DataIssue] = []
+        self.name = ""
         self._file = path.open("rb")
-        self._scan, self._reader = McapScan(path, self._file), MessageReader(path, self._file)
-        self.keep = self._scan.keep
-
-    @property
-    def name(self) -> str:
-        return self._written("name")
-
-    @property
-    def attachments(self) -> Mapping[str, bytes]:
-        return self._scan.attachments
-
-    def _written(self, key: str) -> str:
-        """What McapRecordingWriter wrote of the whole recording."""
-        return self._scan.metadata.get("fleetmap", {}).get(key, "")
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, tuple[str, bytes]] = {}
+        self._chunk_starts: list[int] | None = None
+        self._chunks: dict[int, bytes] = {}
+        self._too_large = 0
+        self._bad_chunks: list[tuple[int, int]] = []  # byte and size
 
     def messages(self) -> Iterator[Message]:
-        return self._scan.messages()
-
-    def issues(self) -> list[DataIssue]:
-        return [*self._scan.damage.all(), *([UNCERTAIN_STAMPS] if self._written("stamps") else [])]
+        """See Container: in the order of the file."""
+        self._file.seek(0)
+        if self._file.read(len(MAGIC)) != MAGIC:
+            fault = what_file_instead(self.path) or "no MCAP file: it does not begin as one; copy the recording again"
+            raise RecordingError(f"{self.path} is {fault}")
+        at: int | None = len(MAGIC)
+        while at is not None:
+            is_end, next_at = yield from self._record(at)
+            if is_end:
+                self._file.seek(max(0, self.size - len(MAGIC)))
+                if self._file.read() != MAGIC:
+                    self._note("the file ends inside its index", "no message is missing")
+                break
+            at = self._next_indexed_chunk(at) if next_at is None else next_at
+        if self._too_large:
+            limit = f"the limit of a record is {MAX_MESSAGE_BYTES >> 20} MiB"
+            self.issues.append(DataIssue("records that are too large", f"{self._too_large} left out; {limit}"))
+        if self._bad_chunks:
+            size = sum(size for _, size in self._bad_chunks)
+            where = f"{len(self._bad_chunks)} with {size} bytes left out, the first at byte {self._bad_chunks[0][0]}"
+            self.issues.append(DataIssue("damaged chunks (checksum or compression)", where))
 
     def read(self, place: Place) -> bytes:
-        return self._reader.read(Location(*place))
+        at, length, chunk_at = place
+        if chunk_at >= 0:
+            return self._unpacked_chunk(chunk_at)[at : at + length]
+        self._file.seek(at)
+        data = self._file.read(length)
+        if len(data) < length:
+            raise RecordingError(f"{self.path} became shorter while it was read; is it still being written?")
+        return data
 
     def close(self) -> None:
         self._file.close()
 
+    def _record(self, at: int) -> Generator[Message, None, tuple[bool, int | None]]:
+        """Yields the messages of the record at `at`; returns True at the data's end, and where the next record begins, None if unknown."""
+        self._file.seek(at)
+        head = self._file.read(_RECORD_HEAD.size)
+        if len(head) < _RECORD_HEAD.size:
+            why = "it ends inside a record's head" if head else "the recorder was stopped hard"
+            self._note("the file has no end mark", why)
+            return False, None
+        opcode, length = _RECORD_HEAD.unpack(head)
+        start, rest = at + len(head), self.size - at - len(head)
+        if not 1 <= opcode < 0x80 or length > _LARGEST_RECORD_BYTES:
+            self._note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
+            return False, None
+        if length > rest:
+            self._note(
+                "the file ends inside a record",
+                f"{length - rest} of {length} bytes of the record at byte {at} are missing",
+            )
+            if opcode == Opcode.CHUNK:
+                yield from self._chunk(start, self._file.read(min(rest, _MAX_RECORD_BYTES)), is_cut=True)
+            return False, None
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return True, None
+        if length > _MAX_RECORD_BYTES:
+            self._too_large += 1
+        elif opcode == Opcode.CHUNK:
+            yield from self._chunk(start, self._file.read(length))
+        elif opcode == Opcode.MESSAGE or opcode in _PARSED:
+            yield from self._content(opcode, memoryview(self._file.read(length)), start, -1)
+        return False, start + length
 
-def _mcap_file(path: Path) -> Path | None:
-    if path.is_dir():
-        return next(iter(sorted(path.glob("*.mcap"))), None)
-    if not path.is_file():
-        return None
-    with path.open("rb") as file:
-        return path if path.suffix == ".mcap" or file.read(len(MAGIC)) == MAGIC else None
+    def _chunk(self, at: int, content: bytes, *, is_cut: bool = False) -> Iterator[Message]:
+        try:
+            chunk = _parsed(Opcode.CHUNK, content)
+            if chunk.uncompressed_size > MAX_MESSAGE_BYTES:
+                self._too_large += 1
+                return
+            if is_cut and chunk.compression:
+                raise ValueError("the rest of a compressed chunk says nothing")
+            unpacked = memoryview(unpack(chunk.compression, chunk.data, chunk.uncompressed_size))
+            is_sound = len(unpacked) == chunk.uncompressed_size
+            if chunk.uncompressed_crc and is_sound:
+                is_sound = zlib.crc32(unpacked) == chunk.uncompressed_crc
+            if not is_cut and not is_sound:
+                raise ValueError("checksum")
+        except ValueError:
+            self._bad_chunks.append((at, len(content)))
+            return
+        if chunk.compression:
+            base, chunk_at = 0, at
+        else:
+            base, chunk_at = at + 40, -1  # the records lie in the file as they are, behind the chunk's head
+        position = 0
+        while position + _RECORD_HEAD.size <= len(unpacked):
+            opcode, length = _RECORD_HEAD.unpack_from(unpacked, position)
+            position += _RECORD_HEAD.size
+            if position + length > len(unpacked):
+                return
+            if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._content(opcode, unpacked[position : position + length], base + position, chunk_at)
+            position += length
+
+    def _content(self, opcode: int, content: memoryview, at: int, chunk_at: int) -> Iterator[Message]:
+        """The message in a record's content at byte `at`; other records are kept."""
+        try:
+            if opcode != Opcode.MESSAGE:
+                self._keep_record(_parsed(opcode, content), content)
+                return
+            if len(content) < _MESSAGE_HEAD.size:
+                raise ValueError("it ends too early")
+            channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+            channel = self._channels.get(channel_id)
+            if channel is None:
+                raise ValueError(f"message of an unknown channel {channel_id}")
+        except ValueError as error:
+            self._note("a damaged record", f"kind {opcode} at byte {at}: {error}")
+            return
+        head = _MESSAGE_HEAD.size
+        yield channel, log_time, (at + head, len(content) - head, chunk_at), content[head:]
+
+    def _keep_record(self, record: Any, content: memoryview) -> None:
+        self.keep(len(content))
+        match record:
+            case records.Schema():
+                self._schemas.setdefault(record.id, (record.name.replace("/msg/", "/"), record.data))
+            case records.Channel():
+                schema = self._schemas.get(record.schema_id, ("", b""))
+                channel = Channel(record.id, record.topic, record.message_encoding, *schema)
+                self._channels.setdefault(record.id, channel)
+            case records.Attachment():
+                (crc,) = struct.unpack_from("<I", content, len(content) - 4)
+                if crc and zlib.crc32(content[:-4]) != crc:
+                    raise ValueError(f"the attachment {record.name[:80]!r} fails its checksum")
+                self.attachments[record.name] = record.data
+            case records.Metadata(name="fleetmap"):  # what McapRecordingWriter wrote of the whole recording
+                self.name = record.metadata.get("name", self.name)
+                if "stamps" in record.metadata:
+                    self.issues.append(UNCERTAIN_STAMPS)
+
+    def _unpacked_chunk(self, at: int) -> bytes:
+        if at not in self._chunks:
+            self._file.seek(at - 8)
+            (length,) = struct.unpack("<Q", self._file.read(8))
+            chunk = _parsed(Opcode.CHUNK, self._file.read(min(length, _MAX_RECORD_BYTES)))
+            while len(self._chunks) >= _KEPT_CHUNKS:
+                del self._chunks[next(iter(self._chunks))]
+            self._chunks[at] = unpack(chunk.compression, chunk.data)
+        return self._chunks[at]
+
+    def _next_indexed_chunk(self, after: int) -> int | None:
+        """Start of the first chunk behind `after`, by the index at the file's end; None without one."""
+        if self._chunk_starts is None:
+            self._chunk_starts = sorted(self._indexed_chunks())
+        behind = bisect_right(self._chunk_starts, after)
+        return self._chunk_starts[behind] if behind < len(self._chunk_starts) else None
+
+    def _indexed_chunks(self) -> Iterator[int]:
+        tail_bytes = _RECORD_HEAD.size + 20 + len(MAGIC)  # footer and end mark
+        self._file.seek(max(0, self.size - tail_bytes))
+        tail = self._file.read(tail_bytes)
+        if len(tail) < tail_bytes or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
+            return
+        at = summary_at = _parsed(Opcode.FOOTER, tail[_RECORD_HEAD.size :]).summary_start
+        while 0 < at <= self.size - _RECORD_HEAD.size:
+            self._file.seek(at)
+            opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
+            if opcode == Opcode.CHUNK_INDEX and length <= _MAX_RECORD_BYTES:
+                self.keep(0)
+                try:
+                    chunk_at = _parsed(opcode, self._file.read(length)).chunk_start_offset
+                except ValueError:
+                    return
+                if chunk_at < summary_at:
+                    yield chunk_at
+            at += _RECORD_HEAD.size + length
+
+    def _note(self, what: str, detail: str) -> None:
+        if len(self.issues) < _MOST_ISSUES:
+            self.issues.append(DataIssue(what, detail))
+
+
+def _parsed(opcode: int, content: bytes | memoryview) -> Any:
+    """A record by the mcap library, which is given its content alone; ValueError for what is none."""
+    try:
+        return _PARSED[opcode].read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct.error, UnicodeDecodeError) as error:
+        raise ValueError("it ends too early, or is no text") from error

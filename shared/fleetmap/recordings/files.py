@@ -1,0 +1,81 @@
+"""Reading files that may be missing, too large or something else: pointers of Git LFS, pages of a web server, zip files."""
+
+import hashlib
+import re
+import stat
+from pathlib import Path
+
+from fleetmap.errors import FleetmapError, RecordingError
+from fleetmap.recordings.limits import MAX_TABLE_BYTES
+
+_BLOCK_BYTES = 1 << 20
+
+
+def what_instead(head: bytes) -> str:
+    """What the first bytes of a file are in place of its content, with what to do; empty where they may be the content."""
+    if head.startswith(b"version https://git-lfs.github.com/spec/"):
+        return "a Git LFS pointer in place of the file; `git lfs pull` fetches it"
+    if head.startswith(b"PK\x03\x04"):
+        return "a zip file; `unzip` it and name what was in it"
+    if head[:512].lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith((b"<!doctype html", b"<html")):
+        advice = "download it again while signed in, or with `git lfs pull` where it is in Git LFS"
+        return f"an HTML page (of a sign-in or an error) in place of the file; {advice}"
+    return ""
+
+
+def file_head(path: Path, size: int) -> bytes:
+    """The first bytes of a file; none of what is no regular file or cannot be read."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as file:
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def what_file_instead(path: Path) -> str:
+    """As `what_instead`, of the file at `path`."""
+    return what_instead(file_head(path, 512))
+
+
+def read_text(
+    path: Path,
+    expected: str,
+    *,
+    most_bytes: int = MAX_TABLE_BYTES,
+    errors: str = "strict",
+    error_type: type[FleetmapError] = RecordingError,
+) -> str:
+    """The text of a file without a byte order mark; an `error_type` for what cannot be read, is no text, too large or something else.
+
+    expected: words on what the file should hold. errors: `replace` for tables, where damage costs lines and not the file.
+    """
+    if fault := what_file_instead(path):
+        raise error_type(f"{path} is {fault}")
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise error_type(f"{path} is no regular file; {expected}")
+        if status.st_size > most_bytes:
+            raise error_type(f"{path} has {status.st_size} bytes; at most {most_bytes} are read, {expected}")
+        return path.read_text(encoding="utf-8-sig", errors=errors)
+    except OSError as error:
+        raise error_type(f"{path} cannot be read ({error.strerror}); check the path, {expected}") from error
+    except UnicodeDecodeError as error:
+        raise error_type(f"{path} is not a text file (byte {error.start} is no UTF-8); {expected}") from error
+
+
+def hash_file(path: Path, digest: "hashlib._Hash") -> None:
+    """Feeds the bytes of a file to `digest`, a block at a time."""
+    try:
+        with path.open("rb") as file:
+            while block := file.read(_BLOCK_BYTES):
+                digest.update(block)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read any more ({error.strerror}); was the recording moved?") from error
+
+
+def natural_key(name: str) -> tuple[object, ...]:
+    """Sorts file names by the numbers in them."""
+    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name))

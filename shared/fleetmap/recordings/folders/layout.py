@@ -1,0 +1,306 @@
+"""What folder formats share: lists of image files, tables of samples, and the recording made of them."""
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.errors import RecordingError
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.recordings.files import hash_file, read_text, what_instead
+from fleetmap.recordings.image_series import DepthRegistration, ImageSeries, SeriesFrames, pair_images
+from fleetmap.recordings.images import StoredImage, file_kind, image_size, is_cut, is_damaged_png
+from fleetmap.recordings.limits import MAX_IMAGE_BYTES
+from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
+from fleetmap.recordings.tum import parse_stamp_ns
+from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+
+_HEAD_BYTES, _TAIL_BYTES = 4096, 8192
+_LAST_NS = 2**63 - 1
+_IMU_NAMES = {
+    "gyro": ("w_", "wx", "wy", "wz", "gyr", "gx", "gy", "gz", "omega", "ang"),
+    "accel": ("a_", "ax", "ay", "az", "acc", "lin"),
+}
+ImageFiles = ImageSeries[Path]
+
+
+@dataclass(frozen=True)
+class FileReader:
+    """An ImageReader of image files below `root`. read_files: all other files read, for the content's hash."""
+
+    root: Path
+    read_files: Sequence[Path]
+
+    def read(self, source: Path, stamp_ns: int) -> StoredImage:
+        return read_image(source)
+
+    def apart(self) -> "FileReader":
+        return self
+
+    def hash_into(self, digest: "hashlib._Hash", images: list[Path]) -> None:
+        """Names, sizes and bytes of all files read, in the order of their names."""
+        named = {self._portable_name(path): path for path in (*self.read_files, *images)}
+        for name in sorted(named):
+            digest.update(f"{name}\0{named[name].stat().st_size}\0".encode())
+            hash_file(named[name], digest)
+
+    def close(self) -> None:
+        """Does nothing: no file stays open."""
+
+    def _portable_name(self, path: Path) -> str:
+        return path.relative_to(self.root).as_posix() if path.is_relative_to(self.root) else f"outside/{path.name}"
+
+
+def file_frames(
+    root: Path,
+    log: ReadLog,
+    left: ImageFiles,
+    right: ImageFiles | None = None,
+    depth: ImageFiles | None = None,
+    registration: DepthRegistration | None = None,
+) -> SeriesFrames[Path]:
+    """Frames of paired image files."""
+    return SeriesFrames(FileReader(root, log.files), left, right, depth, registration)
+
+
+def paired_cameras(cameras: Sequence[ImageFiles], log: ReadLog) -> tuple[ImageFiles, ImageFiles | None]:
+    """Left and right images of the same moments, see `pair_images`; no right ones for one camera."""
+    return (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
+
+
+def read_image(path: Path) -> StoredImage:
+    """The image in a file, not decoded; RecordingError where it cannot be read or has more bytes than any image."""
+    try:
+        if (size := path.stat().st_size) > MAX_IMAGE_BYTES:
+            raise RecordingError(
+                f"{path} has {size} bytes; images of at most {MAX_IMAGE_BYTES >> 20} MiB are read, remove it"
+            )
+        return StoredImage("file", path.read_bytes(), str(path))
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the recording again") from error
+
+
+def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: ReadLog) -> ImageFiles:
+    """The images with increasing stamps that exist, are whole and of the size of most; the others are noted in `log`.
+
+    RecordingError where none is left.
+    """
+    series = ImageSeries(stamps_ns, tuple(paths)).forward(what, log)
+    folders = [folder for folder in {path.parent for path in series.sources} if folder.is_dir()]
+    file_bytes = {entry.path: entry.stat().st_size for folder in folders for entry in os.scandir(folder)}
+    left_out: dict[str, list[str]] = {}
+    kept, sizes_px = [], []
+    for index, path in enumerate(series.sources):
+        fault, size_px = "missing", None
+        if str(path) in file_bytes:
+            fault, size_px = _fault_and_size(path, file_bytes[str(path)])
+            if fault:
+                log.damaged_ns.append(int(series.stamps_ns[index]))
+        if fault:
+            left_out.setdefault(fault, []).append(path.name)
+        else:
+            kept.append(index)
+            sizes_px.append(size_px)
+    for fault, names in left_out.items():
+        log.note(f"{what}: images {fault}", f"{len(names)} of {len(series)}, the first is {names[0]}")
+    if not kept:
+        faults = "; ".join(f"{len(names)} {fault}, the first is {names[0]}" for fault, names in left_out.items())
+        raise RecordingError(
+            f"{what}: none of the {len(series)} images is there and readable ({faults}); copy the recording again"
+        )
+    return series.take(np.array(kept, np.int64)[usual_size(sizes_px, what, log)])
+
+
+def _fault_and_size(path: Path, file_bytes: int) -> tuple[str, tuple[int, int] | None]:
+    """Why a file is no whole image, empty if it is one; and its width and height, None where its head does not say."""
+    if not file_bytes:
+        return "without a byte", None
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+            file.seek(max(0, file_bytes - _TAIL_BYTES))
+            tail = file.read(_TAIL_BYTES)
+            file.seek(0)
+            is_checked = file_kind(head) == "png" and file_bytes <= MAX_IMAGE_BYTES
+            is_damaged = is_checked and is_damaged_png(file.read(file_bytes))
+    except OSError as error:
+        return f"that cannot be read ({error.strerror})", None
+    if fault := what_instead(head):
+        return f"that are {fault}", None
+    if is_cut(head, tail):
+        return "cut off", None
+    if is_damaged:
+        return "damaged inside", None
+    size_px = image_size(head)
+    if size_px is None and file_kind(head) == "other" and not head.startswith((b"II*\0", b"MM\0*")):
+        return "of no format that is read", None  # the header of a TIFF file may be at its end
+    return "", size_px
+
+
+# ------------------------------------------------------------------------------------------------------------------ tables
+
+
+def read_table(path: Path) -> str:
+    """The text of a table; bytes that are no text are replaced, so that damage costs lines and not the file."""
+    return read_text(path, "the recording is incomplete, copy it again", errors="replace")
+
+
+def read_image_list(path: Path, log: ReadLog, *, seconds: bool = False) -> tuple[Stamps, list[Path]]:
+    """Stamps (N,) and image files that a list gives in its first two columns: in ns, or in decimal seconds.
+
+    RecordingError for a line that has none, but for names of columns in the first, and for files outside the list's folder.
+    """
+    stamps, files = [], []
+    for number, line in enumerate(read_table(path).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        columns = re.split(r"[,;\t]", line) if re.search(r"[,;\t]", line) else line.split()
+        stamp, name, *_ = [*(column.strip(' \t"') for column in columns), ""]
+        if number == 1 and name and not stamp[:1].isdecimal() and not seconds:
+            continue  # names of columns
+        try:
+            stamp_ns = parse_stamp_ns(stamp) if seconds else _whole_ns(stamp, where)
+            if not name or stamp_ns > _LAST_NS:
+                raise ValueError("the line is too short" if not name else "the stamp is too large")
+        except ValueError as error:
+            unit = "seconds" if seconds else "ns"
+            raise RecordingError(f"{where}: {line[:60]!r} is no stamp in {unit} and a file name: {error}") from error
+        if ".." in Path(name).parts or Path(name).is_absolute():
+            raise RecordingError(f"{where}: {name[:80]!r} is not inside the folder; name images below it")
+        stamps.append(stamp_ns)
+        files.append(path.parent / name)
+    if not files:
+        raise RecordingError(f"{path} names no image; copy the recording again")
+    log.files.append(path)
+    return np.array(stamps, np.int64), files
+
+
+def _whole_ns(word: str, where: str) -> int:
+    """RecordingError for a number with a decimal point or exponent, with the unit that it looks like; ValueError for other words."""
+    if word.isdecimal():
+        return int(word)
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if word.lstrip("+-").isdecimal() or not np.isfinite(value):
+        raise ValueError(f"stamp {word[:40]!r}")
+    names = {1e17: "nanoseconds that a program rounded", 1e14: "microseconds", 1e11: "milliseconds", 0.0: "seconds"}
+    unit = next(name for least, name in names.items() if abs(value) >= least)
+    raise wrong_unit(f"{where}:", unit, f"{word[:40]} is no whole number", "write all digits of the nanoseconds")
+
+
+def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
+    """Stamps (N,) in ns and values (N, columns) of a text table, separated by commas or blanks; # begins a comment.
+
+    Lines that are no such row (a file cut off in the middle of one) are noted in `log`; RecordingError where no line is one, and for
+    stamps with decimals.
+    """
+    text = read_table(path).replace(",", " ").replace(";", " ")
+    first, _, rest = text.lstrip().partition("\n")
+    if first[:1].isalpha() and re.match(r"\s*\d", rest):  # names of columns
+        text = rest
+    dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (columns,))])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of empty tables, which are an error below
+            table: AnyArray = np.loadtxt(io.StringIO(text), dtype, comments="#", usecols=range(columns + 1), ndmin=1)
+    except ValueError:
+        table = _whole_rows(path, text, dtype, log)
+    if len(table) == 0:
+        first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
+        with contextlib.suppress(ValueError):  # it looks like no unit
+            _whole_ns(first.split()[0] if first else "", str(path))
+        there = f"its first is {first[:80]!r}" if first else "it is empty"
+        raise RecordingError(
+            f"{path} holds no row of a stamp in ns and {columns} numbers, {there}; the recording is incomplete, copy it again"
+        )
+    log.files.append(path)
+    return table["stamp_ns"], table["values"]
+
+
+def _whole_rows(path: Path, text: str, dtype: "np.dtype[np.void]", log: ReadLog) -> AnyArray:
+    columns = dtype["values"].shape[0]
+    rows, bad = [], 0
+    for words in (line.partition("#")[0].split() for line in text.splitlines()):
+        try:
+            stamp, values = int(words[0]), [float(word) for word in words[1 : columns + 1]]
+        except (ValueError, IndexError):
+            bad += bool(words)
+            continue
+        if len(values) == columns and abs(stamp) <= _LAST_NS:
+            rows.append((stamp, values))
+        else:
+            bad += 1
+    log.note(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines are no stamp and {columns} numbers")
+    return np.array(rows, dtype)
+
+
+def read_imu(path: Path, log: ReadLog) -> ImuSamples:
+    """The samples in a table of stamps, gyro rad/s and accelerometer m/s^2; none where there is no such file.
+
+    The columns may come in another order than EuRoC's where the first line names them.
+    """
+    if not path.is_file():
+        return ImuSamples.empty()
+    stamps_ns, rows = read_stamped_rows(path, 6, log)
+    found: dict[str, int] = {}
+    header = read_table(path).lstrip().partition("\n")[0].lower()
+    for number, name in enumerate(re.split(r"[,;\t]", header)[1:7]):
+        word = re.sub(r"[\[(].*", "", name).strip()
+        kind = next((kind for kind, starts in _IMU_NAMES.items() if word.startswith(starts)), "")
+        if kind and word[-1:] in "xyz":
+            found[kind + word[-1]] = number
+    order = [found.get(kind + axis, -1) for kind in _IMU_NAMES for axis in "xyz"]
+    if -1 in order:
+        order = list(range(6))
+    return clean_imu(stamps_ns, rows[:, order[:3]], rows[:, order[3:]], log)
+
+
+def read_ground_truth(path: Path, log: ReadLog) -> Trajectory | None:
+    """The trajectory in a table of stamps and x y z qw qx qy qz; None where there is no such file or no usable row."""
+    return trajectory_of_rows(*read_stamped_rows(path, 7, log), log) if path.is_file() else None
+
+
+def optional_truth(file: Path, log: ReadLog, read: Callable[[Path], Trajectory]) -> Trajectory | None:
+    """The ground truth in a file beside a recording, which is used without it where it cannot be read."""
+    if not file.is_file():
+        return None
+    log.files.append(file)
+    try:
+        return read(file)
+    except RecordingError as error:
+        log.note("ground truth not used", str(error))
+        return None
+
+
+def read_numbers(path: Path, widths: Sequence[int]) -> Array:
+    """(N, width) of a text table of finite numbers, with one of the widths; RecordingError for anything else."""
+    rows: list[list[float]] = []
+    expected = " or ".join(str(width) for width in widths)
+    for number, line in enumerate(read_table(path).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) not in ((len(rows[0]),) if rows else widths) or not np.isfinite(row).all():
+            raise RecordingError(
+                f"{path}, line {number}: {line[:60]!r} are not {expected} finite numbers; copy the recording again"
+            )
+        rows.append(row)
+    if not rows:
+        raise RecordingError(
+            f"{path} is empty; lines of {expected} finite numbers are expected, copy the recording again"
+        )
+    return np.array(rows)
