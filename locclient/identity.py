@@ -18,11 +18,11 @@ import msgspec
 from fleetmap.bus import Bus, TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
+from fleetmap.files import write_atomically
 from fleetmap.mapformat import check_name
 from fleetmap.messages import decode_message, robot_key
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus
     from fleetmap.trust.enrolment import CertificateInfo
 
 _LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot that was parked for eleven months comes back
@@ -74,7 +74,7 @@ class RobotIdentity:
         left = self.certificate().ends - now
         return not _LIFE - _RENEW_AFTER <= left <= _LIFE + timedelta(days=1)
 
-    def renew(self, bus: "Bus") -> None:
+    def renew(self, bus: Bus) -> None:
         """Another key and certificate in the place of the present ones; connections that stand are not touched.
 
         Raises LinkError where the server is away or refuses, StoreError where the disk does. The present ones stay then.
@@ -121,7 +121,7 @@ class RobotIdentity:
         (folder / "bundle.pem").unlink(missing_ok=True)
         return made
 
-    def _ask(self, bus: "Bus", old: bytes, timeout_s: float) -> None:
+    def _ask(self, bus: Bus, old: bytes, timeout_s: float) -> None:
         from fleetmap.trust import enrolment
 
         key = self._next_key(old)
@@ -155,20 +155,8 @@ class RobotIdentity:
 
     def _write(self, name: str, data: bytes) -> None:
         """Whole or not at all, for this account alone, also after a power cut."""
-        temporary = self.folder / f".{name}.tmp"
         with disk_errors(f"{self.folder / name} cannot be written", "make space, or choose another folder"):
-            temporary.unlink(missing_ok=True)
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(descriptor)
-            temporary.replace(self.folder / name)
-            folder = os.open(self.folder, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            write_atomically(self.folder / name, [data])
 
 
 @dataclass(frozen=True, kw_only=True)

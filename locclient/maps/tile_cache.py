@@ -1,7 +1,6 @@
 """The robot's disk cache of map bytes, addressed by their SHA-256 and bounded in size."""
 
 import os
-import secrets
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,6 +11,7 @@ import msgspec
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
+from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
 from fleetmap.messages import WantedVersion
 
@@ -132,7 +132,7 @@ class TileCache:
         """Takes back `keep`, and removes what no other version needs; raises StoreError where the disk refuses."""
         with disk_errors(f"version {version} of {site} cannot be removed from the cache", "check its rights"):
             self._kept_path(site, version).unlink(missing_ok=True)
-            _sync_folder(self._kept_path(site, version).parent)
+            sync_path(self._kept_path(site, version).parent)
         gone = self._kept.pop((site, version), None)
         for sha256 in () if gone is None else set(gone.blobs) - self._used():
             self._remove(sha256)
@@ -226,19 +226,11 @@ class TileCache:
 
     def _write(self, path: Path, data: bytes) -> bool:
         """Whether `data` is under `path` now, whole and on the disk; if not, what was there before is, and a fault is kept."""
-        temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-            _sync_folder(path.parent)
+            write_atomically(path, [data], mode=0o666)
         except OSError as error:
             self._note(f"{path} cannot be written ({error.strerror}); make space for the cache")
-            with suppress(OSError):
-                temporary.unlink()
             return False
         return True
 
@@ -260,12 +252,3 @@ class TileCache:
 
     def _path(self, sha256: str) -> Path:
         return self._folder / blob_path(sha256)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes names in a folder survive a loss of power."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

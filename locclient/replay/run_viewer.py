@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.errors import appearing_file
+from fleetmap.files import appearing_file
 from fleetmap.foxglove import channels
 from fleetmap.foxglove.channels import BASE, CAMERA, MAP, ODOM, ChannelMessage, RobotMark, Shown
 from fleetmap.geometry import Array, se3_inverse

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import appearing_file
+from fleetmap.files import appearing_file
 from fleetmap.foxglove import require_foxglove
 from fleetmap.mapformat import decode_tile
 from fleetmap.messages import finite, report_dict

@@ -6,10 +6,11 @@ from pathlib import Path
 import msgspec
 
 from fleetmap.errors import LinkError, StoreError, UsageError
+from fleetmap.files import write_atomically
 from fleetmap.mapformat import check_name
 from fleetmap.mapformat.manifest import Name
 from fleetmap.messages import FailureAck
-from mapserver.store.files import check_no_link, make_folder, write_atomically
+from mapserver.store.files import check_no_link, make_folder
 
 _MAX_KEPT = 100
 _log = logging.getLogger(__name__)

@@ -24,9 +24,10 @@ from pathlib import Path
 from types import FrameType
 
 from fleetmap.errors import FleetmapError, RecordingError, UsageError, disk_errors
+from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, open_recording
-from mapserver.store.files import make_folder, sync_folder, write_atomically
+from mapserver.store.files import make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
 _HASH_SIGNS = 12
@@ -254,8 +255,8 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
         except OSError:
             reason_file.unlink(missing_ok=True)
             raise
-        sync_folder(folder)
-        sync_folder(path.parent)
+        sync_path(folder)
+        sync_path(path.parent)
     return target
 
 

@@ -7,16 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
+from fleetmap.files import TEMPORARY_SUFFIX, sync_path, write_atomically
 from fleetmap.mapformat import blob_path, sha256_hex, verified
-from mapserver.store.files import (
-    TEMPORARY_SUFFIX,
-    check_no_link,
-    is_plain_file,
-    make_folder,
-    read_chunks,
-    sync_folder,
-    write_atomically,
-)
+from mapserver.store.files import check_no_link, is_plain_file, make_folder, read_chunks
 
 _FOLDER = "blobs"
 
@@ -87,7 +80,7 @@ class BlobFolder:
             # A file of that name may be damaged; reading it costs less than writing it.
             if is_plain_file(path) and path.stat().st_size == size_bytes and self.is_whole(sha256):
                 # Who wrote it may have died before its name was on the disk.
-                sync_folder(path.parent)
+                sync_path(path.parent)
                 chunks = ()
             make_folder(path.parent)
             make_folder(path.parent.parent)

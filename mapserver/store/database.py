@@ -12,8 +12,8 @@ from urllib.parse import quote
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
+from fleetmap.files import sync_path
 from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sha256
-from mapserver.store.files import sync_folder
 from mapserver.store.rows import LogEntry
 from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
 
@@ -234,10 +234,9 @@ def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
     try:
         connection.execute("VACUUM INTO ?", (str(fresh),))
         fresh.chmod(path.stat().st_mode & 0o777)
-        with fresh.open("rb") as file:
-            os.fsync(file.fileno())
+        sync_path(fresh)
         fresh.replace(target)
-        sync_folder(target.parent)
+        sync_path(target.parent)
     except (OSError, sqlite3.Error) as error:
         with suppress(OSError):
             fresh.unlink()

@@ -1,45 +1,20 @@
-"""Files that survive a kill and a power cut, for their owner alone. Every call goes through `os`, where tests make it fail."""
+"""Folders, plain files and locks of a store, for its owner alone. Every call goes through `os`, where tests make it fail."""
 
 import fcntl
 import os
-import secrets
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from fleetmap.errors import StoreError, disk_errors
+from fleetmap.files import OWN_FILE, sync_path
 
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
-_OWN_FILE, _OWN_FOLDER = 0o600, 0o700  # maps, positions and pictures are nobody else's business on a shared machine
+_OWN_FOLDER = 0o700  # as OWN_FILE
 _RESERVE_BYTES = 4 << 20  # what a transaction that removes some hundred versions writes
-TEMPORARY_SUFFIX = ".tmp"
-
-
-def write_atomically(path: Path, chunks: Iterable[bytes]) -> None:
-    """The file at `path` holds the chunks afterwards, or what it held before.
-
-    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either.
-
-    Raises OSError where the disk refuses.
-    """
-    temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
-    descriptor = _open_own(temporary, os.O_WRONLY | os.O_EXCL)
-    try:
-        try:
-            for chunk in chunks:
-                _write_all(descriptor, chunk)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        os.replace(temporary, path)  # noqa: PTH105
-    except BaseException:
-        with suppress(OSError):
-            os.unlink(temporary)  # noqa: PTH108
-        raise
-    sync_folder(path.parent)
 
 
 def read_chunks(path: Path) -> Iterator[bytes]:
@@ -57,15 +32,6 @@ def read_file(path: Path) -> bytes:
     return b"".join(read_chunks(path))
 
 
-def sync_folder(folder: Path) -> None:
-    """Makes the names in `folder` survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def make_folder(folder: Path) -> None:
     """`folder` and its parents exist afterwards, also after a power cut.
 
@@ -76,9 +42,9 @@ def make_folder(folder: Path) -> None:
     for parent in reversed(missing):
         with suppress(FileExistsError):
             os.mkdir(parent, _OWN_FOLDER)  # noqa: PTH102
-        sync_folder(parent.parent)
+        sync_path(parent.parent)
     if not missing:
-        sync_folder(folder.parent)
+        sync_path(folder.parent)
 
 
 def check_no_link(root: Path, path: Path) -> None:
@@ -141,7 +107,7 @@ def locked(path: Path, *, shared: bool) -> Iterator[None]:
 
 
 def _open_own(path: Path, flags: int) -> int:
-    return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, _OWN_FILE)
+    return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, OWN_FILE)
 
 
 def _take_lock(descriptor: int, kind: int, path: Path) -> None:
@@ -155,9 +121,3 @@ def _take_lock(descriptor: int, kind: int, path: Path) -> None:
             time.sleep(0.05)
         else:
             return
-
-
-def _write_all(descriptor: int, chunk: bytes) -> None:
-    view = memoryview(chunk)
-    while view:
-        view = view[os.write(descriptor, view) :]

@@ -20,6 +20,7 @@ from typing import Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError, StoreError, disk_errors
+from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import (
     BlobEntry,
     Manifest,
@@ -44,8 +45,6 @@ from mapserver.store.files import (
     make_folder,
     make_own_file,
     read_file,
-    sync_folder,
-    write_atomically,
 )
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.garbage_collection import Garbage, Retention, collect
@@ -81,7 +80,7 @@ class MapStore(StoreQueries):
         super().__init__(root, clock_ns, read_only=read_only)
         try:
             if not read_only:
-                sync_folder(root)
+                sync_path(root)
                 self._repair_current_files()
         except BaseException:
             self._transactions.close()

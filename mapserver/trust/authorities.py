@@ -22,8 +22,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleetmap.bus import TlsFiles
 from fleetmap.errors import StateError, UsageError, disk_errors
+from fleetmap.files import write_atomically
 from fleetmap.trust.enrolment import certificate_info
-from mapserver.store.files import make_folder, write_atomically
+from mapserver.store.files import make_folder
 from mapserver.trust.http_certificate import ENDS_SOON_DAYS, check_times
 from mapserver.trust.keys import credential, key_pem, load_private
 

@@ -16,11 +16,12 @@ from fleetmap.access import Access, Holder, Purpose
 from fleetmap.bus import TlsFiles
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, StoreError, UsageError, disk_errors
+from fleetmap.files import write_atomically
 from fleetmap.mapformat import check_name
 from fleetmap.messages import encode_message
 from fleetmap.trust.enrolment import Bundle, RenewalAnswer, certificate_info, check_request, key_fingerprint
 from mapserver.store import NOBODY, Actor, MapStore
-from mapserver.store.files import locked, make_folder, write_atomically
+from mapserver.store.files import locked, make_folder
 from mapserver.trust.authorities import DAYS, Authorities
 from mapserver.trust.lists import SignedLists
 

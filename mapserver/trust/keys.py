@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from fleetmap.errors import StoreError, UsageError, disk_errors
-from mapserver.store.files import make_folder, sync_folder
+from fleetmap.files import sync_path
+from mapserver.store.files import make_folder
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
@@ -45,7 +46,7 @@ def make_key(path: Path, passphrase: str | None) -> "CryptoSigner":
             file.write(key_pem(key, passphrase))
             file.flush()
             os.fsync(descriptor)
-        sync_folder(path.parent)
+        sync_path(path.parent)
     return CryptoSigner(key)
 
 

@@ -24,8 +24,9 @@ from tuf.api.metadata import (
 from tuf.api.serialization.json import JSONSerializer
 
 from fleetmap.errors import StateError, StoreError, disk_errors
+from fleetmap.files import write_atomically
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
-from mapserver.store.files import make_folder, write_atomically
+from mapserver.store.files import make_folder
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh
 

@@ -21,8 +21,7 @@ The message holds the offending value and the next step. Caught only in the comm
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 
 class FleetmapError(Exception):
@@ -100,18 +99,3 @@ def disk_errors(fault: object, advice: str, kind: type[FleetmapError] = StoreErr
         yield
     except OSError as error:
         raise kind(f"{fault} ({error.strerror}); {advice}") from error
-
-
-@contextmanager
-def appearing_file(path: Path) -> Iterator[BinaryIO]:
-    """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
-    part = path.with_name(path.name + ".part")
-    with disk_errors(f"{part} cannot be written", "choose another place"):
-        file = part.open("wb")
-    try:
-        with file:
-            yield file
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise

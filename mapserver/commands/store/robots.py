@@ -48,7 +48,7 @@ def enrol(
     A bundle is a secret until it was used: carry it on a stick or over SSH.
     """
     from fleetmap.bus import check_endpoint
-    from mapserver.store.files import write_atomically
+    from fleetmap.files import write_atomically
     from mapserver.trust.enrolment import LISTENING, RobotRegister
 
     with open_store(where.store) as maps:

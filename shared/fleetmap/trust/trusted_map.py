@@ -2,7 +2,6 @@
 
 import fcntl
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from fleetmap.errors import LinkError, StoreError, UntrustedError, disk_errors
+from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat.names import check_name
 from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, trust_key
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
@@ -170,7 +170,7 @@ class TrustedMap:
         self._list = read_site_list((self._folder / f"{files[-1]}.json").read_bytes(), self._site)
         self._clock = _Clock(wall_s, clock.signed_s, clock.number)
         if self._files() != before or abs(wall_s - self._kept_clock_s) > _CLOCK_EVERY_S:
-            self._write("clock", " ".join(map(str, self._clock)).encode())
+            write_atomically(self._folder / "clock", [" ".join(map(str, self._clock)).encode()], mode=0o666)
             self._kept_clock_s = wall_s
             self._sync(before)
 
@@ -188,9 +188,7 @@ class TrustedMap:
                 data = self._ask(FIRST_ROOT)
                 if data is None or len(data) > _MAX_ROOT_BYTES:
                     raise UntrustedError("signature", "the server has no signed lists; update it, or serve it anew")
-                before = self._files()
-                self._write(path.name, data)
-                self._sync(before)
+                write_atomically(path, [data], mode=0o666)
                 _log.warning("first use: the keys of site %s are trusted from now on, pinned in %s", self._site, path)
             self._pinned_root = path.read_bytes()
         return self._pinned_root
@@ -208,11 +206,6 @@ class TrustedMap:
         except (FileNotFoundError, ValueError):
             return _Clock(0.0, 0.0, 0)
 
-    def _write(self, name: str, data: bytes) -> None:
-        temporary = self._folder / f".{name}.tmp"
-        temporary.write_bytes(data)
-        temporary.replace(self._folder / name)
-
     def _sync(self, before: dict[Path, bytes]) -> None:
         """python-tuf renames without fsync: after a power cut the guard against rollback would be gone.
 
@@ -220,11 +213,7 @@ class TrustedMap:
         """
         changed = [path for path, data in self._files().items() if before.get(path) != data]
         for path in [*changed, *sorted({path.parent for path in changed})]:
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync_path(path)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

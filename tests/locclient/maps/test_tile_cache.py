@@ -74,7 +74,7 @@ def test_a_full_disk_costs_the_cache_only(tmp_path: Path, monkeypatch: pytest.Mo
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("locclient.maps.tile_cache.os.fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     sha256 = put(cache, b"tile")
     assert sha256 not in cache
     assert "No space left" in cache.take_faults()[0]
@@ -125,7 +125,7 @@ def test_a_disk_that_refuses_leaves_the_old_version_active(tmp_path: Path, monke
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("locclient.maps.tile_cache.os.fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(StoreError, match="No space left"):
         cache.activate("lab", 2, [b])
     assert cache.active("lab").version == 1

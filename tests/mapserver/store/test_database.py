@@ -138,11 +138,12 @@ def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
             store.record_robot_report("lab", "r1", {}, 1)
     assert (path.read_bytes(), copy.exists()) == (before, False)
 
-    def is_full(_: Path) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def is_full(path: Path) -> None:
+        if path.is_dir():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(database_module, "sync_folder", is_full)
+        patch.setattr(database_module, "sync_path", is_full)
         with pytest.raises(StoreError, match="make space: the store is as it was"):
             MapStore.open(tmp_path)
     assert format_of(path) == FORMAT

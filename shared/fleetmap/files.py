@@ -1,0 +1,67 @@
+"""Files that are whole or not there, also after a kill and a power cut. Every call goes through `os`, where tests make it fail."""
+
+import os
+import secrets
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from fleetmap.errors import disk_errors
+
+OWN_FILE = 0o600  # maps, positions and pictures are nobody else's business on a shared machine
+TEMPORARY_SUFFIX = ".tmp"
+
+
+def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) -> None:
+    """The file at `path` holds the chunks afterwards, or what it held before.
+
+    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either.
+
+    Raises OSError where the disk refuses.
+    """
+    temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_EXCL | os.O_CREAT | os.O_CLOEXEC, mode)
+    try:
+        try:
+            for chunk in chunks:
+                _write_all(descriptor, chunk)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        os.replace(temporary, path)  # noqa: PTH105
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)  # noqa: PTH108
+        raise
+    sync_path(path.parent)
+
+
+def sync_path(path: Path) -> None:
+    """Makes the bytes of a file, or the names in a folder, survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def appearing_file(path: Path) -> Iterator[BinaryIO]:
+    """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
+    part = path.with_name(path.name + ".part")
+    with disk_errors(f"{part} cannot be written", "choose another place"):
+        file = part.open("wb")
+    try:
+        with file:
+            yield file
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _write_all(descriptor: int, chunk: bytes) -> None:
+    view = memoryview(chunk)
+    while view:
+        view = view[os.write(descriptor, view) :]
