@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
-from fleetmap.mapformat.columns import Columns, differences, planes
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.tile import Ids, Tile, check_tile
+from fleetmap.mapformat.tile import Ids, Tile, check_increasing, check_tile
 
 _RATIO = 32767.0
 
@@ -96,6 +95,52 @@ def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Ar
     return np.asarray(np.moveaxis(np.array(rows), -1, 0))
 
 
+def differences(ids: Ids) -> Ids:
+    """Each id less the one before it, the first as it is."""
+    return np.diff(ids, prepend=np.uint32(0)) if len(ids) else ids
+
+
+def planes(values: Ids, width: int) -> bytes:
+    """The low `width` bytes of each value, as byte planes: all low bytes, then all next ones."""
+    return values.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :width].T.tobytes()
+
+
+class Columns:
+    """Reads a tile's payload column by column; the caller has checked that it is long enough."""
+
+    def __init__(self, payload: bytes, offset: int) -> None:
+        self._data = np.frombuffer(payload, np.uint8)
+        self._offset = offset
+
+    def bytes(self, count: int) -> NDArray[np.uint8]:
+        """The next `count` bytes."""
+        self._offset += count
+        return self._data[self._offset - count : self._offset]
+
+    def planes(self, count: int, width: int) -> Ids:
+        """The next `count` values of `width` byte planes."""
+        rows = np.zeros((count, 4), np.uint8)
+        rows[:, :width] = self.bytes(count * width).reshape(width, count).T
+        return rows.view("<u4").reshape(count).astype(np.uint32)
+
+    def increasing(self, count: int) -> Ids:
+        """The next `count` ids; raises MapFormatError unless they are strictly increasing."""
+        return self._sums(self.planes(count, 4))
+
+    def increasing_lists(self, counts: NDArray[np.int64]) -> tuple[Ids, ...]:
+        """The next lists of ids, of so many each; errors as of `increasing`."""
+        values = self.planes(int(counts.sum()), 4)
+        return tuple(self._sums(part) for part in np.split(values, np.cumsum(counts)[:-1])) if len(counts) else ()
+
+    def _sums(self, steps: Ids) -> Ids:
+        sums = np.cumsum(steps.astype(np.uint64))
+        if len(sums) and sums[-1] >= 1 << 32:
+            raise MapFormatError(f"tile: an id adds up to {sums[-1]}, more than 32 bits hold; the bytes are damaged")
+        ids = sums.astype(np.uint32)
+        check_increasing(ids, "tile: ids")
+        return ids
+
+
 _MAGIC = b"FMTL"
 TILE_FORMAT = 2
 LANDMARK_BYTES = 48
@@ -171,7 +216,7 @@ def decode_tile(data: bytes) -> Tile:
         raise MapFormatError(f"tile ({tile_x}, {tile_y}): {places} places, the limit is {MAX_TILE_PLACES}")
     if not (np.isfinite(size_m) and 0 < size_m < 1e6):
         raise MapFormatError(f"tile ({tile_x}, {tile_y}): size_m is {size_m}; the bytes are damaged")
-    columns, steps = Columns(payload, _HEAD.size, "tile"), _STEPS[number]
+    columns, steps = Columns(payload, _HEAD.size), _STEPS[number]
     quantum_m = steps.quantum_m(size_m)
     tile = Tile(
         tile_x=tile_x,

@@ -8,23 +8,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
+from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
-from fleetmap.odometry.filter.sliding_window import SlidingWindow
-from fleetmap.odometry.imu_inputs import ImuInputs
+from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
+from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
-from fleetmap.odometry.odometry_checks import ZeroVelocityDetector
-from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, is_pause
+from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
+from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause
 from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _FOLLOWED_SHARE = 0.5  # of the tracks
 _NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
+
+
+class ImuInputs:
+    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the checks for its faults.
+
+    accelerometer: None for one camera, whose metres come from it.
+    """
+
+    def __init__(
+        self,
+        rig: OdometryRig,
+        noise: ImuNoise,
+        samples: SensorBuffer,
+        clock: GyroClock,
+        accelerometer: AccelerometerCheck | None = None,
+    ) -> None:
+        settings = rig.settings.filter
+        self.samples, self.noise, self.clock, self.accelerometer = samples, noise, clock, accelerometer
+        self.weighing_noise = replace(  # wider than its data sheet says
+            noise,
+            gyro_noise_radps_rthz=noise.gyro_noise_radps_rthz * settings.gyro_noise_scale,
+            accel_noise_mps2_rthz=noise.accel_noise_mps2_rthz * settings.accel_noise_scale,
+        )
+        self.monitor = DivergenceMonitor(settings.time_offset_sigma_s)
+
+    @property
+    def has_fault(self) -> bool:
+        return self.clock.off_s is not None or bool(self.accelerometer and self.accelerometer.fault)
 
 
 class Step(NamedTuple):

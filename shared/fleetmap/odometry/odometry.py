@@ -14,8 +14,7 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
-from fleetmap.odometry.imu_inputs import imu_inputs
-from fleetmap.odometry.modes import Mode, StartingMode, VisualMode
+from fleetmap.odometry.modes import ImuInputs, Mode, StartingMode, VisualMode
 from fleetmap.odometry.odometry_checks import MAX_OFFSET_SIGMAS
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
@@ -107,5 +106,5 @@ class Odometry:
         window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
         if self._rig.imu is None:
             return VisualMode(window)
-        inputs = imu_inputs(self._rig, self._rig.imu, self._samples, self._clock, self._accelerometer)
+        inputs = ImuInputs(self._rig, self._rig.imu, self._samples, self._clock, self._accelerometer)
         return StartingMode(window, inputs)

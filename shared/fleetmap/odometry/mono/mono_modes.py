@@ -13,19 +13,12 @@ from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter import msckf_kernels
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.imu_inputs import ImuInputs, imu_inputs
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
-from fleetmap.odometry.modes import (
-    InertialMode,
-    Mode,
-    StartingMode,
-    Step,
-    VisualMode,
-    WindowMode,
-)
+from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.odometry.tracking.tracks import Observations, TrackBatch
@@ -126,7 +119,7 @@ class MonocularMode(Mode):
         self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
         self._visual = VisualEstimate(None, np.zeros((6, 6)))
         self._unscaled: list[_UnscaledFrame] = []
-        self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 2)))
+        self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 3)))
         self._still_since_ns: int | None = None
         self._tried_ns = 0
         self._not_before_ns = -(2**62)
@@ -218,16 +211,13 @@ class MonocularMode(Mode):
 
     def _detect_standstill(self, tracked: Tracked) -> None:
         """Keeps since when the image stands still."""
-        before, old = self._newest_pixels
-        _, a, b = np.intersect1d(before, tracked.ids, return_indices=True)
-        moved_px = np.linalg.norm(old[a] - tracked.pixels[b, :2], axis=1)
-        settings = self._rig.settings
-        still = len(a) >= settings.tracker.min_inliers and np.median(moved_px) < settings.monocular.still_px
+        still_px = self._rig.settings.monocular.still_px
+        still = is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, still_px)
         if not still:
             self._still_since_ns = None
         elif self._still_since_ns is None:
             self._still_since_ns = self._stamp_ns
-        self._newest_pixels = (tracked.ids, tracked.pixels[:, :2].copy())
+        self._newest_pixels = (tracked.ids, tracked.pixels)
 
     def _metric_start(self, imu: ImuInputs, visual: VisualEstimate) -> tuple[InitialState, float | None] | None:
         """By rest, if image and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
@@ -348,9 +338,8 @@ class MonocularOdometry(Odometry):
     def _first_mode(self) -> Mode:
         rig = self._rig
         self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, self._points_in_camera)
-        self._vision = MonocularMode(
-            rig, None if rig.imu is None else imu_inputs(rig, rig.imu, self._samples, self._clock)
-        )
+        imu = None if rig.imu is None else ImuInputs(rig, rig.imu, self._samples, self._clock)
+        self._vision = MonocularMode(rig, imu)
         return self._vision
 
     def _points_in_camera(self, ids: NDArray[np.int64]) -> Array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.odometry.mono.mono_ba_kernels import adjust_window
-from fleetmap.odometry.mono.two_view import rays_from_pixels, two_view_motion
+from fleetmap.odometry.mono.two_view import midpoints, rays_from_pixels, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
 from fleetmap.pnp.pnp import Correspondences, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
@@ -15,9 +15,8 @@ from fleetmap.sensors.rectification import StereoCamera
 Ids = NDArray[np.int64]
 _HUBER_SIGMAS = 2.5
 _ITERATIONS = 8
-_CORRELATION = (
-    3.0  # points share the errors of the views they come from: a resection's own sigma is too small by about this
-)
+# Points share the errors of the views they come from: a resection's own sigma is too small by about this.
+_CORRELATION = 3.0
 _LONGEST_WAIT = 60  # frames without a first pair before the search starts again from a later one
 
 
@@ -276,21 +275,17 @@ class VisualOdometry:
         """(N, 3) points midway between rays of cameras first (N, 4, 4) and last (4, 4); NaN where angle or pixels forbid."""
         rays_a = np.einsum("nij,nj->ni", first[:, :3, :3], rays_from_pixels(self._camera, before))
         rays_b = rays_from_pixels(self._camera, now) @ last[:3, :3].T
-        apart = last[:3, 3] - first[:, :3, 3]
-        cosine = (rays_a * rays_b).sum(axis=1)
-        determinant = np.maximum(1.0 - cosine**2, 1e-12)
-        along_a = ((rays_a * apart).sum(axis=1) - cosine * (rays_b * apart).sum(axis=1)) / determinant
-        along_b = (cosine * (rays_a * apart).sum(axis=1) - (rays_b * apart).sum(axis=1)) / determinant
-        points = 0.5 * (first[:, :3, 3] + along_a[:, None] * rays_a + last[:3, 3] + along_b[:, None] * rays_b)
+        points, cosines = midpoints(rays_a, rays_b, last[:3, 3] - first[:, :3, 3])
+        points += first[:, :3, 3]
         away = np.einsum("nji,nj->ni", first[:, :3, :3], points - first[:, :3, 3])
         off_a = np.linalg.norm(self._camera.pixel_from_point(away)[:, :2] - before, axis=1)
         off_b = np.linalg.norm(
             self._camera.pixel_from_point(transform_points(se3_inverse(last), points))[:, :2] - now, axis=1
         )
-        wide = cosine < np.cos(np.radians(self._settings.point_angle_deg))
+        wide = cosines < np.cos(np.radians(self._settings.point_angle_deg))
         limit = 0.5 * self._settings.max_error_px
         with np.errstate(invalid="ignore"):
-            good = wide & (along_a > 0) & (along_b > 0) & (off_a < limit) & (off_b < limit)
+            good = wide & (off_a < limit) & (off_b < limit)
         points[~good] = np.nan
         return np.asarray(points, np.float64)
 

@@ -89,15 +89,23 @@ def triangulate_pair(camera: StereoCamera, b_from_a: Array, pixels_a: Array, pix
     """Points (N, 3) in camera a midway between the two rays, and the angles (N,) between them; NaN for parallel rays."""
     rays_a = rays_from_pixels(camera, pixels_a)
     rays_b = rays_from_pixels(camera, pixels_b) @ b_from_a[:3, :3]  # in the axes of a
-    centre = -b_from_a[:3, :3].T @ b_from_a[:3, 3]
-    cosine = (rays_a * rays_b).sum(axis=1)
+    points, cosines = midpoints(rays_a, rays_b, -b_from_a[:3, :3].T @ b_from_a[:3, 3])
+    return points, np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def midpoints(rays_a: Array, rays_b: Array, apart: Array) -> tuple[Array, Array]:
+    """Points (N, 3) midway between unit rays (N, 3) from two centres that are `apart` (3,) or (N, 3), as seen from the first one.
+
+    NaN where the rays are parallel, or meet behind a centre. And the cosines (N,) of the angles between them.
+    """
+    cosines = (rays_a * rays_b).sum(axis=1)
+    a, b = (rays_a * apart).sum(axis=1), (rays_b * apart).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = 1.0 - cosine**2
-        along_a = (rays_a @ centre - cosine * (rays_b @ centre)) / determinant
-        along_b = (cosine * (rays_a @ centre) - rays_b @ centre) / determinant
-        points = 0.5 * (along_a[:, None] * rays_a + centre + along_b[:, None] * rays_b)
+        determinant = 1.0 - cosines**2
+        along_a, along_b = (a - cosines * b) / determinant, (cosines * a - b) / determinant
+        points = 0.5 * (along_a[:, None] * rays_a + apart + along_b[:, None] * rays_b)
     points[~((along_a > 0) & (along_b > 0) & (determinant > 1e-10))] = np.nan
-    return points, np.arccos(np.clip(cosine, -1.0, 1.0))
+    return points, cosines
 
 
 def rays_from_pixels(camera: StereoCamera, pixels: Array) -> Array:
