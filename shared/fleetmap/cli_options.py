@@ -90,14 +90,14 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> 
         if isinstance(command, Group):
             group = typer.Typer(no_args_is_help=True, add_completion=False, help=command.help)
             for inner_name, inner in command.commands.items():
-                group.command(inner_name, cls=_Command)(inner)
+                group.command(inner_name, cls=RetiringCommand)(inner)
             app.add_typer(group, name=name)
         else:
-            app.command(name, cls=_Command)(command)
+            app.command(name, cls=RetiringCommand)(command)
     return app
 
 
-class _Command(typer.core.TyperCommand):
+class RetiringCommand(typer.core.TyperCommand):
     """A command that refuses an option which is gone with what replaces it."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -41,6 +41,7 @@ RETIRED = {  # keys of files, and options of commands with _ for -; what replace
     "add": "`mapserver trust rotate root --stick DIR` makes another root key",
     **dict.fromkeys(("signer", "keys", "adopt"), "the account that serves also builds and signs; delete the key"),
     **dict.fromkeys(("with_trust", "root"), "an imported version is a draft that you judge; delete the key"),
+    "images": "the simulator stores pictures as PNG, without loss",
     "witness": "`mapserver audit --verify` checks the log by itself; delete the key",
     **{
         f"oidc_{item}": _OF_PEOPLE

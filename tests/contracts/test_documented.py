@@ -69,56 +69,37 @@ def test_bus_keys_are_documented() -> None:
     assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Bus"))} == keys
 
 
-def test_causes_are_documented() -> None:
-    causes = {cause.value for cause in Cause if cause is not Cause.NONE}
-    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Causes"))} == causes
-
-
-def test_flags_are_documented() -> None:
-    assert {code_words(row[0])[0] for row in rows(section(SERVICE, "Flags"))} == {flag.value for flag in Flag}
-
-
-def test_build_report_keys_are_documented() -> None:
-    keys = {field.name for field in msgspec.structs.fields(BuildReport)}
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Build"))} == keys
-
-
-def test_session_keys_are_documented() -> None:
-    keys = {"recording", "joined", "verdict", "reason", "evidence"} | {
-        field.name for field in dataclasses.fields(Counts)
+def _fields(*kinds: type) -> set[str]:
+    """Names of the fields of records."""
+    return {
+        field.name
+        for kind in kinds
+        for field in (dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else msgspec.structs.fields(kind))
     }
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Sessions"))} == keys
 
 
-def test_evidence_keys_are_documented() -> None:
-    kinds = (
-        figures.Evidence,
-        figures.Compared,
-        figures.ProbeFigures,
-        figures.Aliasing,
-        figures.TrajectoryBreaks,
-        figures.TileDirections,
-        figures.Starts,
-        figures.LookAlike,
-        figures.RigEvidence,
-    )
-    keys = {field.name for kind in kinds for field in msgspec.structs.fields(kind)}
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Evidence"))} == keys
+EVIDENCE = (
+    figures.Evidence, figures.Compared, figures.ProbeFigures, figures.Aliasing, figures.TrajectoryBreaks,
+    figures.TileDirections, figures.Starts, figures.LookAlike, figures.RigEvidence,
+)  # fmt: skip
+RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failure_reports"}
 
 
-def test_nightly_report_keys_are_documented() -> None:
-    keys = {"state", "message"} | set(dataclasses.asdict(NightReport(1)))
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Nightly"))} == keys
-
-
-def test_replay_report_keys_are_documented() -> None:
-    keys = set(METRICS) | {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failure_reports"}
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Replay"))} == keys
-
-
-def test_fleet_measures_are_documented() -> None:
-    keys = {field.name for field in dataclasses.fields(Kpis)}
-    assert {code_words(row[0])[0] for row in rows(section(REPORTS, "Fleet"))} == keys
+@pytest.mark.parametrize(
+    ("page", "heading", "keys"),
+    [
+        (SERVICE, "Causes", {cause.value for cause in Cause if cause is not Cause.NONE}),
+        (SERVICE, "Flags", {flag.value for flag in Flag}),
+        (REPORTS, "Build", _fields(BuildReport)),
+        (REPORTS, "Sessions", _fields(Counts) | {"recording", "joined", "verdict", "reason", "evidence"}),
+        (REPORTS, "Evidence", _fields(*EVIDENCE)),
+        (REPORTS, "Nightly", _fields(NightReport) | {"state", "message"}),
+        (REPORTS, "Replay", set(METRICS) | RUN_KEYS),
+        (REPORTS, "Fleet", _fields(Kpis)),
+    ],
+)
+def test_keys_are_documented(page: str, heading: str, keys: set[str]) -> None:
+    assert {code_words(row[0])[0] for row in rows(section(page, heading))} == keys
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

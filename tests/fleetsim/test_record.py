@@ -114,19 +114,6 @@ def test_hidden_errors_are_in_the_pictures_and_not_in_the_calibration(tmp_path: 
     assert not np.array_equal(spoiled.read_frame(2).left, true.read_frame(2).left)
 
 
-def test_pictures_are_stored_as_asked(tmp_path: Path) -> None:
-    sizes, pictures = {}, {}
-    for kind in ("raw", "png", "jpeg"):
-        (tmp_path / kind).mkdir()
-        path = _record(tmp_path / kind, "--images", kind)
-        sizes[kind], pictures[kind] = path.stat().st_size, open_recording(path).read_frame(3).left
-    assert sizes["jpeg"] < sizes["png"] < sizes["raw"]
-    np.testing.assert_array_equal(pictures["png"], pictures["raw"])
-    assert 0 < np.abs(pictures["jpeg"].astype(int) - pictures["raw"]).mean() < 4
-    with pytest.raises(UsageError, match="euroc png alone"):
-        _run("record", "clip", "--out", str(tmp_path / "folder"), "--format", "euroc", "--images", "jpeg")
-
-
 _PICTURES = """
 import hashlib
 from fleetsim.recorder import Order, prepare

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, so3_log
+from fleetmap.geometry import Array
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples
@@ -108,20 +108,3 @@ def _rectified(rectifier: Rectifier, rig: RigCalibration, raw_px: Array, number:
 def zero_theta() -> Array:
     """(C,) no correction."""
     return np.zeros(len(COLUMNS))
-
-
-def true_corrections(given: RigCalibration, true: RigCalibration) -> Array:
-    """(C,) corrections that make `true` of `given`, exactly; zero for the wheels."""
-    axes, theta = RigAxes.of(given, Rectifier(given)), np.zeros(len(COLUMNS))
-    zooms = [t.intrinsics_px[0] / g.intrinsics_px[0] for g, t in zip(given.cameras, true.cameras, strict=True)]
-    shift = true.cameras[0].intrinsics_px[2:] - given.cameras[0].intrinsics_px[2:]
-    left, right = (camera.body_from_cam for camera in true.cameras)
-    body_from_rect = left[:3, :3] @ axes.rect_from_cam[0].T
-    turn = so3_log(axes.body_from_rect.T @ body_from_rect)
-    pair_turn = so3_log(body_from_rect.T @ right[:3, :3] @ axes.rect_from_cam[1].T)
-    apart = body_from_rect.T @ (right[:3, 3] - left[:3, 3])
-    late_s = true.cameras[0].imu_minus_cam_s - given.cameras[0].imu_minus_cam_s
-    first = [np.linalg.norm(apart) / axes.baseline_m - 1.0, zooms[0] - 1.0, zooms[1] / zooms[0] - 1.0, *shift]
-    place = left[:3, 3] - given.cameras[0].body_from_cam[:3, 3]
-    theta[:-1] = [*first, *pair_turn, *(apart[1:] / apart[0]), *turn, *place, late_s]
-    return theta
