@@ -9,7 +9,7 @@ import time
 
 from fleetmap import FleetmapError
 from mapserver import open_store
-from mapserver.fleet.shift_summary import SummarySettings, summarise
+from mapserver.fleet.shift_summary import summarise
 from mapserver.fleet_statistics.kpis import Kpis
 
 
@@ -29,7 +29,7 @@ def in_words(figures: Kpis) -> str:
 def main(store: str, site: str, hours: str = "24") -> None:
     """Prints the tables, the worst robots and versions first."""
     with open_store(store) as maps:
-        summary = summarise(maps, site, int(hours), time.time_ns(), SummarySettings())
+        summary = summarise(maps, site, int(hours), time.time_ns())
     print(f"{site}, version {summary.current_version}, last {hours} h: {in_words(summary.total)}")
     for title, rows in (("robot", summary.robots), ("version", summary.versions), ("cause", summary.causes)):
         for key, figures in rows:

@@ -34,38 +34,20 @@ class BuildCommandOptions(SurveyOptions):
     ] = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class GivenTrajectoryOptions:
-    """Another system's poses to begin with, and what is known of them."""
-
-    trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system to begin with.")
-    ] = None
-    trajectory_frame: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
-    ] = None
-    trajectory_scale: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
-    ] = None
-
-    def given(self) -> "OtherTrajectory | None":
-        """The trajectory that is named, None without one; UsageError for options that say something of none."""
-        from mapserver.drafting.trajectory import OtherTrajectory
-
-        if self.trajectory is None:
-            said = [name for name, value in vars(self).items() if value is not None]
-            if said:
-                raise UsageError(f"--{said[0].replace('_', '-')} says something of --trajectory FILE, which is missing")
-            return None
-        return OtherTrajectory(self.trajectory, self.trajectory_frame or "camera", self.trajectory_scale)
-
-
 @expand_options
 def build(
     context: typer.Context,
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
     options: BuildCommandOptions,
-    trajectory: GivenTrajectoryOptions,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system to begin with.")
+    ] = None,
+    trajectory_frame: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
+    ] = None,
+    trajectory_scale: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Metres in their unit of length.")
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
@@ -83,10 +65,21 @@ def build(
             context,
             use=None if options.use is None else named_sensor_set(options.use),
             replay=tuple(options.replay or ()),
-            trajectory=trajectory.given(),
+            trajectory=_other_trajectory(trajectory, trajectory_frame, trajectory_scale),
             trajectory_out=options.trajectory_out,
             picture=options.picture,
             frame_from_ground_truth=options.frame_from_ground_truth,
         ),
     )
     typer.echo(built.sentence)
+
+
+def _other_trajectory(file: Path | None, frame: str | None, scale: float | None) -> "OtherTrajectory | None":
+    from mapserver.drafting.trajectory import OtherTrajectory
+
+    if file is not None:
+        return OtherTrajectory(file, frame or "camera", scale)
+    for option, value in (("--trajectory-frame", frame), ("--trajectory-scale", scale)):
+        if value is not None:
+            raise UsageError(f"{option} says something of --trajectory FILE, which is missing")
+    return None

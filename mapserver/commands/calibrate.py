@@ -3,14 +3,13 @@
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, TopicNames, config_path, expand_options
+from fleetmap.cli_options import ConfigFile, TopicNames, config_path
 from fleetmap.errors import RecordingError, UsageError, disk_errors
 from mapserver.commands.options import Calibration, check_output, topics_of
 
@@ -22,30 +21,22 @@ if TYPE_CHECKING:
     from mapserver.survey.survey_inputs import SurveyTools
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalibrateOptions:
-    """Options of `calibrate`."""
-
+def calibrate(
+    context: typer.Context,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or files of one rig.")],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.yaml", help="Write the corrected calibration here, as a Kalibr camchain."),
-    ] = None
-    calibration: Calibration = None
-    topic: TopicNames = None
+    ] = None,
+    calibration: Calibration = None,
+    topic: TopicNames = None,
     guess: Annotated[
         str | None,
         typer.Option(
             metavar="WxH:M",
             help="No calibration is at hand: size of the raw images and metres between the cameras, 752x480:0.11.",
         ),
-    ] = None
-
-
-@expand_options
-def calibrate(
-    context: typer.Context,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folders or files of one rig.")],
-    options: CalibrateOptions,
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
@@ -53,11 +44,10 @@ def calibrate(
     What the recordings do not show keeps its value. With --guess nothing else is known: lenses and the pair's
     angles are found from focal length = image width, by the images alone.
     """
-    out, guess = options.out, options.guess
     check_output("--out", out)
     from fleetmap.recordings import OpenOptions, open_recording
 
-    topics = topics_of(context, options.topic)
+    topics = topics_of(context, topic)
     if guess is not None:
         _from_guess(recordings, out, guess, config_path(context), topics)
         return
@@ -67,7 +57,7 @@ def calibrate(
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
-        how = OpenOptions(options.calibration, topics)
+        how = OpenOptions(calibration, topics)
         sources = [_sound(opened.enter_context(open_recording(path, how))) for path in recordings]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))

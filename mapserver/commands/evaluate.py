@@ -1,35 +1,26 @@
 """`mapserver evaluate`: an estimated trajectory against the truth."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options
+from fleetmap.cli_options import ConfigFile
 from mapserver.commands.options import Json, print_json
 
 
-@dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """Options of `evaluate`."""
-
-    ground_truth: Annotated[Path, typer.Option(metavar="FILE", help="True trajectory of the same body, TUM text.")]
-    covariances: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="Covariances of the estimate; adds their NEES.")
-    ] = None
-    from_first: Annotated[
-        bool, typer.Option("--from-first", help="Align the first pose with the truth: for odometry without a map.")
-    ] = False
-    frames: Annotated[
-        int | None, typer.Option(min=1, help="Number of frames that should have an estimate, for evaluated_share.")
-    ] = None
-
-
-@expand_options
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE.tum", help="Estimated trajectory, TUM text.")],
-    options: EvaluateOptions,
+    ground_truth: Annotated[Path, typer.Option(metavar="FILE", help="True trajectory of the same body, TUM text.")],
+    covariances: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Covariances of the estimate; adds their NEES.")
+    ] = None,
+    from_first: Annotated[
+        bool, typer.Option("--from-first", help="Align the first pose with the truth: for odometry without a map.")
+    ] = False,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of frames that should have an estimate, for evaluated_share.")
+    ] = None,
     json: Json = False,
     config: ConfigFile = None,
 ) -> None:
@@ -40,13 +31,13 @@ def evaluate(
     from fleetmap.recordings.tum import read_covariances, read_tum
     from mapserver.evaluation.trajectory_error import summary
 
-    covariances = None if options.covariances is None else read_covariances(options.covariances)
-    trajectories = read_tum(estimate), read_tum(options.ground_truth)
-    found = summary(*trajectories, frames=options.frames, from_first=options.from_first, covariances=covariances)
+    trajectories = read_tum(estimate), read_tum(ground_truth)
+    spread = None if covariances is None else read_covariances(covariances)
+    found = summary(*trajectories, frames=frames, from_first=from_first, covariances=spread)
     if json:
         print_json(found)
         return
-    table = Table("error", "value", title=f"{estimate.name} against {options.ground_truth.name}")
+    table = Table("error", "value", title=f"{estimate.name} against {ground_truth.name}")
     for key, value in found.items():
         table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
     plain_console().print(table)

@@ -36,12 +36,11 @@ def report(
 ) -> None:
     """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
     from mapserver.dashboard.pages.shift_page import html_page
-    from mapserver.fleet.shift_summary import SummarySettings, summarise
+    from mapserver.fleet.shift_summary import summarise
 
     settings = settings_of(context)
-    judged_by = SummarySettings(settings.canary, settings.resurvey)
     with open_store(store, read_only=True) as maps:
-        page = html_page(summarise(maps, site, hours, time.time_ns(), judged_by))
+        page = html_page(summarise(maps, site, hours, time.time_ns(), settings.canary, settings.resurvey))
     write_output(out, page.encode())
     typer.echo(str(out))
 

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, asynccontextmanager, nullcontext,
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -190,13 +190,23 @@ def serve(
         at.viewers() as viewers,
         open_store(store) as maps,
     ):
-        shown = None if viewers is None else _Shown(viewers, at.viewed_site(maps))
+        viewed_site = "" if viewers is None else at.viewed_site(maps)
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
         with bus:
-            http = _Http(listener, guard, certificate, proxies, shown)
-            _run(maps, (bus, robots), http, settings)
+            _run(
+                maps,
+                bus,
+                robots,
+                settings,
+                listener=listener,
+                guard=guard,
+                certificate=certificate,
+                proxies=proxies,
+                viewers=viewers,
+                viewed_site=viewed_site,
+            )
     _end_process()
 
 
@@ -209,21 +219,18 @@ def _end_process() -> None:
     os._exit(0)
 
 
-class _Shown(NamedTuple):
-    viewers: "FoxgloveServer"
-    site: str
-
-
-class _Http(NamedTuple):
-    listener: "BoundedListener"
-    guard: "GuardSettings"
-    certificate: "HttpCertificate | None"
-    proxies: frozenset[str]
-    shown: _Shown | None
-
-
 def _run(
-    maps: "MapStore", guarded_bus: "tuple[Bus, BusGuard | None]", http: _Http, settings: "MapserverConfig"
+    maps: "MapStore",
+    bus: "Bus",
+    robots: "BusGuard | None",
+    settings: "MapserverConfig",
+    *,
+    listener: "BoundedListener",
+    guard: "GuardSettings",
+    certificate: "HttpCertificate | None",
+    proxies: frozenset[str],
+    viewers: "FoxgloveServer | None",
+    viewed_site: str,
 ) -> None:
     import uvicorn
     from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
@@ -250,11 +257,10 @@ def _run(
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     log_to_stderr(logging.INFO)
-    if http.guard.warning:
-        logging.getLogger(__name__).warning("%s", http.guard.warning)
+    if guard.warning:
+        logging.getLogger(__name__).warning("%s", guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
-    bus, robots = guarded_bus
     webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
@@ -264,18 +270,18 @@ def _run(
         import asyncio
 
         groups = [tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook)]
-        if http.shown is not None:  # apart from the others: no robot waits for a viewer
+        if viewers is not None:  # apart from the others: no robot waits for a viewer
             from mapserver.serving.fleet_viewer import FleetViewer
 
-            viewer = FleetViewer(maps, fleet, bus_service.surveys, http.shown.site, http.shown.viewers)
+            viewer = FleetViewer(maps, fleet, bus_service.surveys, viewed_site, viewers)
             groups.append([BackgroundTask("showing the site to viewers", _VIEW_EVERY_S, viewer.look)])
         background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
-        background.append(asyncio.create_task(http.listener.watch(server.server_state.connections)))
-        host, port = http.listener.getsockname()[:2]
-        typer.echo(f"http: {'https' if http.certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
+        background.append(asyncio.create_task(listener.watch(server.server_state.connections)))
+        host, port = listener.getsockname()[:2]
+        typer.echo(f"http: {'https' if certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
-        if http.shown is not None:
-            typer.echo(f"foxglove: {http.shown.viewers.url}")
+        if viewers is not None:
+            typer.echo(f"foxglove: {viewers.url}")
         typer.echo("ready")
         yield
         for task in background:
@@ -283,11 +289,11 @@ def _run(
         await asyncio.gather(*background, return_exceptions=True)
         _bound_the_end(fleet)
 
-    api = ApiSettings(http.guard, settings.gate, settings.canary, settings.resurvey)
+    api = ApiSettings(guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
     # Around the middleware that puts the client's address in the place of the proxy's.
-    served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(http.proxies)), http.guard.proxy)  # type: ignore[arg-type]
+    served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
     config = uvicorn.Config(
         served,
         loop="asyncio",  # uvloop would not ask the listener
@@ -300,16 +306,16 @@ def _run(
         timeout_graceful_shutdown=_STOP_WITHIN_S,
         ws_max_size=MAX_BODY_BYTES,
         proxy_headers=False,
-        ssl_certfile=None if http.certificate is None else http.certificate.certificate,
-        ssl_keyfile=None if http.certificate is None else http.certificate.key,
+        ssl_certfile=None if certificate is None else certificate.certificate,
+        ssl_keyfile=None if certificate is None else certificate.key,
     )
     config.load()
-    if http.certificate is not None and config.ssl is not None:
+    if certificate is not None and config.ssl is not None:
         import ssl
 
         config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
-        renew = partial(http.certificate.renew, config.ssl)
-        tasks.append(BackgroundTask("looking at the certificate of HTTP", _WARN_EVERY_S, http.certificate.warn))
+        renew = partial(certificate.renew, config.ssl)
+        tasks.append(BackgroundTask("looking at the certificate of HTTP", _WARN_EVERY_S, certificate.warn))
         tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
     # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
     # the default ones would end the process with a status that says it was killed.
@@ -320,7 +326,7 @@ def _run(
     bus.open()
     try:
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
-            server.run(sockets=[http.listener])
+            server.run(sockets=[listener])
     finally:
         if webhook is not None:
             webhook.close()

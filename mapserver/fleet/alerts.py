@@ -59,7 +59,7 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
         trust_status,
     )  # late: zenoh comes with it, and builds, which read the settings, need none
 
-    found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, (info.site, now_ns))]
+    found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, info.site, now_ns)]
     with suppress(StateError):  # a store that is not signed
         found += [
             Alert("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
@@ -68,8 +68,7 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
     return found
 
 
-def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site_now: tuple[str, int]) -> Iterator[Alert]:
-    site, now_ns = site_now
+def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
     yield from _failure_rate(store, settings, site, now_ns)
     for robot in fleet.robots(site):
         yield from _lost(robot, settings, now_ns)

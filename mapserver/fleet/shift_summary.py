@@ -1,7 +1,6 @@
 """Figures of the shift leader's page, read from the store."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
@@ -33,15 +32,15 @@ class FleetSummary:
     resurvey: ResurveyList
 
 
-class SummarySettings(NamedTuple):
-    """Settings by which trials and tiles are judged."""
-
-    canary: CanarySettings = CanarySettings()
-    resurvey: ResurveySettings = ResurveySettings()
-
-
-def summarise(store: MapStore, site: str, hours: int, now_ns: int, settings: SummarySettings) -> FleetSummary:
-    """The last `hours` of a site beside as many before; raises UsageError for an unknown site."""
+def summarise(
+    store: MapStore,
+    site: str,
+    hours: int,
+    now_ns: int,
+    canary: CanarySettings = CanarySettings(),  # noqa: B008  frozen
+    resurvey: ResurveySettings = ResurveySettings(),  # noqa: B008
+) -> FleetSummary:
+    """The last `hours` of a site beside as many before; raises UsageError for an unknown site. canary, resurvey: what judges both."""
     current = store.current(site)
     until = hour_of(now_ns) + 1
     since = until - hours
@@ -59,8 +58,8 @@ def summarise(store: MapStore, site: str, hours: int, now_ns: int, settings: Sum
         causes=_table(store, site, "cause", since),
         by_hour=[(hour, kpis(counts)) for hour, counts in store.fleet.hours(site, "site", since_hour=since).items()],
         failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
-        trials=[(row, find(store, row, settings.canary, now_ns)) for row in store.canaries(site)[:1]],
-        resurvey=resurvey_list(store, site, settings.resurvey, now_ns),
+        trials=[(row, find(store, row, canary, now_ns)) for row in store.canaries(site)[:1]],
+        resurvey=resurvey_list(store, site, resurvey, now_ns),
     )
 
 

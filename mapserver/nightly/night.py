@@ -101,8 +101,8 @@ def last_report(store: Path, site: str) -> dict[str, Any] | None:
     return None if last is None else {"state": last.state, "message": last.message, **last.report}
 
 
-def _has_site(maps: MapStore, site: str) -> bool:
-    return any(info.site == site for info in maps.sites())
+def _versions(maps: MapStore, site: str) -> list[VersionInfo]:
+    return maps.versions(site) if any(info.site == site for info in maps.sites()) else []
 
 
 def _like(names: Sequence[object]) -> str:
@@ -110,8 +110,7 @@ def _like(names: Sequence[object]) -> str:
 
 
 def _current(maps: MapStore, site: str) -> int | None:
-    info = maps.current(site) if _has_site(maps, site) else None
-    return None if info is None else info.version
+    return next((info.current_version for info in maps.sites() if info.site == site), None)
 
 
 def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
@@ -193,20 +192,17 @@ class _Night:
     def _left_draft(self) -> VersionInfo | None:
         """The draft that a killed night saved and that is still based on the current version."""
         site = self._request.site
-        if not _has_site(self._maps, site):
-            return None
         parent, resumed = _current(self._maps, site), set(self._report.resumes)
-        drafts = [info for info in self._maps.versions(site) if info.state == "draft" and info.job in resumed]
+        drafts = [info for info in _versions(self._maps, site) if info.state == "draft" and info.job in resumed]
         return next((info for info in reversed(drafts) if info.parent == parent), None)
 
     def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
         site = self._request.site
         known: dict[str, int] = {}
-        if _has_site(self._maps, site):
-            for info in self._maps.versions(site):
-                if info.state != "draft":
-                    entries = self._maps.manifest(site, info.version).recordings
-                    known |= {entry.sha256: info.version for entry in entries}
+        for info in _versions(self._maps, site):
+            if info.state != "draft":
+                entries = self._maps.manifest(site, info.version).recordings
+                known |= {entry.sha256: info.version for entry in entries}
         for recorded in recordings:
             if recorded.sha256 in known:
                 self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {known[recorded.sha256]}")

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
 IDLE_S, LIFE_S = 3600, 12 * 3600
 TRIES, TRY_EVERY_S = 5, 12
-ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = (
-    20,
-    2,
-)  # under whatever names: one address leaves half of the server's time to others
+ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = 20, 2  # under any names: one address leaves half of the server's time to others
 MIN_PASSWORD, MAX_PASSWORD = 12, 1000
 MAX_TOKEN_DAYS = 400
 _WAITING = 4  # sign-ins that may wait for their turn: more would hold the threads that answer everybody else

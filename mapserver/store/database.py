@@ -87,6 +87,10 @@ class Transactions:
         """The rows, each as a `kind` with a field for every column. Raises StoreError where the disk refuses."""
         return [kind(**row) for row in self.query(sql, values)]
 
+    def first(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> Row | None:
+        """As `rows`: the first of them, None without any."""
+        return next(iter(self.rows(kind, sql, values)), None)
+
     def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
         """One line of the log, chained to the one before it, within a transaction; site: empty where it is about none."""
         actor = entry.actor
@@ -135,11 +139,11 @@ def _opened_for_reading(path: Path) -> Database:
     log = path.with_name(f"{path.name}-wal")
     try:
         try:
-            return _current(_opened(path, _check_ours_of, "mode=ro"))
+            return _current(_opened(path, _check_ours, "mode=ro"))
         except sqlite3.OperationalError:
             if log.is_file() and log.stat().st_size > 0:
                 raise
-            return _current(_opened(path, _check_ours_of, "mode=ro&immutable=1"))
+            return _current(_opened(path, _check_ours, "mode=ro&immutable=1"))
     except sqlite3.Error as error:
         raise StoreError(
             f"the store {path.parent} cannot be read without writing ({error}); copy it to where it can be written"
@@ -156,10 +160,6 @@ def is_older(path: Path) -> bool:
     return len(head) == _HEAD_BYTES and 0 < int.from_bytes(head[_FORMAT_AT : _FORMAT_AT + 4], "big") < FORMAT
 
 
-def _check_ours_of(database: Database, path: Path) -> None:
-    _check_ours(database.conn, path)
-
-
 def _current(database: Database) -> Database:
     if int(database.conn.execute("PRAGMA user_version").fetchone()[0]) == FORMAT:
         return database
@@ -173,7 +173,7 @@ def _current(database: Database) -> Database:
 
 
 def _prepare(database: Database, path: Path) -> None:
-    _check_ours(database.conn, path)
+    _check_ours(database, path)
     database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")  # of a file that is still empty
     database.conn.execute("PRAGMA journal_mode = WAL")
     database.conn.execute("PRAGMA foreign_keys = ON")
@@ -200,7 +200,8 @@ def _transaction(database: Database, *, durable: bool) -> Iterator[sqlite3.Conne
         raise
 
 
-def _check_ours(connection: sqlite3.Connection, path: Path) -> None:
+def _check_ours(database: Database, path: Path) -> None:
+    connection = database.conn
     application = connection.execute("PRAGMA application_id").fetchone()[0]
     number = connection.execute("PRAGMA user_version").fetchone()[0]
     tables = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]

@@ -324,11 +324,11 @@ class StoreQueries:
 
     def _find_version(self, site: str, version: int) -> VersionInfo | None:
         query = "SELECT * FROM versions WHERE site = ? AND version = ?"
-        return next(iter(self._transactions.rows(VersionInfo, query, (site, version))), None)
+        return self._transactions.first(VersionInfo, query, (site, version))
 
     def _current_row(self, site: str) -> VersionInfo | None:
         query = "SELECT * FROM versions WHERE site = ? AND state = 'current'"
-        return next(iter(self._transactions.rows(VersionInfo, query, (site,))), None)
+        return self._transactions.first(VersionInfo, query, (site,))
 
     def _now(self) -> str:
         return _iso(self._clock_ns())

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.errors import FleetmapError
-from fleetmap.mapformat import Manifest, current_path, decode_manifest
+from fleetmap.mapformat import current_path, decode_manifest
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.files import is_plain_file
@@ -91,22 +91,15 @@ def _version_faults(transactions: Transactions, blobs: BlobFolder, info: Version
     rows = transactions.query(query, (info.site, info.version))
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
         faults.append(f"{name}: the database does not mention exactly the bytes of its manifest")
-    stored, made = _figures(info), _figures_of(manifest)
+    names = ("site", "version", "parent", "tile_bytes", "landmarks")
+    stored = (*(getattr(info, name) for name in names), info.tiles, info.vocabulary_sha256)
+    made = (*(getattr(manifest, name) for name in names), len(manifest.tiles), manifest.vocabulary.sha256)
     if stored != made:
         faults.append(f"{name}: the database says {stored}, its manifest {made}")
     wrong = [
         tile for tile in manifest.tiles if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes
     ]
     return faults + [f"{name}: tile {tile.x},{tile.y} has another size than its manifest says" for tile in wrong]
-
-
-def _figures(info: VersionInfo) -> tuple[object, ...]:
-    return (info.site, info.version, info.parent, info.tiles, info.tile_bytes, info.landmarks, info.vocabulary_sha256)
-
-
-def _figures_of(manifest: Manifest) -> tuple[object, ...]:
-    sizes = (len(manifest.tiles), manifest.tile_bytes, manifest.landmarks)
-    return (manifest.site, manifest.version, manifest.parent, *sizes, manifest.vocabulary.sha256)
 
 
 def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteReleases) -> list[str]:

@@ -115,8 +115,7 @@ class Authorities:
 
     def rotate_robots_ca(self, *, is_stolen: bool) -> None:
         """Another authority of robots. is_stolen: nothing that the last one signed counts any more, else it does till the next time."""
-        before = b"" if is_stolen else self._robots_ca().certificate.public_bytes(_PEM)
-        self._renew_robots_ca(before)
+        self._renew_robots_ca(before=b"" if is_stolen else self._robots_ca().certificate.public_bytes(_PEM))
 
     def sign_robot(self, key: bytes, name: str, purpose: str = "robot") -> bytes:
         """PEM of a certificate for a public key (DER). purpose: robot, enrol or survey."""

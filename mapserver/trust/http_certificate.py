@@ -26,10 +26,9 @@ class HttpCertificate:
 
     def warn(self, names: frozenset[str] = frozenset()) -> None:
         """Says in the log what clients will refuse soon, or already. names: by which the server is to be reached."""
-        from cryptography import x509
         from cryptography.x509.oid import ExtensionOID
 
-        chain = x509.load_pem_x509_certificates(self.certificate.read_bytes())
+        chain = self._chain()
         left = (chain[0].not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86_400
         if left < ENDS_SOON_DAYS:
             ends = f"{chain[0].not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
@@ -46,15 +45,14 @@ class HttpCertificate:
         if (is_public and not followers) or any(one.issuer != by.subject for one, by in followers):
             issuer = chain[0].issuer.rfc4514_string()
             _log.warning("%s does not go on with the certificate of %s; give the full chain", self.certificate, issuer)
-        if self.key.stat().st_mode & 0o007:
+        with disk_errors(f"{self.key} cannot be read", "check the path and its rights", UsageError):
+            is_open = self.key.stat().st_mode & 0o007
+        if is_open:
             _log.warning("every account of this machine can use the key %s; `chmod o= %s`", self.key, self.key)
 
     def names(self) -> frozenset[str]:
         """The DNS names that the certificate is for, those with a wildcard left out."""
-        from cryptography import x509
-
-        found = x509.load_pem_x509_certificate(self.certificate.read_bytes())
-        return frozenset(name for name in _names(found) if "*" not in name)  # addresses are let in anyway
+        return frozenset(name for name in _names(self._chain()[0]) if "*" not in name)  # addresses are let in anyway
 
     def renew(self, context: ssl.SSLContext) -> None:
         """Gives new connections the files' present content, where it is another one and fits together; else goes on with the old."""
@@ -80,10 +78,19 @@ class HttpCertificate:
                 f"--http-cert {self.certificate} and --http-key {self.key} cannot be served ({error}); give a certificate and its "
                 "unencrypted key as PEM files"
             ) from error
+        step = "put a renewed one and its key in their place"
+        check_times(self.certificate, self._chain()[0], datetime.now(UTC), step)
+
+    def _chain(self) -> "list[x509.Certificate]":
+        """The certificate, and those behind it in the file; UsageError where there is none now, as while it is replaced."""
         from cryptography import x509
 
-        found = x509.load_pem_x509_certificate(self.certificate.read_bytes())
-        check_times(self.certificate, found, datetime.now(UTC), "put a renewed one and its key in their place")
+        with disk_errors(f"{self.certificate} cannot be read", "check the path and its rights", UsageError):
+            data = self.certificate.read_bytes()
+        try:
+            return x509.load_pem_x509_certificates(data)
+        except ValueError as error:
+            raise UsageError(f"{self.certificate} holds no certificate ({error}); put a whole one there") from error
 
     def _mark(self) -> tuple[int, ...]:
         with disk_errors(f"{self.certificate} or {self.key} cannot be read", "check the paths and their rights"):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from fleetmap.errors import StoreError, UsageError, disk_errors
-from fleetmap.files import sync_path
+from fleetmap.files import write_atomically
 from mapserver.store.files import make_folder
 
 if TYPE_CHECKING:
@@ -38,15 +38,12 @@ def make_key(path: Path, passphrase: str | None) -> "CryptoSigner":
     from securesystemslib.signer import CryptoSigner
 
     key = Ed25519PrivateKey.generate()
-    with disk_errors(f"the key {path} cannot be written", "check the folder; a key is never overwritten"):
+    if path.exists():
+        raise StoreError(f"{path} is a key already, and a key is never overwritten; name another folder")
+    with disk_errors(f"the key {path} cannot be written", "check the folder"):
         if not path.parent.is_dir():
             make_folder(path.parent)
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(key_pem(key, passphrase))
-            file.flush()
-            os.fsync(descriptor)
-        sync_path(path.parent)
+        write_atomically(path, [key_pem(key, passphrase)])
     return CryptoSigner(key)
 
 

@@ -1,6 +1,5 @@
 """`mapserver align`: where a site's map lies in the drawing of its building."""
 
-from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,40 +13,26 @@ from mapserver.commands.options import ActorOptions, Json, SiteOptions, open_sto
 if TYPE_CHECKING:
     from fleetmap.geometry import Array
     from mapserver.floor_plan.alignment import Alignment
-    from mapserver.floor_plan.pins import Fit
     from mapserver.store import MapStore
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlanOptions:
-    """The drawing and what is known of it."""
-
-    plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
-    ] = None
-    pin: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
-    ] = None
-    metres_per_pixel: Annotated[
-        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: the pins give it.")
-    ] = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShowOptions:
-    """What to print."""
-
-    show: Annotated[bool, typer.Option("--show", help="Print the alignment that is kept; change nothing.")] = False
-    level: Annotated[str, typer.Option(metavar="NAME", help="Name of the level for Open-RMF.")] = "L1"
-    json: Json = False
 
 
 @expand_options
 def align(
+    *,
     where: SiteOptions,
-    given: PlanOptions,
-    shown: ShowOptions,
+    plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
+    ] = None,
+    pin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
+    ] = None,
+    metres_per_pixel: Annotated[
+        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: the pins give it.")
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Print the alignment that is kept; change nothing.")] = False,
+    level: Annotated[str, typer.Option(metavar="NAME", help="Name of the level for Open-RMF.")] = "L1",
+    json: Json = False,
     by: ActorOptions,
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
@@ -55,26 +40,26 @@ def align(
     from fleetmap.mapformat.building import ALIGNMENT
     from mapserver.floor_plan.alignment import PLAN, encode_alignment
 
-    named = given.plan is not None or bool(given.pin)
-    if shown.show + forget + named != 1:
+    named = plan is not None or bool(pin)
+    if show + forget + named != 1:
         raise UsageError("name --pin (and --plan) to align, --show to print what is kept, or --forget")
-    with open_store(where.store, read_only=shown.show) as maps:
+    with open_store(where.store, read_only=show) as maps:
         corners = _corners(maps, where.site)
         if forget:
             maps.keep_site_files(where.site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=by.named())
             typer.echo(f"site {where.site}: the alignment is forgotten; robots go by what their version says")
             return
         if named:
-            found, data = _aligned(given, corners)
+            found, data = _aligned(plan, pin or [], metres_per_pixel, corners)
             files = {ALIGNMENT: encode_alignment(found), PLAN: data}
             maps.keep_site_files(where.site, files, _words(found), actor=by.named())
         alignment = maps.alignment(where.site)
     if alignment is None:
         raise UsageError(f"site {where.site} is not aligned; `mapserver align --plan FILE --pin ...` does it")
-    if shown.json:
+    if json:
         print_json(alignment)
     else:
-        _print(alignment, corners, shown.level)
+        _print(alignment, corners, level)
 
 
 def _corners(maps: "MapStore", site: str) -> "Array":
@@ -87,28 +72,26 @@ def _corners(maps: "MapStore", site: str) -> "Array":
     return map_corners_m(maps.manifest(site, current.version))
 
 
-def _aligned(given: PlanOptions, corners: "Array") -> "tuple[Alignment, bytes | None]":
+def _aligned(
+    file: Path | None, given: list[str], metres_per_pixel: float | None, corners: "Array"
+) -> "tuple[Alignment, bytes | None]":
     from mapserver.floor_plan.alignment import Alignment
     from mapserver.floor_plan.pins import fit_pins, parse_pin
     from mapserver.floor_plan.plan_file import read_plan, upwards
 
-    pins = [parse_pin(text) for text in given.pin or ()]
-    plan = None if given.plan is None else read_plan(given.plan)
+    pins = [parse_pin(text) for text in given]
+    plan = None if file is None else read_plan(file)
     pins = upwards(pins) if plan is None else plan.drawn(pins)
     name, data = (None, None) if plan is None else (plan.name, plan.data)
-    fit = fit_pins(pins, given.metres_per_pixel, corners)
-    _say_checks(fit)
-    return Alignment(
-        frame=fit.frame, metres_per_unit=fit.metres_per_unit, method="pins", plan=name, off_m=fit.off_m
-    ), data
-
-
-def _say_checks(fit: "Fit") -> None:
+    fit = fit_pins(pins, metres_per_pixel, corners)
     if not fit.is_checked:
         typer.echo(
             "note: the pins lie on one line: a mirrored plan would not show; add a pin beside the line", err=True
         )
     typer.echo(f"at the far end of the map positions in the building are known to {2 * fit.far_sigma_m:.2f} m (95 %)")
+    return Alignment(
+        frame=fit.frame, metres_per_unit=fit.metres_per_unit, method="pins", plan=name, off_m=fit.off_m
+    ), data
 
 
 def _words(found: "Alignment") -> str:

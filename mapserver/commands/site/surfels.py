@@ -1,12 +1,11 @@
 """`mapserver map`: what a version knows of how its site looks, for other programs."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import Group, TopicNames, expand_options
+from fleetmap.cli_options import Group, TopicNames
 from fleetmap.errors import StateError, UsageError
 from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, write_output
 
@@ -62,23 +61,15 @@ def changes(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class RefineOptions:
-    """Options of `map refine`."""
-
-    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300
-    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0
-    topic: TopicNames = None
-
-
-@expand_options
 def refine(
     version: SurfelVersion,
     recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
     file: SplatFile,
     site: SiteName,
     store: StoreFolder,
-    options: RefineOptions,
+    steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0,
+    topic: TopicNames = None,
 ) -> None:
     """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
     check_output("FILE", file, ".ply")
@@ -98,13 +89,13 @@ def refine(
         raise StateError(
             f"version {version} of site {site} has no archive here, which tells where its pictures were taken"
         )
-    with open_recording(recording, OpenOptions(topics=named_topics(options.topic))) as opened:
+    with open_recording(recording, OpenOptions(topics=named_topics(topic))) as opened:
         if opened.content_hash() not in {entry.sha256 for entry in manifest.recordings}:
             names = ", ".join(entry.name for entry in manifest.recordings)
             raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
         own_rig = len(manifest.recordings) == 1
         views = looks_of(opened, decode_archive(archive), surfels, own_rig=own_rig)
-    done = refined_by(Splats.of(surfels), views, options.steps, np.random.default_rng(options.seed))
+    done = refined_by(Splats.of(surfels), views, steps, np.random.default_rng(seed))
     said = (
         f"{done.held_out} held-out views: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "
         f"SSIM {done.before.ssim:.3f} before, {done.after.ssim:.3f} after"

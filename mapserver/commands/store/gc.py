@@ -1,6 +1,5 @@
 """`mapserver gc`: removal of unused versions and files from a store."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,22 +12,16 @@ if TYPE_CHECKING:
     from mapserver.store.garbage_collection import Garbage
 
 
-@dataclass(frozen=True, kw_only=True)
-class RetentionOptions:
-    """Versions that stay."""
-
-    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5
-    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3
-    keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0
-    robot_days: Annotated[
-        float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
-    ] = 30.0
-
-
 @expand_options
 def gc(
+    *,
     store: StoreFolder,
-    retention: RetentionOptions,
+    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5,
+    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3,
+    keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0,
+    robot_days: Annotated[
+        float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
+    ] = 30.0,
     by: ActorOptions,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
     json: Json = False,
@@ -40,9 +33,11 @@ def gc(
     from mapserver.store import Retention
     from mapserver.store.files import keep_reserve, release_reserve
 
+    retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
+
     def collect() -> "Garbage":
         with open_store(store, read_only=dry_run) as maps:
-            return maps.collect_garbage(Retention(**vars(retention)), dry_run=dry_run, actor=by.named())
+            return maps.collect_garbage(retention, dry_run=dry_run, actor=by.named())
 
     try:
         garbage = collect()

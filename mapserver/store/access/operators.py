@@ -58,10 +58,9 @@ class OperatorQueries:
         )
 
     def find(self, name: str) -> OperatorRow | None:
-        found = self._transactions.rows(
+        return self._transactions.first(
             OperatorRow, "SELECT name, role, password, is_disabled FROM operators WHERE name = ?", (name,)
         )
-        return found[0] if found else None
 
     def all(self, now_ns: int) -> list[OperatorRow]:
         return self._transactions.rows(
@@ -116,13 +115,12 @@ class OperatorQueries:
 
     def session(self, sha256: str) -> SessionRow | None:
         """The session of this hash, unless its operator is disabled; its age is judged elsewhere."""
-        found = self._transactions.rows(
+        return self._transactions.first(
             SessionRow,
             """SELECT name, role, begun_ns, used_ns FROM sessions JOIN operators USING (name)
                WHERE sha256 = ? AND is_disabled = 0""",
             (sha256,),
         )
-        return found[0] if found else None
 
     def use_session(self, sha256: str, now_ns: int) -> None:
         with self._transactions.write(durable=False) as connection:
@@ -154,13 +152,12 @@ class OperatorQueries:
 
     def token(self, sha256: str) -> TokenRow | None:
         """The token of this hash, unless its operator is disabled; its end is judged elsewhere."""
-        found = self._transactions.rows(
+        return self._transactions.first(
             TokenRow,
             """SELECT name, role, scopes, ends_ns FROM tokens JOIN operators USING (name)
                WHERE sha256 = ? AND is_disabled = 0""",
             (sha256,),
         )
-        return found[0] if found else None
 
 
 def _change(connection: sqlite3.Connection, sql: str, *values: str) -> None:

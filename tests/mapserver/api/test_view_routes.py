@@ -1,4 +1,4 @@
-"""Expected views over HTTP."""
+"""Expected views and the grid of a version over HTTP."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,10 +10,11 @@ import pytest
 
 from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, FailureReport, Placement
+from fleetmap.occupancy_grid import read_grid
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter
 from support.fleet.served_api import Server, served_api
-from support.storage.map_samples import save_sample_draft, save_surfel_draft, seen_wall, wall
+from support.storage.map_samples import save_grid_draft, save_sample_draft, save_surfel_draft, seen_wall, wall
 
 POSE = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "yaw_deg": 0.0, "width_px": 188}
 
@@ -150,3 +151,22 @@ def test_reports_that_allow_no_view_say_why(server: Server, changes: dict[str, o
     assert answer.status_code in (404, 409, 422)
     assert said in answer.json()["detail"]
     assert "no surfels" in server.client.get(reported(server, save_sample_draft(server.store))).json()["detail"]
+
+
+def test_planners_fetch_both_files(server: Server, tmp_path: Path) -> None:
+    address = f"/v1/sites/lab/versions/{save_grid_draft(server.store)}/grid"
+    for height_m in (9, 0):
+        assert server.client.get(f"{address}.yaml?robot_height_m={height_m}").status_code == 422
+    for name in ("yaml", "pgm"):
+        answer = server.client.get(f"{address}.{name}", params={"robot_height_m": 0.7})
+        assert answer.status_code == 200
+        (tmp_path / f"grid.{name}").write_bytes(answer.content)
+    assert (read_grid(tmp_path / "grid.yaml").cells == 100).sum() == 100
+    again = server.client.get(f"{address}.pgm?robot_height_m=0.7", headers={"If-None-Match": answer.headers["ETag"]})
+    assert again.status_code == 304
+
+
+def test_a_version_without_a_grid_is_told(server: Server) -> None:
+    answer = server.client.get("/v1/sites/lab/versions/1/grid.yaml")
+    assert answer.status_code == 409
+    assert "occupancy_grid" in answer.json()["detail"]

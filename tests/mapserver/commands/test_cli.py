@@ -132,31 +132,16 @@ def _keys(section: Section) -> dict[str, object]:
 def test_the_file_gives_defaults_and_the_command_line_wins(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Site and store are said once for all commands; a section of a command comes before them."""
     with MapStore.open(tmp_path / "store", create=True) as maps:
-        save_sample_draft(maps, site="lab")
-        save_sample_draft(maps, site="hall")
-        save_sample_draft(maps, site="hall")
+        for site in ("lab", "hall", "hall"):
+            save_sample_draft(maps, site=site)
     file = tmp_path / "site.toml"
-    file.write_text(f'[versions]\nsite = "lab"\nstore = "{tmp_path / "store"}"\njson = true\n')
-    for arguments, count in (
-        (("--config", file, "versions"), 1),
-        (("--config", file, "versions", "--site", "hall"), 2),
-    ):
-        assert status(monkeypatch, *arguments) == 0
-        assert len(json.loads(capsys.readouterr().out)) == count
-
-
-def test_site_and_store_are_said_once(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        save_sample_draft(maps, site="lab")
-        save_sample_draft(maps, site="hall")
-        save_sample_draft(maps, site="hall")
-    file = tmp_path / "site.toml"
-    file.write_text(f'site = "lab"\nstore = "{tmp_path / "store"}"\n[inspect]\nsite = "hall"\nversion = 2\n')
-    assert status(monkeypatch, "--config", file, "versions", "--json") == 0
-    assert [info["site"] for info in json.loads(capsys.readouterr().out)] == ["lab"]
+    common = f'site = "lab"\nstore = "{tmp_path / "store"}"\n'
+    file.write_text(f'{common}[versions]\njson = true\n[inspect]\nsite = "hall"\nversion = 2\n')
+    for more, sites in (((), ["lab"]), (("--site", "hall"), ["hall", "hall"])):
+        assert status(monkeypatch, "--config", file, "versions", *more) == 0
+        assert [info["site"] for info in json.loads(capsys.readouterr().out)] == sites
     assert status(monkeypatch, "--config", file, "inspect") == 0
     assert "site hall version 2" in capsys.readouterr().out
 

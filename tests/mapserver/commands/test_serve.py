@@ -1,6 +1,5 @@
 """The commands, and `serve` as a process with real HTTP and real zenoh on loopback."""
 
-import json
 import os
 import signal
 import subprocess
@@ -19,7 +18,7 @@ from typer.testing import CliRunner
 
 from fleetmap.bus import Bus
 from fleetmap.cli_options import Program
-from fleetmap.errors import GateRefusedError, StoreError, UnreachableError, UsageError
+from fleetmap.errors import StoreError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
@@ -171,44 +170,6 @@ def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match=words):
             serve_at("127.0.0.1:0", "tcp/127.0.0.1:0", **options)
-
-
-def run(*arguments: str) -> str:
-    result = CliRunner().invoke(cli.app, list(arguments))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
-def test_publish_versions_and_inspect(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store)
-    where = ("--site", "lab", "--store", str(tmp_path))
-    assert "version 1 is current (2 tiles, 80 landmarks" in run("publish", *where)
-    (row,) = json.loads(run("versions", *where, "--json"))
-    assert (row["version"], row["state"], row["landmarks"]) == (1, "current", 80)
-    assert "current" in run("versions", *where)
-    shown = json.loads(run("inspect", *where, "--json"))
-    assert shown["manifest"]["report"] == {"path_m": 12.5}
-    assert shown["bytes_per_m"] == pytest.approx(shown["map_bytes"] / 12.5)
-    text = run("inspect", *where)
-    assert "bytes per metre" in text
-    assert "2 tiles of 16 m" in text
-    assert "walk" in text
-    with pytest.raises(UsageError, match="no draft"):
-        run("publish", *where)
-    with pytest.raises(UsageError, match="no version 5"):
-        run("inspect", *where, "--version", "5")
-
-
-def test_an_empty_draft_ends_with_the_gates_status(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        store.save_draft("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
-    with pytest.raises(GateRefusedError) as refusal:
-        run("publish", "--site", "lab", "--store", str(tmp_path))
-    assert refusal.value.exit_status == 4
-    assert json.loads(run("inspect", "--site", "lab", "--store", str(tmp_path), "--json"))["bytes_per_m"] is None
 
 
 def test_beyond_the_machine_http_is_refused_until_it_is_protected(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import pytest
+
 from fleetmap.mapformat import blob_path
 from mapserver import releases
 from mapserver.store import MapStore
@@ -17,14 +19,24 @@ def test_a_life_of_versions(run, tmp_path: Path) -> None:
             save_sample_draft(store, seed=seed)
     in_store = ("--store", tmp_path / "store")
     where = ("--site", "lab", *in_store)
-    for version in (1, 2):
-        assert "held_out_frames" in run("publish", *where, "--version", version)
+    first = run("publish", *where, "--version", 1)
+    assert "version 1 is current (2 tiles, 80 landmarks" in first
+    assert "held_out_frames" in first
+    run("publish", *where, "--version", 2)
+    assert "no version 5" in run("inspect", *where, "--version", 5, status=2)
+    assert "--reason" in run("publish", *where, "--version", 3, "--force", status=2)
+    rows = json.loads(run("versions", *where, "--json"))
+    assert [(row["version"], row["state"]) for row in rows] == [(1, "published"), (2, "current"), (3, "draft")]
+    assert "current" in run("versions", *where)
     assert "version 1 is current again" in run("rollback", *where, "--actor", "ada", "--reason", "lost robots")
     assert "version 2 is current" in run("promote", *where, 2)
     assert "error: version 3 of site lab is a draft" in run("promote", *where, 3, status=2)
     shown = json.loads(run("inspect", *where, "--version", 1, "--json"))
     assert [(event["kind"], event["actor"]) for event in shown["history"]][-1] == ("rolled_back", "ada")
-    assert "gate: accepted" in run("inspect", *where, "--version", 1)
+    assert shown["manifest"]["report"] == {"path_m": 12.5}
+    assert shown["bytes_per_m"] == pytest.approx(shown["map_bytes"] / 12.5)
+    text = run("inspect", *where, "--version", 1)
+    assert all(words in text for words in ("gate: accepted", "bytes per metre", "2 tiles of 16 m", "walk"))
     changed = json.loads(run("diff", *where, 1, 2, "--json"))
     assert (changed["tiles_changed"], changed["quality"]["path_m"]) == (2, {"before": 12.5, "after": 12.5})
     assert "fetches" in run("diff", *where, 1, 2)
@@ -32,6 +44,7 @@ def test_a_life_of_versions(run, tmp_path: Path) -> None:
     assert "(draft)" in run("import", tmp_path / "lab.fmex", "--store", tmp_path / "other")
     assert "0 files would be removed" in run("gc", *in_store, "--dry-run")
     assert json.loads(run("gc", *in_store, "--keep-drafts", 0, "--keep-days", 0, "--json"))["removed"] == [["lab", 3]]
+    assert "no draft" in run("publish", *where, status=2)
     assert "clean" in run("verify", *in_store)
 
 
@@ -50,12 +63,6 @@ def test_gc_leaves_a_store_that_it_refuses_as_it_is(run, tmp_path: Path) -> None
         connection.execute("PRAGMA user_version = 1")
     assert "earlier fleetmap" in run("gc", "--store", tmp_path, status=3)
     assert (tmp_path / "reserve").is_file()
-
-
-def test_a_reason_is_asked_for(run, tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store)
-    assert "--reason" in run("publish", "--site", "lab", "--store", tmp_path, "--force", status=2)
 
 
 def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:

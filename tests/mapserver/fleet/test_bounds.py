@@ -1,7 +1,6 @@
 """Nothing that robots send grows without bound: failures in rate, size and number, pictures in bytes, traces, robots. Rows 8, 9, 23."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -18,17 +17,10 @@ from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, FleetRetention, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
 
 SECOND_NS = 10**9
-
-
-@dataclass
-class Clock:
-    now_ns: int = 10**18
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from mapserver import releases
 from mapserver.cli import app
 from mapserver.dashboard.pages.shift_page import html_page
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.shift_summary import SummarySettings, summarise
+from mapserver.fleet.shift_summary import summarise
 from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
@@ -87,7 +87,7 @@ def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -
 
     path, known = folder
     with MapStore.open(path) as store:
-        summary = summarise(store, "hall", 24, time.time_ns(), SummarySettings())
+        summary = summarise(store, "hall", 24, time.time_ns())
         page = html_page(summary)
     assert summary.total.failures.events == known.failures["site", ""] > 0
     tags = _Tags()
@@ -104,7 +104,7 @@ def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -
 def test_an_idle_site_has_a_page_too(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)
-        page = html_page(summarise(store, "lab", 24, 10**18, SummarySettings()))
+        page = html_page(summarise(store, "lab", 24, 10**18))
     assert "not known" in page and "No failures were reported" in page
 
 

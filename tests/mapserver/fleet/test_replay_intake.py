@@ -15,15 +15,8 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
 from support.fleet.failed_robot import small_file
+from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
-
-
-@dataclass
-class Clock:
-    now_ns: int = 10**18
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @dataclass

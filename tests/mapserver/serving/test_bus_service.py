@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.errors import LinkError, MapFormatError, UnreachableError, UsageError
+from fleetmap.errors import LinkError, MapFormatError, UnreachableError
 from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import (
     FailureAck,
@@ -24,7 +24,6 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.occupancy_grid import OccupancyGrid
-from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -351,11 +350,3 @@ def test_reports_have_a_size_and_a_rate(world: World, monkeypatch: pytest.Monkey
     assert 15 <= taken <= 25
     world.robot_bus.publish(robot_key("lab", "r2", "health"), report(1, {}).replace(b"r1", b"r2"))
     assert world.counts[-1] == ("health", "ok", 0), "another robot has a rate of its own"
-
-
-def test_presence_and_names(world: World) -> None:
-    handle = world.link.announce_presence()
-    assert world.robot_bus.alive(robot_key("lab", "*", "alive")) == [robot_key("lab", "r1", "alive")]
-    handle.close()
-    with pytest.raises(UsageError, match="robot name"):
-        MapClient(world.robot_bus, world.cache, "lab", "Robot One")

@@ -26,6 +26,7 @@ from mapserver.serving import webhook
 from mapserver.serving.webhook import AlertWatch, Webhook, check_address
 from mapserver.store import MapStore
 from support.fleet.contracts_documents import REPOSITORY
+from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
 
 HOUR_NS = 3_600_000_000_000
@@ -65,16 +66,9 @@ def wait_for(what: object, seconds: float = 15.0) -> None:
         time.sleep(0.01)
 
 
-class Clock:
-    now_ns = 1_900_000_000_000_000_000
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(1_900_000_000_000_000_000)
 
 
 @pytest.fixture

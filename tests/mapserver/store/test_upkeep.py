@@ -13,18 +13,11 @@ from fleetmap.mapformat import blob_path, current_path
 from mapserver import releases
 from mapserver.store import Actor, MapStore, Retention
 from mapserver.store.files import locked
+from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now_ns = DAY_NS * 20_000
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @pytest.fixture

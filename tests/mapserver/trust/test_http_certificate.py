@@ -43,6 +43,13 @@ def test_certificates_that_nobody_would_believe_are_errors(tmp_path: Path, autho
     ended = authority.sign(own.public_key(), "h", -0.003, hosts=["maps.example"])
     with pytest.raises(UsageError, match=r"http.crt ended at .* UTC, .*put a renewed one"):
         HttpCertificate(*write(tmp_path, ended, own))
+    served = HttpCertificate(*write(tmp_path, good, own))
+    served.certificate.write_bytes(b"")  # while it is replaced
+    with pytest.raises(UsageError, match=r"http\.crt holds no certificate"):
+        served.warn()
+    served.certificate.unlink()
+    with pytest.raises(UsageError, match=r"http\.crt cannot be read"):
+        served.warn()
 
 
 @pytest.mark.parametrize(

@@ -23,22 +23,15 @@ from mapserver.trust.keys import load_key, make_key, make_passphrase
 from mapserver.trust.repository import ListRepository
 from mapserver.trust.signing import check_base
 from mapserver.trust.status import trust_status
+from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
 
 HOUR_NS = 3_600_000_000_000
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.now_ns = 1_780_000_000_000_000_000
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(1_780_000_000_000_000_000)
 
 
 @pytest.fixture
