@@ -1,7 +1,6 @@
 """`mapserver prepare`: the kernels of builds are compiled before the first recording comes."""
 
 import io
-import math
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr
@@ -51,10 +50,9 @@ def _steps(folder: Path) -> Mapping[str, Callable[[], None]]:
 
     def build_as_large() -> None:
         settings = survey_settings(None, SensorSet.STEREO)
-        iterated_and_factorised = {"bundle": 0.0, "rough_bundle": 0.0, "final_bundle": math.inf}
         large = {
-            name: msgspec.structs.replace(getattr(settings, name), dense_unknowns=0, sparse_couplings=couplings)
-            for name, couplings in iterated_and_factorised.items()
+            name: msgspec.structs.replace(getattr(settings, name), dense_unknowns=0)
+            for name in ("bundle", "rough_bundle", "final_bundle")
         }
         build("large", SensorSet.STEREO, msgspec.structs.replace(settings, **large))
 

@@ -1,11 +1,11 @@
 """Settings of a survey: one set for each sensor set, none for a single recording."""
 
+from math import inf
 from typing import Literal
 
 from fleetmap.config import Section
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.odometry import OdometrySettings
-from mapserver.survey.bundle.settings import BundleSettings
 
 
 class KeyframeSettings(Section, frozen=True):
@@ -66,6 +66,17 @@ class NoiseSettings(Section, frozen=True):
     accel_noise_scale: float = 5.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
     gyro_noise_scale: float = 2.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
     walk_scale: float = 1.0  # factor on the calibration's bias walks
+
+
+class BundleSettings(Section, frozen=True):
+    """How hard bundle adjustment tries. Widths are in sigmas of an observation's residual."""
+
+    max_iterations: int = 10  # Levenberg-Marquardt steps
+    huber_sigmas: float = 2.5  # where the loss turns from quadratic to linear
+    cutoff_sigmas: float = inf  # observations farther off have no influence
+    lambda_start: float = 1e-4  # first damping
+    relative_cost_tolerance: float = 1e-4  # relative gain of the last step
+    dense_unknowns: int = 700  # reduced systems up to this size are solved by dense Cholesky, larger ones by sparse
 
 
 class SingleCameraSettings(Section, frozen=True):

@@ -13,7 +13,7 @@ from mapserver.survey.bundle.problem import (
     BundleProblem,
     BundleResult,
 )
-from mapserver.survey.bundle.reduced_system import Chains, ReducedSystem, build_chains, solve_reduced
+from mapserver.survey.bundle.reduced_system import ReducedSystem, SparseLayout, solve_dense
 from mapserver.survey.bundle.reprojection_kernels import (
     ImageNormal,
     Measured,
@@ -23,8 +23,8 @@ from mapserver.survey.bundle.reprojection_kernels import (
     step_poses,
 )
 from mapserver.survey.bundle.schur_kernels import Eliminated, View, invert_landmarks, reduce_to_poses
-from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.sparsity import Structure, build_structure
+from mapserver.survey.settings import BundleSettings
 
 LAMBDA_MIN, LAMBDA_MAX = 1e-10, 1e10
 DAMPING_FLOOR = 1e-9
@@ -73,14 +73,14 @@ class _Bundle:
         self.body_in_cam_m = np.ascontiguousarray(-cam_from_body @ problem.body_from_cam[:3, 3])
         self.state = _initial_state(problem)
         s, points = self.structure, len(problem.points_map)
-        self.chains: Chains = build_chains(s.slots[self.terms.ends].astype(np.int64), len(s.slot_keyframes))
+        self.edge_slots = s.slots[self.terms.ends].astype(np.int64)
+        self.layout: SparseLayout | None = None  # what fills in is the same for all systems of the problem
         self.squared, self.measured = np.zeros(len(s.order)), Measured(s.pixels, s.weights)
         self.robust = settings.huber_sigmas, settings.cutoff_sigmas
         shapes = (len(s.order), 6), (points, 6), (points, 3), (len(s.free), 6, 6), (len(s.free), 6)
         self.images = ImageNormal(*(np.zeros(shape) for shape in shapes))
         self.eliminated = Eliminated(self.images.obs_info, np.zeros((points, 6)), self.images.point_rhs)
         self.normal: Normal
-        self.solver = "none"
         self.spare = self.state.like()
 
     def _view(self, state: State) -> View:
@@ -127,7 +127,7 @@ class _Bundle:
             view, pattern = self._view(self.state), (s.slot_keyframes, s.row_ptr, s.cols)
             reduce_to_poses(view, s.table, self.eliminated, pattern, blocks, rhs)
         rhs[~s.free] = 0.0
-        return ReducedSystem(s, self.chains, blocks, normal.edge_blocks, damp, rhs)
+        return ReducedSystem(s, self.edge_slots, blocks, normal.edge_blocks, damp, rhs)
 
     def _add_terms(self, blocks: Array, rhs: Array, diagonal: Array) -> None:
         s, normal = self.structure, self.normal
@@ -154,7 +154,7 @@ class _Bundle:
     def _add_motion(self, rhs: Array, diagonal: Array) -> None:
         s, normal = self.structure, self.normal
         for side in range(2):
-            slots, part = self.chains.edge_slots[:, side], slice(15 * side, 15 * side + 15)
+            slots, part = self.edge_slots[:, side], slice(15 * side, 15 * side + 15)
             here = slots >= 0
             np.add.at(rhs, slots[here], normal.edge_rhs[here, part])
             np.add.at(diagonal, slots[here], np.einsum("eaa->ea", normal.edge_blocks[here, part, part]))
@@ -164,7 +164,7 @@ class _Bundle:
     def step(self, damping: float) -> State | None:
         """The state after one damped step, None where the system could not be solved."""
         s, state, moved = self.structure, self.state, self.spare
-        step, self.solver = solve_reduced(self.reduced(damping), self.settings, self.solver)
+        step = self._solved(self.reduced(damping))
         if step is None:
             return None
         step_landmarks(self._view(state), s.table, self.eliminated, step, moved.points_map)
@@ -172,6 +172,12 @@ class _Bundle:
         moved.motions[:] = state.motions
         moved.motions[s.slot_keyframes] += step[:, 6:]
         return moved
+
+    def _solved(self, system: ReducedSystem) -> Array | None:
+        if system.rhs.size <= self.settings.dense_unknowns:
+            return solve_dense(system)
+        self.layout = self.layout or SparseLayout.of(system)
+        return self.layout.solve(system)
 
     def accept(self, candidate: State) -> None:
         """Makes `candidate` the current state."""
@@ -195,7 +201,6 @@ class _Bundle:
             squared_sigmas=squared,
             iterations=iterations,
             converged=converged,
-            solver=self.solver,
         )
 
 

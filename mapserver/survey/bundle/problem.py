@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.inertial import Preintegrated, preintegrate
-from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.inertial import Preintegrated
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.state import RelativeTerm
 
 
@@ -87,7 +85,7 @@ class BundleResult:
 
     map_from_body (K, 4, 4), points_map (N, 3); velocities and biases (K, 3), None without inertial terms. costs: half the robust sum of
     squares at the start and after every accepted step. squared_sigmas (M,): each observation's squared residual in sigmas, in the problem's
-    order, huge for points behind the camera. solver: dense, pcg or sparse, the last one used.
+    order, huge for points behind the camera.
     """
 
     map_from_body: Array
@@ -99,22 +97,14 @@ class BundleResult:
     squared_sigmas: Array
     iterations: int
     converged: bool
-    solver: str
 
 
-def continued(
-    problem: BundleProblem, result: BundleResult, imu: ImuSamples | None = None, noise: ImuNoise | None = None
-) -> BundleProblem:
-    """`problem` at the values of `result`; with samples, its inertial edges preintegrated again at the new biases."""
+def continued(problem: BundleProblem, result: BundleResult) -> BundleProblem:
+    """`problem` at the values of `result`."""
     moved = replace(problem, map_from_body=result.map_from_body, points_map=result.points_map)
     inertial, gyro, accel = problem.inertial, result.gyro_bias_radps, result.accel_bias_mps2
-    if inertial is None or result.velocities_map_mps is None or gyro is None or accel is None:
-        return moved
-    edges = inertial.edges
-    if imu is not None:
-        known = noise or ImuNoise()
-        edges = [(i, j, preintegrate(imu, e.start_ns, e.end_ns, gyro[i], accel[i], known)) for i, j, e in edges]
-    moved.inertial = replace(
-        inertial, velocities_map_mps=result.velocities_map_mps, gyro_bias_radps=gyro, accel_bias_mps2=accel, edges=edges
-    )
+    if inertial is not None and result.velocities_map_mps is not None and gyro is not None and accel is not None:
+        moved.inertial = replace(
+            inertial, velocities_map_mps=result.velocities_map_mps, gyro_bias_radps=gyro, accel_bias_mps2=accel
+        )
     return moved

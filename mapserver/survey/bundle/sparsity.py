@@ -45,12 +45,20 @@ def build_structure(problem: BundleProblem) -> Structure:
     keyframes = np.asarray(problem.obs_keyframe, np.int32)[order]
     landmarks = np.asarray(problem.obs_landmark, np.int32)[order]
     landmark_ptr = np.searchsorted(landmarks, np.arange(len(problem.points_map) + 1))
-    pixels, weights = _measurements(problem, order)
+    observed, sigma = problem.obs_pixels[order], problem.obs_sigma_px[order]
+    disparity = observed[:, 0] - observed[:, 2]
+    seen = np.isfinite(disparity) & (problem.camera.baseline_m > 0)
+    pixels = np.stack([observed[:, 0], observed[:, 1], np.where(seen, disparity, 0.0)], axis=1)
+    disparity_weights = np.where(seen, 1.0 / np.where(seen, sigma[:, 1], 1.0), 0.0)
+    weights = np.stack([1.0 / sigma[:, 0], disparity_weights], axis=1)
     moves = _free_unknowns(problem)
     slot_keyframes = np.nonzero(moves.any(axis=1))[0].astype(np.int32)
     slots = np.full(len(moves), -1, np.int32)
     slots[slot_keyframes] = np.arange(len(slot_keyframes))
-    slot_ptr, slot_obs = _observations_by_slot(slots, keyframes, len(slot_keyframes))
+    obs_slots = slots[keyframes]
+    by_slot = np.argsort(obs_slots, kind="stable")
+    slot_obs = by_slot[int((obs_slots < 0).sum()) :].astype(np.int32)
+    slot_ptr = np.searchsorted(obs_slots[slot_obs], np.arange(len(slot_keyframes) + 1))
     table = ObservationTable(slot_ptr, slot_obs, landmarks, keyframes, landmark_ptr, slots)
     row_ptr, cols = _pattern(problem, table)
     return Structure(order, table, pixels, weights, slots, slot_keyframes, moves[slot_keyframes], row_ptr, cols)
@@ -74,15 +82,6 @@ def _check(problem: BundleProblem) -> None:
         )
 
 
-def _measurements(problem: BundleProblem, order: AnyArray) -> tuple[Array, Array]:
-    observed = problem.obs_pixels[order]
-    disparity = observed[:, 0] - observed[:, 2]
-    seen = np.isfinite(disparity) & (problem.camera.baseline_m > 0)
-    pixels = np.stack([observed[:, 0], observed[:, 1], np.where(seen, disparity, 0.0)], axis=1)
-    sigma = problem.obs_sigma_px[order]
-    return pixels, np.stack([1.0 / sigma[:, 0], np.where(seen, 1.0 / np.where(seen, sigma[:, 1], 1.0), 0.0)], axis=1)
-
-
 def _free_unknowns(problem: BundleProblem) -> NDArray[np.bool_]:
     """(K, 6 or 15): rotation, translation, velocity, gyro bias, accelerometer bias."""
     count, inertial = len(problem.map_from_body), problem.inertial
@@ -102,23 +101,8 @@ def _free_unknowns(problem: BundleProblem) -> NDArray[np.bool_]:
     return moves
 
 
-def _observations_by_slot(slots: Indices, keyframes: Indices, count: int) -> tuple[AnyArray, Indices]:
-    obs_slots = slots[keyframes]
-    by_slot = np.argsort(obs_slots, kind="stable")
-    held = int((obs_slots < 0).sum())
-    return np.searchsorted(obs_slots[by_slot[held:]], np.arange(count + 1)), by_slot[held:].astype(np.int32)
-
-
-def block_pattern(table: ObservationTable, pair_ptr: AnyArray, pair_first: Indices) -> tuple[AnyArray, Indices]:
-    """Row pointers and columns of the reduced system's blocks: slots that share a landmark or a pair."""
-    row_ptr, cols = np.zeros(len(table.slot_ptr), np.int64), np.zeros(0, np.int32)
-    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
-    cols = np.empty(int(row_ptr[-1]), np.int32)
-    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
-    return row_ptr, cols
-
-
 def _pattern(problem: BundleProblem, table: ObservationTable) -> tuple[AnyArray, Indices]:
+    """Row pointers and columns of the reduced system's blocks: slots that share a landmark or a relative term."""
     slots = table.slots
     pairs = np.array([sorted((slots[t.i], slots[t.j])) for t in problem.relative], np.int32).reshape(-1, 2)
     pairs = pairs[pairs[:, 0] >= 0]
@@ -126,4 +110,9 @@ def _pattern(problem: BundleProblem, table: ObservationTable) -> tuple[AnyArray,
     pair_ptr = np.searchsorted(pairs[:, 1], np.arange(len(table.slot_ptr)))
     if problem.points_held:
         table = table._replace(slot_ptr=np.zeros_like(table.slot_ptr))
-    return block_pattern(table, pair_ptr, np.ascontiguousarray(pairs[:, 0]))
+    pair_first = np.ascontiguousarray(pairs[:, 0])
+    row_ptr, cols = np.zeros(len(table.slot_ptr), np.int64), np.zeros(0, np.int32)
+    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
+    cols = np.empty(int(row_ptr[-1]), np.int32)
+    count_row_blocks(table, pair_ptr, pair_first, row_ptr, cols)
+    return row_ptr, cols

@@ -15,8 +15,7 @@ from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem, BundleResult
-from mapserver.survey.bundle.settings import BundleSettings
+from mapserver.survey.bundle.problem import BundleProblem
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks, SurveyState
 
@@ -92,13 +91,9 @@ def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: 
     points = result.points_map[marks.obs_landmark]
     depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
-    pull = _weights(result, settings.final_bundle) * off / problem.obs_sigma_px[:, 1] ** 2
+    # what the robust cost leaves of each observation's weight
+    norm, robust = np.sqrt(result.squared_sigmas), settings.final_bundle
+    weights = np.minimum(1.0, robust.huber_sigmas / np.maximum(norm, 1e-9))
+    weights[norm > robust.cutoff_sigmas] = 0.0
+    pull = weights * off / problem.obs_sigma_px[:, 1] ** 2
     return -float(np.nansum(pull * disparity_shift(camera, marks.obs_pixels)))
-
-
-def _weights(result: BundleResult, settings: BundleSettings) -> Array:
-    """(M,) what the robust cost leaves of each observation's weight."""
-    norm = np.sqrt(result.squared_sigmas)
-    weight = np.minimum(1.0, settings.huber_sigmas / np.maximum(norm, 1e-9))
-    weight[norm > settings.cutoff_sigmas] = 0.0
-    return np.asarray(weight)

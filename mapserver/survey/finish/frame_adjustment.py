@@ -10,19 +10,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, interpolate_se3, se3_inverse
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
+from fleetmap.sensors.samples import Stamps
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import scaled_noise
 from mapserver.survey.bundle.odometry_factors import edge_covariance
 from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, MotionPrior, continued
-from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.finish.trajectory import frame_trajectory
 from mapserver.survey.keyframes.connected_components import MIN_SEEN
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.settings import BundleSettings, SurveySettings
 from mapserver.survey.state import OdometryPass, RelativeTerm, SurveyState
 
 Indices = NDArray[np.int64]
@@ -239,3 +238,27 @@ class _Chain:
             information = np.linalg.inv(wide * edge_covariance(odometry, f, g)).astype(np.float64)
             terms.append(RelativeTerm(i, j, i_from_j, information))
         return terms
+
+
+def frame_trajectory(
+    frame_stamps_ns: Stamps, odom_from_body: Array, keyframe_frames: list[int], map_from_body: Array
+) -> Array:
+    """map_from_body (F, 4, 4) of all frames: carried from the keyframe before and from the one after, blended by time.
+
+    odom_from_body (F, 4, 4): the motion; keyframe_frames (K,) frame numbers, rising; map_from_body (K, 4, 4).
+    """
+    out = np.empty((len(frame_stamps_ns), 4, 4))
+    afters = np.searchsorted(keyframe_frames, np.arange(len(out))).tolist()
+    for f, after in enumerate(afters):
+        if after < len(keyframe_frames) and keyframe_frames[after] == f:
+            out[f] = map_from_body[after]
+            continue
+        sides = [k for k in (after - 1, after) if 0 <= k < len(keyframe_frames)]
+        there = [(map_from_body[k], odom_from_body[keyframe_frames[k]]) for k in sides]
+        carried = [map_from_k @ se3_inverse(odom_from_k) @ odom_from_body[f] for map_from_k, odom_from_k in there]
+        if len(sides) == 1:
+            out[f] = carried[0]
+            continue
+        start, end = (int(frame_stamps_ns[keyframe_frames[k]]) for k in sides)
+        out[f] = interpolate_se3(carried[0], carried[1], (int(frame_stamps_ns[f]) - start) / (end - start))
+    return out

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse, so3_log
+from fleetmap.geometry import se3_inverse, so3_log
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
@@ -74,7 +74,8 @@ class WaitingRevisits:
         agreeing = [revisit, *(other for other in beside if _agree(revisit, other, marginals))]
         competitors = {other.edge.i for other in beside if other not in agreeing}
         keyframes = sorted({other.edge.i for other in agreeing})
-        way_m = _way_m(marginals.map_from_body[keyframes, :3, 3])
+        places = marginals.map_from_body[keyframes, :3, 3]
+        way_m = max(float(np.linalg.norm(a - b)) for a in places for b in places)
         if (
             len(keyframes) < _MIN_KEYFRAMES
             or way_m < _MIN_WAY_M
@@ -98,7 +99,3 @@ def _agree(one: Revisit, other: Revisit, marginals: GraphMarginals) -> bool:
     sigma_m = float(np.sqrt(sum(float(np.trace(cov[3:, 3:])) for cov in covs)))
     far = np.linalg.norm(off[:3, 3]) > _FLOOR_M + _SIGMAS * sigma_m
     return not far and bool(np.linalg.norm(so3_log(off[:3, :3])) < _FLOOR_RAD)
-
-
-def _way_m(places: Array) -> float:
-    return max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)

@@ -11,10 +11,9 @@ from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import inertial_edges
 from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, PriorTerm
-from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
-from mapserver.survey.settings import SessionSettings, SurveySettings
+from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
 from mapserver.survey.state import Landmarks, RelativeTerm, SurveyState
 
 

@@ -44,18 +44,13 @@ def count_landmarks(
     for keyframe, place, sighting in zip(keyframes, map_from_cam, sightings, strict=True):
         if sighting is None:
             continue
-        due = np.zeros(len(expected), bool)
-        due[_due(base, keyframe, place)] = True
-        due[sighting.rows] = True
-        expected += due
+        visible = base.visible(place, -EDGE_PX, WIDER_VIEW_RAD)
+        is_due = np.zeros(len(expected), bool)
+        is_due[visible.rows[due(visible, keyframe_features(keyframe).pixels)]] = True
+        is_due[sighting.rows] = True
+        expected += is_due
         seen[sighting.rows] += 1
     return LandmarkCounts(expected, seen)
-
-
-def _due(base: BaseMap, keyframe: Keyframe, map_from_cam: Array) -> Rows:
-    """Landmarks that this keyframe should see."""
-    expected = base.visible(map_from_cam, -EDGE_PX, WIDER_VIEW_RAD)
-    return np.asarray(expected.rows[due(expected, keyframe_features(keyframe).pixels)])
 
 
 def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
-from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.finish.frame_adjustment import frame_trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks

@@ -85,7 +85,8 @@ class ChainCovariance:
             return int(self._before[k])
         slot = len(self._anchors)
         if len(self._joint) < 6 * (slot + 1):
-            grown = np.zeros((6 * _grown(slot),) * 2)
+            capacity = slot + max(slot // 4, _FIRST_CAPACITY)  # by a quarter, as memory goes with the square
+            grown = np.zeros((6 * capacity,) * 2)
             grown[: 6 * slot, : 6 * slot] = self._joint
             self._joint = grown
         row = self._crossing(k, np.arange(slot)).transpose(1, 0, 2).reshape(6, -1)
@@ -115,8 +116,3 @@ class ChainCovariance:
         whole = self._sums[end] - self._sums[start]
         self._shares[start:end] = np.linalg.solve(whole, way).transpose(0, 2, 1)
         self._after[start:end] = slot
-
-
-def _grown(capacity: int) -> int:
-    """A larger capacity: by a quarter, as memory goes with the square."""
-    return capacity + max(capacity // 4, _FIRST_CAPACITY)

@@ -16,15 +16,13 @@ def loop_weights(
     loops: list[gtsam.NoiseModelFactor],
     start: gtsam.Values,
     bound: float,
-    *,
-    is_rough: bool = False,
 ) -> tuple[Array, gtsam.Values]:
     """Weight (len(loops),) of each loop, 1 believed and 0 not, and where the keyframes are then.
 
     `certain`: all that is taken for true. A loop is consistent while its squared residual stays within `bound`. Each step makes the cost a
     little less convex and takes up where the last one ended, so that the whole costs little more than one solve. It begins once near
     `start`, where at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling; the
-    lower truncated cost wins. is_rough: only near `start`. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
+    lower truncated cost wins. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
     """
     squared = squared_residuals(loops, start)
     if (squared <= bound).all():
@@ -33,7 +31,7 @@ def loop_weights(
     found: list[tuple[float, Array, gtsam.Values]] = []
     for reach in reaches:
         found.append(_anneal(certain, loops, start, bound, min(bound / max(reach - bound, bound), 1.0)))
-        if is_rough or found[-1][1].min() > 0.5:
+        if found[-1][1].min() > 0.5:
             break
     _, weights, values = min(found, key=lambda one: one[0])
     return weights, values

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import gtsam
 import numpy as np
@@ -10,14 +9,12 @@ from scipy.special import gammaincinv
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse, skew
-from mapserver.survey.pose_graph.gnc import loop_weights, squared_residuals
+from mapserver.survey.pose_graph.gnc import loop_weights
 
 _FIXED_SIGMA = 1e-6
 _INLIER_PROBABILITY = 0.999
 _MAX_ITERATIONS = 100
 _FIRST_ITERATIONS = 15  # before another start is considered
-_SCALE_ROUNDS = 6
-_RIGHT_SHARE = 0.7  # of the loops, taken for right where the noise is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +63,11 @@ def optimize_pose_graph(
     fixed: int = 0,
     *,
     robust: bool = True,
-    noise: Literal["given", "estimated"] = "given",
 ) -> PoseGraphResult:
     """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
 
     robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in which all other edges
-    are known to be true; a loop counts as consistent while its squared residual stays within the 0.999 of chi-square. noise "estimated":
-    within a bound that goes by the better 0.7 of the loops, for graphs whose covariances are right only up to a common factor. Where the
+    are known to be true; a loop counts as consistent while its squared residual stays within the 0.999 of chi-square. Where the
     result is less likely than its edges' covariances allow, a second start without any guess (chordal relaxation of the rotations) is
     tried, and the better result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
     proper covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as gtsam has it.
@@ -84,7 +79,13 @@ def optimize_pose_graph(
     try:
         if robust and loops:
             graph = _graph(map_from_body, edges, fixed)
-            weights, begin = _believed(graph, loops, start, _chi_square(_INLIER_PROBABILITY), noise)
+            doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
+            for n in sorted(set(range(graph.size())) - set(loops)):
+                certain.push_back(graph.at(n))
+            bound = float(
+                2.0 * gammaincinv(3.0, _INLIER_PROBABILITY)
+            )  # chi-square; scipy.stats takes half a second to import
+            weights, begin = loop_weights(certain, doubtful, start, bound)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
         graph = _graph(map_from_body, kept, fixed)
@@ -190,34 +191,6 @@ def _descend(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations:
     return optimizer.optimize(), int(optimizer.iterations())
 
 
-def _believed(
-    graph: gtsam.NonlinearFactorGraph, loops: list[int], start: gtsam.Values, bound: float, noise: str
-) -> tuple[Array, gtsam.Values]:
-    """(len(loops),) weight of every loop, and where the keyframes are then."""
-    doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
-    for n in sorted(set(range(graph.size())) - set(loops)):
-        certain.push_back(graph.at(n))
-    if noise == "given":
-        return loop_weights(certain, doubtful, start, bound)
-    values, scale = start, _scale(doubtful, start)
-    for _ in range(_SCALE_ROUNDS):
-        _, values = loop_weights(certain, doubtful, values, bound * scale, is_rough=True)
-        last, scale = scale, _scale(doubtful, values)
-        if scale > 0.5 * last:
-            break
-    return loop_weights(certain, doubtful, values, bound * scale)
-
-
 def _with_noise(factor: gtsam.NonlinearFactor) -> gtsam.NoiseModelFactor:
     assert isinstance(factor, gtsam.NoiseModelFactor)
     return factor
-
-
-def _scale(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> float:
-    """By how much the loops' squared residuals exceed what their covariances say, at a quantile that outliers spare."""
-    return max(float(np.quantile(squared_residuals(loops, values), _RIGHT_SHARE) / _chi_square(_RIGHT_SHARE)), 1e-9)
-
-
-def _chi_square(probability: float) -> float:
-    """The quantile for the six freedoms of a pose."""
-    return float(2.0 * gammaincinv(3.0, probability))  # scipy.stats takes half a second to import

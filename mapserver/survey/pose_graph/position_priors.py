@@ -30,7 +30,7 @@ def learn_priors(
     Without a prior that knows its heading nothing is added: positions alone do not say which way the survey looked.
     """
     usable = _usable(priors, odometry)
-    first = next((n for n, (prior, _) in enumerate(usable) if _knows_heading(prior)), None)
+    first = next((n for n, (prior, _) in enumerate(usable) if prior.cov_rot_trans[2, 2] <= _HEADING_KNOWN_RAD**2), None)
     if first is None:
         return 0
     contradicting = 0
@@ -42,7 +42,7 @@ def learn_priors(
         if n == first or other == keyframe:
             continue
         led = _led(other, at, odometry)
-        edge = _edge(marginals, (keyframe, map_from_i, reference), (other, prior), led, base_from_body)
+        edge = _edge(marginals, keyframe, map_from_i, reference, other, prior, led, base_from_body)
         if marginals.innovation_squared(edge) <= CHI2_6_0999:
             marginals.add(edge)
         else:
@@ -62,10 +62,6 @@ def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[tup
     return found
 
 
-def _knows_heading(prior: PositionPrior) -> bool:
-    return bool(prior.cov_rot_trans[2, 2] <= _HEADING_KNOWN_RAD**2)
-
-
 def _keyframe_at(frame: int, odometry: OdometryPass) -> int:
     """The keyframe that is nearest to a frame."""
     return int(np.argmin([abs(k.frame_index - frame) for k in odometry.keyframes]))
@@ -79,13 +75,15 @@ def _led(keyframe: int, frame: int, odometry: OdometryPass) -> Array:
 
 def _edge(
     marginals: GraphMarginals,
-    known: tuple[int, Array, PositionPrior],
-    told: tuple[int, PositionPrior],
+    i: int,
+    map_from_i: Array,
+    reference: PositionPrior,
+    j: int,
+    prior: PositionPrior,
     led: Array,
     base_from_body: Array,
 ) -> PoseEdge:
-    """Where a told keyframe lies to the known one. Its heading is the graph's own, of which the edge says nothing."""
-    (i, map_from_i, reference), (j, prior) = known, told
+    """Where keyframe j lies to i, by their priors. Its heading is the graph's own, of which the edge says nothing."""
     placed = marginals.map_from_body
     turn_ij = placed[i, :3, :3].T @ placed[j, :3, :3]
     turn_map_j = map_from_i[:3, :3] @ turn_ij

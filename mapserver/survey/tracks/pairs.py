@@ -73,13 +73,12 @@ def match_task(shared: MatchInputs, task: PairTask) -> list[PairMatch | None]:
 def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:
     """The verified match of two keyframes, None where too little agrees."""
     a, b, settings = _features(inputs.keyframes[i]), _features(inputs.keyframes[j]), inputs.settings
-    guidance, radius_px = _guidance(inputs), settings.guided_radius_px
+    lens, camera, radius_px = _lens(inputs.camera), inputs.camera.lens, settings.guided_radius_px
+    guidance = Guidance(lens, camera, _SCALES, settings.match_sigma_px, REFINEMENT, settings.guided_distance)
     steps, done, motion, hessian = 2, 0, np.empty((4, 4)), np.empty((6, 6))
     if predicted is not None and predicted.is_known:
-        motion, radii_px = (
-            np.array(predicted.j_from_i, np.float64, order="C"),
-            np.array([settings.search_px, radius_px, radius_px]),
-        )
+        motion = np.array(predicted.j_from_i, np.float64, order="C")
+        radii_px = np.array([settings.search_px, radius_px, radius_px])
         done, forward = follow_motion(
             a, b, guidance, radii_px, (settings.min_inliers, _PROJECTED_SHARE), (motion, hessian)
         )
@@ -103,28 +102,6 @@ def _features(keyframe: Keyframe) -> PairFeatures:
     return PairFeatures(pixels, octaves, packed(own.descriptors), *places, not keyframe.from_views)
 
 
-def _guidance(inputs: MatchInputs) -> Guidance:
-    settings, camera = inputs.settings, inputs.camera
-    return Guidance(_lens(camera), camera.lens, _SCALES, settings.match_sigma_px, REFINEMENT, settings.guided_distance)
-
-
-def _measured(keyframe: Keyframe, index: Indices) -> Array:
-    pixels = keyframe.features.pixels[index]
-    measured = np.full(len(pixels), np.nan) if keyframe.from_views else keyframe.disparities[index, 0]
-    return np.column_stack([pixels, pixels[:, 0] - measured])
-
-
-def _sigmas(keyframe: Keyframe, index: Indices, settings: PairSettings) -> Array:
-    scale = _SCALES[keyframe.features.octaves[index]]
-    return np.column_stack([settings.match_sigma_px * scale, np.maximum(settings.match_sigma_px, scale)])
-
-
-def _correspondences(a: Keyframe, b: Keyframe, inputs: MatchInputs, pairs: Indices) -> Correspondences:
-    """Points of a, which are features pairs[:, 0], as b sees them."""
-    measured, sigmas = _measured(b, pairs[:, 1]), _sigmas(b, pairs[:, 1], inputs.settings)
-    return Correspondences(inputs.camera, a.points_cam[pairs[:, 0]], measured, sigmas)
-
-
 def _from_descriptors(
     a: Keyframe, b: Keyframe, inputs: MatchInputs, predicted: PredictedMotion | None
 ) -> PnpResult | None:
@@ -134,7 +111,11 @@ def _from_descriptors(
     descriptors = a.features.descriptors[known], b.features.descriptors
     pairs = match_mutual(*descriptors, settings.max_distance, settings.ratio, nodes)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
-    matches = _correspondences(a, b, inputs, np.column_stack([index_a, index_b]))
+    pixels, scale = b.features.pixels[index_b], _SCALES[b.features.octaves[index_b]]
+    disparities = np.full(len(pixels), np.nan) if b.from_views else b.disparities[index_b, 0]
+    measured = np.column_stack([pixels, pixels[:, 0] - disparities])
+    sigmas = np.column_stack([settings.match_sigma_px * scale, np.maximum(settings.match_sigma_px, scale)])
+    matches = Correspondences(camera, a.points_cam[index_a], measured, sigmas)
     least = settings.min_inliers
     if predicted is not None and predicted.rotation_sigma_rad is not None and not b.from_views:
         sigma_rad = predicted.rotation_sigma_rad

@@ -10,7 +10,7 @@ from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.settings import NoiseSettings, SurveySettings
+from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, Pictures, PosedKeyframes, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
@@ -206,7 +206,10 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
         own, pictures = keyframes[k], keyframes[k].pictures
         features, references, is_reference = batch.table[rows, 2], batch.references[rows], batch.is_reference[rows]
         points_map = batch.points_map[rows]
-        left, sigma = own.features.pixels[features].copy(), _descriptor_sigma(own, features, noise)
+        left, sigma = (
+            own.features.pixels[features].copy(),
+            noise.descriptor_sigma_px * 1.2 ** own.features.octaves[features].astype(np.float64),
+        )
         sigma[is_reference] = noise.aligned_sigma_px
         cam_from_map = se3_inverse(batch.map_from_cam[k])
         others = np.flatnonzero(~is_reference)
@@ -225,10 +228,6 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
         pixels[rows] = np.column_stack([left, left[:, 0] - found[:, 0]])
         sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(found[:, 1], nan=1.0))])
     return pixels, sigmas
-
-
-def _descriptor_sigma(keyframe: Keyframe, features: NDArray[np.int64], noise: NoiseSettings) -> Array:
-    return np.asarray(noise.descriptor_sigma_px * 1.2 ** keyframe.features.octaves[features].astype(np.float64))
 
 
 def _patch_features(keyframe: Keyframe, pictures: Pictures, chosen: NDArray[np.int64]) -> PatchFeatures:

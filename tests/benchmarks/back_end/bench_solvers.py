@@ -19,12 +19,13 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2
 
-from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.geometry import Array, align_points, se3, se3_inverse, se3_log, so3_exp, transform_points
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.problem import BundleProblem
-from mapserver.survey.bundle.settings import BundleSettings
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.settings import BundleSettings
 from support.problems.g2o import parse_g2o
 from support.recordings.realdata import DATA
 from support.worlds.bundle_gtsam import gtsam_graph
@@ -76,18 +77,28 @@ def _shaken(map_from_body: Array) -> Array:
     return np.array([placed @ se3(so3_exp(0.1 * rng.normal(size=3)), rng.normal(size=3)) for placed in map_from_body])
 
 
+def _with_measured_noise(edges: list[PoseEdge], clean: Array) -> list[PoseEdge]:
+    """Their covariances are right up to a common factor: what the better 0.7 of the loops leave over at the optimum tells it."""
+    loops = [edge for edge in edges if edge.is_loop]
+    off = [se3_log(edge.i_from_j @ se3_inverse(clean[edge.j]) @ clean[edge.i]) for edge in loops]
+    squared = [float(r @ np.linalg.solve(edge.cov_rot_trans, r)) for r, edge in zip(off, loops, strict=True)]
+    factor = float(np.quantile(squared, 0.7)) / float(chi2.ppf(0.7, 6))
+    return [replace(edge, cov_rot_trans=factor * edge.cov_rot_trans) for edge in edges]
+
+
 def _with_wrong_loops(map_from_body: Array, edges: list[PoseEdge], clean: Array) -> Figures:
     rng = np.random.default_rng(0)
     right = sum(edge.is_loop for edge in edges)
     extent_m = float(np.linalg.norm(np.ptp(clean[:, :3, 3], axis=0)))
     way_m = float(np.linalg.norm(np.diff(clean[:, :3, 3], axis=0), axis=1).sum())
+    edges = _with_measured_noise(edges, clean)
     wrong: list[PoseEdge] = []
     while len(wrong) < right // 10:
         i, j = (int(k) for k in rng.integers(0, len(map_from_body), 2))
         if abs(i - j) > 1:
             i_from_j = se3(so3_exp(rng.normal(size=3)), rng.normal(size=3) * extent_m / 6)
             wrong.append(PoseEdge(i, j, i_from_j, edges[-1].cov_rot_trans, is_loop=True))
-    seconds, robust = timed(lambda: optimize_pose_graph(map_from_body, [*edges, *wrong], noise="estimated"))
+    seconds, robust = timed(lambda: optimize_pose_graph(map_from_body, [*edges, *wrong]))
     kept = robust.loop_weights >= 0.5
     places, wanted = robust.map_from_body[:, :3, 3], clean[:, :3, 3]
     aligned = transform_points(align_points(wanted, places)[0], places)

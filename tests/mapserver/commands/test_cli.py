@@ -195,7 +195,7 @@ def test_build_takes_its_settings_from_the_file(
         ("[build]\nsight = 'lab'", "sight"),
         ("[survey.loops]\ntop = 'many'", "survey.loops.top"),
         ("[biuld]", "biuld"),
-        ("[survey.bundle]\npcg_tolerance = 1e-3", "survey.bundle.pcg_tolerance is an internal constant now"),
+        ("[survey.bundle]\nlambda_start = 1e-3", "survey.bundle.lambda_start is an internal constant now"),
         ("[build", "site.toml"),
     ],
 )

@@ -11,8 +11,7 @@ from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.drafting.worker import Threads
-from mapserver.survey.finish.frame_adjustment import PlacedFrames, place_frames
-from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.finish.frame_adjustment import PlacedFrames, frame_trajectory, place_frames
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass, SurveyState
 from support.worlds.corridor_scene import CAMERA, scene

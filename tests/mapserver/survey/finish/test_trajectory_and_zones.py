@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inverse, so3_exp
-from mapserver.survey.finish.trajectory import frame_trajectory
+from mapserver.survey.finish.frame_adjustment import frame_trajectory
 from mapserver.survey.loops.zones import Zones
 
 FRAME_NS = 50_000_000

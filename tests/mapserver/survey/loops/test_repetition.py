@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapserver.survey.loops.repetition import Repetition
+from mapserver.survey.loops.loops import Repetition
 
 AISLE, BLOCK = np.array([0.2, 4.5, 0.0]), np.array([30.0, 0.0, 0.0])
 
