@@ -114,7 +114,7 @@ class MonocularMode(Mode):
     """One camera alone, up to scale, until an IMU shows the scale and the direction of gravity."""
 
     def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
-        self._rig, self._imu = rig, imu
+        self._rig, self.imu = rig, imu
         self._stamp_ns = 0
         self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
         self._visual = VisualEstimate(None, np.zeros((6, 6)))
@@ -137,7 +137,7 @@ class MonocularMode(Mode):
         if isinstance(mode, StartingMode):
             self._not_before_ns = mode.not_before_ns
         else:
-            self._imu = None
+            self.imu = None
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) tracked points in the newest frame's camera, NaN where unknown."""
@@ -161,12 +161,12 @@ class MonocularMode(Mode):
         """See Mode; switches to the filter once the scale is known, and places earlier frames anew then."""
         self._detect_standstill(tracked)
         visual = self._visual = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
-        if self._imu is not None:
+        if self.imu is not None:
             self._keep_unscaled(frame_index, visual)
-            found = self._metric_start(self._imu, visual)
+            found = self._metric_start(self.imu, visual)
             if found is not None:
                 return self._go_metric(
-                    frame_index, tracked, InertialMode(self._metric_window(*found), self._imu), found[1]
+                    frame_index, tracked, InertialMode(self._metric_window(*found), self.imu), found[1]
                 )
         return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in visual.revised))
 
@@ -334,6 +334,11 @@ class MonocularOdometry(Odometry):
             self._vision.resume(self._mode)
             self._mode = self._vision
         return super().handle_stereo(frame)
+
+    @property
+    def refuses_imu(self) -> bool:
+        """As Odometry's, also once vision goes on without the IMU."""
+        return super().refuses_imu or (self._rig.imu is not None and self._vision.imu is None)
 
     def _first_mode(self) -> Mode:
         rig = self._rig

@@ -137,6 +137,29 @@ def test_a_steady_way_shows_no_scale() -> None:
     assert found is None
 
 
+def standing() -> tuple[Odometry, RectifiedFrame]:
+    """The odometry of one camera with six seconds of samples of a resting IMU, and the image that it sees all the time."""
+    calibration = rig(IMU)
+    odometry = make_odometry(
+        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
+    )
+    stamps_ns = np.arange(0, int(6e9), 5_000_000)
+    rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
+    odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(rest), rest))
+    return odometry, RectifiedFrame(FRAME_NS, stereo_frame(FRAME_NS).left, None, None)
+
+
+def test_an_imu_that_is_left_out_is_named_while_vision_goes_on_alone() -> None:
+    odometry, frame = standing()
+    said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(1, 20)]
+    assert said[-1].inertial
+    assert not odometry.refuses_imu
+    odometry._clock.off_s = 0.1
+    said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(20, 23)]
+    assert not said[-1].inertial
+    assert odometry.refuses_imu
+
+
 def test_a_start_from_rest_that_was_wrong_is_not_made_again_from_the_same_samples(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -153,14 +176,8 @@ def test_a_start_from_rest_that_was_wrong_is_not_made_again_from_the_same_sample
     monkeypatch.setattr(mono_modes, "static_initialization", recorded)
     wrong = iter([True])
     monkeypatch.setattr(DivergenceMonitor, "is_wrong_start", lambda *_: next(wrong, False))
-    calibration, image = rig(IMU), stereo_frame(FRAME_NS).left
-    odometry = make_odometry(
-        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
-    )
-    stamps_ns = np.arange(0, int(6e9), 5_000_000)
-    rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
-    odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(rest), rest))
-    said = [odometry.handle_stereo(RectifiedFrame(k * FRAME_NS, image, None, None)) for k in range(1, 100)]
+    odometry, frame = standing()
+    said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(1, 100)]
     inertial = [n for n, estimate in enumerate(said) if estimate.inertial]
     wrong_frame = inertial[0] + 1
     assert not said[wrong_frame].inertial
