@@ -14,7 +14,6 @@ import numpy as np
 from rich.console import Console
 
 from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
-from fleetmap.config import to_dict
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
@@ -380,14 +379,14 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     given: dict[str, Any] = {} if options.trajectory is None else {"trajectory": options.trajectory.file.name}
     if parent is not None and (trusted := parent.manifest.configuration.get(TRUSTED_KEY)):
         given[TRUSTED_KEY] = trusted
-    topics = {} if options.topics == Topics() else {"topics": to_dict(options.topics)}
+    topics = {} if options.topics == Topics() else {"topics": to_plain(options.topics)}
     always = {
         "frames": options.frames,
         "frame_from_ground_truth": options.frame_from_ground_truth or kept,
         "own_calibration": options.calibration is not None,
         "use": None if options.use is None else options.use.value,
         "zones": {name: polygon.tolist() for name, polygon in run.zones.polygons.items()},
-        "survey": to_dict(run.settings),
+        "survey": to_plain(run.settings),
     }
     return given | topics | always
 

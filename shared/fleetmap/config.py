@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
@@ -135,9 +134,3 @@ def over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
         old = merged.get(key)
         merged[key] = over(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return merged
-
-
-def to_dict(section: Section) -> dict[str, object]:
-    """The effective configuration as plain values, for reports and manifests."""
-    built: dict[str, object] = to_plain(section)
-    return built

@@ -12,7 +12,7 @@ from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, ImuSamples, Stamps
 
 IMU_GAP_NS = 35_000_000  # a longer time without samples is bridged as without an IMU; one of 30 Hz has none
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
-_LEAST_ROOM = 1024  # samples
+_FOR_EVER_NS = 1 << 62
 
 
 def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
@@ -22,14 +22,10 @@ def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
 
 
 class SensorBuffer:
-    """Samples in order of their stamps, on the IMU's clock; spikes of the IMU are left out.
-
-    `imu` is a view of rows that are never written again: where there is no room behind them, they move to other arrays.
-    """
+    """Samples in order of their stamps, on the IMU's clock; spikes of the IMU are left out. The arrays of `imu` are never written again."""
 
     def __init__(self) -> None:
         self.imu = ImuSamples.empty()
-        self._room, self._first, self._end = ImuSamples.empty(), 0, 0
         self._pending: list[ImuSamples] = []
         self._wheel: list[WheelSample] = []
 
@@ -47,32 +43,19 @@ class SensorBuffer:
         Without an IMU wheels serve no start: all go that serve no frame from needed_from_ns on.
         """
         if self._pending:
-            self._append_pending()
-        oldest, room = needed_from_ns - int(memory_s * 1e9), self._room
-        if self._end > self._first and room.stamps_ns[self._first] < oldest - int(0.4e9 * memory_s):
-            self._first += int(np.searchsorted(room.stamps_ns[self._first : self._end], oldest))
-        rows = slice(self._first, self._end)
-        self.imu = ImuSamples(room.stamps_ns[rows], room.gyro_radps[rows], room.accel_mps2[rows])
+            parts = [self.imu, *self._pending]
+            stamps_ns = np.concatenate([part.stamps_ns for part in parts])
+            gyro_radps = np.concatenate([part.gyro_radps for part in parts])
+            accel_mps2 = np.concatenate([part.accel_mps2 for part in parts])
+            end = sensor_kernels.drop_spikes(stamps_ns, gyro_radps, accel_mps2, len(self.imu))
+            self.imu = ImuSamples(stamps_ns[:end], gyro_radps[:end], accel_mps2[:end])
+            self._pending.clear()
+        oldest = needed_from_ns - int(memory_s * 1e9)
+        if len(self.imu) and self.imu.stamps_ns[0] < oldest - int(0.4e9 * memory_s):
+            self.imu = self.imu.between(oldest, _FOR_EVER_NS)
         serves_ns = oldest if len(self.imu) else needed_from_ns - _WHEEL_REACH_NS
         if self._wheel and self._wheel[0].stamp_ns < serves_ns:
             self._wheel = [s for s in self._wheel if s.stamp_ns >= serves_ns]
-
-    def _append_pending(self) -> None:
-        known = self._end
-        most = known + sum(len(batch) for batch in self._pending)
-        if most > len(self._room):
-            held = most - self._first
-            old, self._room = self._room, _room_for(max(2 * held, _LEAST_ROOM))
-            for to, rows in zip(_columns(self._room), _columns(old), strict=True):
-                to[: known - self._first] = rows[self._first : known]
-            self._first, known = 0, known - self._first
-        end = known
-        for batch in self._pending:
-            for to, rows in zip(_columns(self._room), _columns(batch), strict=True):
-                to[end : end + len(batch)] = rows
-            end += len(batch)
-        self._pending.clear()
-        self._end = sensor_kernels.drop_spikes(*_columns(self._room), self._first, known, end)
 
     def rotation_between(self, start_ns: int, end_ns: int, noise: ImuNoise) -> Array | None:
         """earlier_from_later (3, 3) of the body by the gyro, its bias included; None where samples are missing."""
@@ -102,11 +85,3 @@ class SensorBuffer:
         if abs(sample.stamp_ns - stamp_ns) > _WHEEL_REACH_NS or not len(around):
             return None
         return sample, np.asarray(around.gyro_radps.mean(axis=0))
-
-
-def _columns(samples: ImuSamples) -> tuple[Stamps, Array, Array]:
-    return samples.stamps_ns, samples.gyro_radps, samples.accel_mps2
-
-
-def _room_for(count: int) -> ImuSamples:
-    return ImuSamples(np.empty(count, np.int64), np.empty((count, 3)), np.empty((count, 3)))

@@ -22,13 +22,14 @@ def _jumps(values: Array, before: int, after: int, limit: float) -> bool:
 
 
 @kernel
-def drop_spikes(stamps_ns: Stamps, gyro: Array, accel: Array, first: int, known: int, end: int) -> int:
-    """End of the samples once spikes are gone from rows known to end, in place: what is far from both neighbours.
+def drop_spikes(stamps_ns: Stamps, gyro: Array, accel: Array, known: int) -> int:
+    """End of the samples once spikes are gone from the rows behind the known ones, in place: what is far from both neighbours.
 
-    Rows first to known came earlier. The last sample is judged by one neighbour alone; the very first one has none and stays.
+    Rows up to known came earlier. The last sample is judged by one neighbour alone; the very first one has none and stays.
     """
+    end = len(stamps_ns)
     kept = np.ones(end - known, np.bool_)
-    for n in range(max(known, first + 1), end):
+    for n in range(max(known, 1), end):
         is_last = n == end - 1
         turns = _jumps(gyro, n - 1, n, _SPIKE_RADPS) and (is_last or _jumps(gyro, n, n + 1, _SPIKE_RADPS))
         pushes = _jumps(accel, n - 1, n, _SPIKE_MPS2) and (is_last or _jumps(accel, n, n + 1, _SPIKE_MPS2))

@@ -1,13 +1,12 @@
 """The features of one frame, with the depth of those that match something in a map."""
 
-from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import orb, stereo
-from fleetmap.features.extraction import extract, extract_in_slices
+from fleetmap.features.extraction import extract
 from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -41,13 +40,6 @@ class FrameFeatures:
     def without_depth(self) -> "FrameFeatures":
         """A copy as of a single camera."""
         return FrameFeatures(self.features, np.column_stack([self.pixels[:, :2], np.full(len(self.pixels), np.nan)]))
-
-
-def extract_features(frame: RectifiedFrame, settings: OrbSettings) -> Generator[None, None, FrameFeatures]:
-    """The features of one frame, no depth measured yet, in slices."""
-    features = yield from extract_in_slices(frame.left, settings)
-    pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
-    return FrameFeatures(features, pixels, frame, np.zeros(len(features), bool))
 
 
 def features_with_depth(

@@ -82,22 +82,16 @@ class MapView:
     def __len__(self) -> int:
         return len(self.points_map)
 
-    def shown_shares(self, descriptors: NDArray[np.uint8]) -> Array:
-        """(K,) the share of each place's landmarks, by the rarity of their words, that look like one of the descriptors (N, 32).
+    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
+        """Places of whose landmarks, by the rarity of their words, the descriptors (N, 32) show the largest share, best first.
 
-        Not the similarity of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing.
+        Not the similarity of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing. Each
+        place counts for itself: added up over its neighbours, fewer right ones are among the first (docs/studies/recognition.md).
         """
         if not len(descriptors):
-            return np.zeros(len(self.place_rows))
+            return np.zeros(0, np.int64)
         weights = self._shown_weights * self._index.near(descriptors, _NEAR_BITS)[self._shown]
-        return np.asarray(
-            np.bincount(self._place_of_shown, weights, minlength=len(self.place_rows)) / self._place_weights
-        )
-
-    def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Places of whose landmarks the descriptors show the largest share, best first. Each place counts for itself: added up over
-        its neighbours, fewer right ones are among the first (docs/studies/recognition.md)."""
-        shares = self.shown_shares(descriptors)
+        shares = np.bincount(self._place_of_shown, weights, minlength=len(self.place_rows)) / self._place_weights
         if allowed is not None:
             shares = np.where(allowed, shares, 0.0)
         best = np.argsort(-shares, kind="stable")[:top]
@@ -123,10 +117,6 @@ class MapView:
         map_from_place = self.map_from_cam[place]
         near = places_around(self.map_from_cam, map_from_place, _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
         return np.flatnonzero(self._seen_from(np.flatnonzero(near)))
-
-    def judged(self, rows: Rows, is_found: NDArray[np.bool_]) -> CovisibleLandmarks:
-        """Landmarks (E,) that should have been seen, and whether they were (E,)."""
-        return CovisibleLandmarks(self.landmark_ids[rows], self.points_map[rows], self.descriptors[rows], is_found)
 
     def _seen_from(self, places: Rows) -> NDArray[np.bool_]:
         """(N,) which landmarks are seen from one of the places."""

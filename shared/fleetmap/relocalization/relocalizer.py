@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import orb
+from fleetmap.features.extraction import extract_in_slices
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
-from fleetmap.relocalization.frame_features import FrameFeatures, extract_features
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import Rows, image_coverage, match_visible, places_around
 from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
@@ -62,8 +63,10 @@ class Relocalizer:
         self._settings = settings
 
     def extract(self, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """The features of one frame, in slices: see `finished`."""
-        return (yield from extract_features(frame, self._settings.orb))
+        """The features of one frame, no depth measured yet, in slices: see `finished`."""
+        features = yield from extract_in_slices(frame.left, self._settings.orb)
+        pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
+        return FrameFeatures(features, pixels, frame, np.zeros(len(features), bool))
 
     def near(self, query: FrameFeatures, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
         """The fix near a predicted place whose covariance (map axes) sets the search window; None where nothing agrees."""
@@ -267,7 +270,11 @@ class Relocalizer:
             expected=len(rows),
             seen=seen,
             matches=matches,
-            covisible=self.view.judged(rows, is_found) if is_passed else None,
+            covisible=CovisibleLandmarks(
+                self.view.landmark_ids[rows], self.view.points_map[rows], self.view.descriptors[rows], is_found
+            )
+            if is_passed
+            else None,
         )
 
     def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> Correspondences:

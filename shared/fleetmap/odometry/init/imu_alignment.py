@@ -71,7 +71,8 @@ def align(
     gyro_bias = np.zeros(3)
     for _ in range(2):
         gyro_bias = gyro_bias + _gyro_bias_step(motion, imu, noise, gyro_bias)
-    if not _is_bias(gyro_bias, settings):
+    # What no gyro reads at rest is pictures that were followed wrongly.
+    if not np.linalg.norm(gyro_bias) < settings.start.steady_gyro_mean_radps:
         return None
     terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
     gravity = _free_gravity(motion, terms)
@@ -118,11 +119,6 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     covariance = 4.0 * to_error @ solved @ to_error.T
     floor = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
     return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]))
-
-
-def _is_bias(gyro_bias: Array, settings: OdometrySettings) -> bool:
-    """Whether a gyro may read that at rest. A larger difference is pictures that were followed wrongly."""
-    return bool(np.linalg.norm(gyro_bias) < settings.start.steady_gyro_mean_radps)
 
 
 def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:
