@@ -56,23 +56,3 @@ def test_targets_fast_forward_recovery(publisher: ListPublisher, robot: ListRead
     publisher.publish("root", "snapshot", "timestamp")
     assert robot.refused(1) == ""
     assert robot.number(ROLE) == honest + 1
-
-
-@pytest.mark.parametrize("role", ["snapshot", "timestamp"])
-def test_new_fast_forward_recovery(publisher: ListPublisher, robot: ListReader, role: str) -> None:
-    publisher.signed(role).version = 100
-    publisher.name(role)
-    for name in ("snapshot", "timestamp")[role == "timestamp" :]:
-        publisher.publish(name)
-    assert robot.refused(1) == ""
-    publisher.signed(role).version = 1
-    publisher.name(role)
-    publisher.rotate("snapshot", "timestamp")
-    publisher.write("snapshot")
-    publisher.publish("root")
-    if role == "snapshot":
-        publisher.publish("timestamp")
-    else:
-        publisher.write("timestamp")
-    assert robot.refused(1) == ""
-    assert robot.number(role) == 1

@@ -7,7 +7,6 @@ from fleetmap.geometry import Array, se3_exp, se3_inverse, so3_exp
 from fleetmap.odometry.filter.measurements import LinearMeasurement
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import InitialState
-from fleetmap.odometry.init import imu_alignment
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.settings import OdometrySettings
@@ -152,7 +151,7 @@ def test_gravity_of_the_wrong_size_is_refused() -> None:
     assert dynamic_initialization(vision, weak, NOISE, SETTINGS) is None
 
 
-def test_pictures_that_turned_away_give_no_gyro_bias(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_that_turned_away_give_no_gyro_bias() -> None:
     """Vision that slips by tens of degrees looks like a gyro with a bias that none has; the filter would believe it."""
     rng = np.random.default_rng(7)
     imu = noisy_imu(rng, 2.5, NOISE, GYRO_BIAS, np.zeros(3))
@@ -161,7 +160,3 @@ def test_pictures_that_turned_away_give_no_gyro_bias(monkeypatch: pytest.MonkeyP
     turned[:, :3, :3] = turned[:, :3, :3] @ np.array([so3_exp(np.array([0.0, 0.0, 0.03 * k])) for k in range(20)])
     slipped = Trajectory(vision.stamps_ns, turned)
     assert dynamic_initialization(slipped, imu, NOISE, SETTINGS) is None
-    monkeypatch.setattr(imu_alignment, "_is_bias", lambda _bias, _settings: True)
-    wrong = dynamic_initialization(slipped, imu, NOISE, SETTINGS)
-    assert wrong is not None
-    assert np.linalg.norm(wrong.state.gyro_bias_radps) > 0.2  # the danger that the limit averts
