@@ -12,7 +12,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from mapserver.cli import app
-from support.recordings.calibration_faults import IMAGE_FAULTS, pair_turn
+from support.recordings.calibration_faults import pair_turn, swapped
 from support.recordings.recording_samples import write_euroc
 from support.recordings.spoiled_recording import (
     with_clock_shift,
@@ -59,7 +59,7 @@ def remarks(report: dict[str, Any]) -> str:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        pytest.param(IMAGE_FAULTS["swapped"].recording, "left and right are swapped", id="swapped"),
+        pytest.param(swapped, "left and right are swapped", id="swapped"),
         pytest.param(pair_turn("pitch", 1.0).recording, r"look [+-](0\.9|1\.0)\d degrees apart", id="tilted"),
     ],
 )

@@ -4,7 +4,7 @@ CPU seconds and peak memory by stage and keyframes, the slopes of their growth (
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
-    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--robots A,B] [--frames N]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_site.py [--keyframes 250,1000] [--frames N]
         [--drive FILE] [--out FILE.json]
 """
 
@@ -12,7 +12,6 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse
-import hashlib
 import json
 import subprocess
 import sys
@@ -21,7 +20,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 
@@ -34,21 +32,12 @@ from mapserver.config import survey_settings
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge
-from mapserver.survey.stages import Survey, survey_from
+from mapserver.survey.stages import survey_from
 from mapserver.survey.state import ImageStore, MemoryImageStore
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
-ROBOTS = ("survey",)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
-
-
-def simulate(robots: Sequence[str], frames: int | None, out: Path) -> None:
-    """Writes what the odometry saw on drives that follow each other: a quarter of an hour for what takes 80 minutes."""
-    survey = simulated_survey(session_of("fulfilment-centre", robots, frames=frames), SETTINGS)
-    survey.write(out)
 
 
 class Stages:
@@ -70,42 +59,29 @@ class Stages:
         Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
 
 
-class _Gate(GraphMarginals):
-    """The loops' gate, of which is known how much it learned, though not itself: it is as large as all else."""
-
-    last_learned = 0
-
-    def add(self, edge: PoseEdge) -> None:
-        """See GraphMarginals."""
-        super().add(edge)
-        _Gate.last_learned = self.learned
-
-
-def measure(drive: Path, keyframes: int, threads: int) -> dict[str, Any]:
+def measure(drive: Path, keyframes: int) -> dict[str, Any]:
     """One survey's figures."""
     with MappedImageStore(drive.parent) as store:
         survey = SimulatedSurvey.read(drive, keyframes, store)
-        return _measure(survey, store, threads)
+        return _measure(survey, store)
 
 
-def _measure(survey: SimulatedSurvey, store: ImageStore, threads: int) -> dict[str, Any]:
+def _measure(survey: SimulatedSurvey, store: ImageStore) -> dict[str, Any]:
     stages, before_mb = Stages(), _peak_mb()
-    begun = time.process_time(), time.perf_counter()
+    begun_s = time.process_time()
     options = SurveyConfig(SETTINGS, default_vocabulary())
-    gate = patch.object(stages, "GraphMarginals", _Gate)
-    with drawn_alignment(survey), open_executor(threads, None) as executor, gate:
+    with drawn_alignment(survey), open_executor(1, None) as executor:
         made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(stages, store, executor))
     stages("end", 0, 0)
     count = len(survey.odometry.keyframes)
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
-    cpu_s = time.process_time() - begun[0]
+    cpu_s = time.process_time() - begun_s
     return {
         "keyframes": count,
         "frames": len(survey.odometry.estimates),
         "driving_s": 1e-9 * (survey.odometry.estimates[-1].stamp_ns - survey.odometry.estimates[0].stamp_ns),
         "path_m": float(np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1).sum()),
         "cpu_s": cpu_s,
-        "wall_s": time.perf_counter() - begun[1],
         "cpu_ms_per_keyframe": 1e3 * cpu_s / count,
         "stages_s": stages.cpu_s,
         "stages_mb": stages.peak_mb,
@@ -113,22 +89,11 @@ def _measure(survey: SimulatedSurvey, store: ImageStore, threads: int) -> dict[s
         "input_mb": before_mb,
         "observations": len(made.state.landmarks.obs_keyframe),
         "loops": len(made.loops.edges),
-        "loops_learned": _Gate.last_learned,
         "wrong_loops": wrong_loops(made.loops.edges, survey),
         "kept": len(made.odometry.keyframes),
         "ate_m": ate_m(made.state.map_from_body, truth),
-        "digest": digest(made),
         "odometry_ate_m": ate_m(survey.odometry.odom_from_body, survey.map_from_body),
     }
-
-
-def digest(made: Survey) -> str:
-    """Of all that the survey found: equal for equal results."""
-    state, marks, found = made.state, made.state.landmarks, hashlib.sha256()
-    for array in (state.map_from_body, marks.points_map, marks.obs_keyframe, marks.obs_feature, made.map.point_sigma_m):
-        found.update(np.ascontiguousarray(array))
-    found.update(np.ascontiguousarray(made.map.trajectory.frame_from_body))
-    return found.hexdigest()[:16]
 
 
 def ate_m(map_from_body: Array, truth: Array) -> float:
@@ -147,20 +112,20 @@ def wrong_loops(edges: Any, survey: SimulatedSurvey) -> int:
     return wrong
 
 
-def measured(sizes: Sequence[int], drive: Path, threads: int = 1) -> Iterator[dict[str, Any]]:
+def measured(sizes: Sequence[int], drive: Path) -> Iterator[dict[str, Any]]:
     """The figures of each size, in a process of its own whose memory has held no more than its part of the drive."""
     for size in sizes:
         with TemporaryDirectory(dir=drive.parent) as folder:
             part = Path(folder) / "part.drive"
-            command = [sys.executable, __file__, "--one", str(size), "--threads", str(threads), "--drive"]
+            command = [sys.executable, __file__, "--one", str(size), "--drive"]
             subprocess.run([*command, str(drive), "--cut", str(part)], check=True)
             done = subprocess.run([*command, str(part)], check=True, stdout=subprocess.PIPE, text=True)
         yield json.loads(done.stdout.splitlines()[-1])
 
 
-def slope(rows: list[dict[str, Any]], key: str, against: str = "keyframes") -> float:
-    """Of the log-log fit; against the observations parts are alike of which one sees more in a keyframe than another."""
-    return float(np.polyfit(np.log([r[against] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
+def slope(rows: list[dict[str, Any]], key: str) -> float:
+    """Of the log-log fit over the keyframes."""
+    return float(np.polyfit(np.log([r["keyframes"] for r in rows]), np.log([r[key] for r in rows]), 1)[0])
 
 
 def _peak_mb() -> float:
@@ -172,10 +137,8 @@ def main() -> None:
     """Prints one line of JSON for each size, then the slopes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keyframes", default="250,1000", help="sizes, comma separated")
-    parser.add_argument("--robots", default=",".join(ROBOTS), help="runs of the scenario, one after the other")
     parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
     parser.add_argument("--drive", type=Path, default=Path("out/site.drive"), help="as simulated; made where missing")
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--one", type=int, default=None, help=argparse.SUPPRESS)
     parser.add_argument("--cut", type=Path, default=None, help=argparse.SUPPRESS)
@@ -184,19 +147,18 @@ def main() -> None:
         SimulatedSurvey.read(given.drive, given.one, MemoryImageStore()).write(given.cut)
         return
     if given.one is not None:
-        print(json.dumps(measure(given.drive, given.one, given.threads)), flush=True)
+        print(json.dumps(measure(given.drive, given.one)), flush=True)
         return
     if not given.drive.exists():
         given.drive.parent.mkdir(parents=True, exist_ok=True)
-        simulate(given.robots.split(","), given.frames, given.drive)
+        simulated_survey(session_of("fulfilment-centre", ["survey"], frames=given.frames), SETTINGS).write(given.drive)
     rows = []
-    for row in measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive, given.threads):
+    for row in measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive):
         rows.append(row)
         print(json.dumps(row), flush=True)
     slopes = {}
     if len(rows) > 1:
         slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
-        slopes["cpu by observations"] = slope(rows, "cpu_s", "observations")
         print(json.dumps(slopes))
     if given.out is not None:
         given.out.write_text(json.dumps({"sizes": rows, "slopes": slopes}, indent=2) + "\n", encoding="utf-8")

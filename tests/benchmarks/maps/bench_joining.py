@@ -14,7 +14,7 @@ import argparse
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,7 +151,7 @@ def recorded(shot: Shot, work: Path) -> Path:
 
         SCENARIOS[f"{site.scenario}-half"] = make
         order = Order(f"{site.scenario}-half", site.seed, shot.day, shot.light, shot.robot, frames=_FRAMES)
-        record_order(order, path.with_suffix(".part"), "mcap", "png")
+        record_order(order, path.with_suffix(".part"), "mcap")
         path.with_suffix(".part").rename(path)
     return path
 
@@ -235,51 +235,36 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-@dataclass(frozen=True, slots=True)
-class Amount:
-    """How many buildings: `sites` without pictures make sites * (sites - 1) foreign pairs, `true_sites` six true sessions each,
-    `rendered` ones as many foreign pairs and two later sessions each.
-    """
-
-    parts: tuple[str, ...] = ("pictures", "foreign", "true")
-    sites: int = 15
-    true_sites: int = 34
-    rendered: int = 7
-    seed: int = 500
-
-
-def measured(amount: Amount, work: Path) -> Iterator[dict[str, Any]]:
+def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each session."""
-    plain = [Site(_PLAIN[n % 3], amount.seed + 100 + n) for n in range(amount.true_sites)]
+    plain = [Site(_PLAIN[n % 3], options.seed + 100 + n) for n in range(options.true_sites)]
     parts = {
-        "pictures": rendered(sites(amount.rendered, amount.seed), work),
-        "foreign": foreign(sites(amount.sites, amount.seed + 50)),
+        "pictures": rendered(sites(options.rendered, options.seed), options.work),
+        "foreign": foreign(sites(options.sites, options.seed + 50)),
         "true": true(plain),
     }
-    for part in amount.parts:
+    for part in options.parts:
         for row in parts[part]:
             yield row | {name: f"{row[name].scenario} {row[name].seed}" for name in ("map", "session")} | {"part": part}
 
 
 def main() -> None:
     """Prints a line for each session and the rates; writes JSON where asked."""
-    full = Amount()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sites", type=int, default=full.sites, help="buildings without pictures: 210 foreign pairs")
-    parser.add_argument("--true-sites", type=int, default=full.true_sites, help="buildings with six true sessions each")
-    parser.add_argument("--rendered", type=int, default=full.rendered, help="buildings with pictures: 42 foreign pairs")
-    parser.add_argument("--parts", nargs="+", default=full.parts)
-    parser.add_argument("--seed", type=int, default=full.seed)
+    parser.add_argument("--sites", type=int, default=15, help="buildings without pictures: 210 foreign pairs")
+    parser.add_argument("--true-sites", type=int, default=34, help="buildings with six true sessions each")
+    parser.add_argument("--rendered", type=int, default=7, help="buildings with pictures: 42 foreign pairs")
+    parser.add_argument("--parts", nargs="+", default=["pictures", "foreign", "true"])
+    parser.add_argument("--seed", type=int, default=500)
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "fleetmap-bench")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     options.work.mkdir(parents=True, exist_ok=True)
-    amount = Amount(tuple(options.parts), options.sites, options.true_sites, options.rendered, options.seed)
     rows = []
-    for row in measured(amount, options.work):
+    for row in measured(options):
         rows.append(row)
         print(json.dumps(row), flush=True)
-    figures = {part: summary([row for row in rows if row["part"] == part]) for part in amount.parts}
+    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.parts}
     figures["all"] = summary(rows)
     print(json.dumps(figures, indent=1))
     if options.out is not None:

@@ -1,4 +1,4 @@
-"""Robots that are switched on where they stand, by night and without a prior: how soon each finds itself, and what its search costs.
+"""Robots that are switched on where they stand, by night and without a prior: how soon each finds itself.
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_standing_starts.py [--seed N] [--starts N] [--pipeline NAME...] [--work FOLDER]
 [--out FILE.json]`. The map is that of `small-loop`'s survey by day; three days later, at places spread over another robot's drive, each
@@ -10,7 +10,6 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 import argparse
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,6 @@ from benchmarks.common.recorded_runs import (
     surveyed,
     write_results,
 )
-from benchmarks.common.yardstick import at_reference, slowness
 from benchmarks.robot.aliased_starts import WRONG_M, part_of
 from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array
@@ -36,7 +34,6 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.identity import MapAddress
-from locclient.localization import map_query
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
@@ -46,19 +43,17 @@ from locclient.robot.version_trial import TrialSettings
 
 WITHIN_S, ELSEWHERE_M = 1.0, 8.0
 _FOLLOWED_S, _LIGHT, _DAY, _ROBOT = 2.0, "night", 3, "runner-1"
-_SLICES = map_query._MORE_SLICES
 PIPELINES = ("clean", "night-gain")
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
     """How one start went: seconds until the first right fix, and until TRACKING at the right place, None for never; whether it was ever
-    TRACKING elsewhere; CPU milliseconds of each frame without a place after the first."""
+    TRACKING elsewhere."""
 
     fix_s: float | None
     tracking_s: float | None
     is_wrong: bool
-    lost_ms: tuple[float, ...]
 
 
 def without_around(loaded: LoadedMap, position_m: Array) -> LoadedMap:
@@ -82,12 +77,12 @@ def without_around(loaded: LoadedMap, position_m: Array) -> LoadedMap:
 def start(session: Session, frames: Sequence[CameraFrame], loaded: LoadedMap) -> Start:
     """The outcome of waking up there."""
     rectifier = Rectifier(session.nominal)
-    robot = Robot(session.nominal, rectifier, LocalizerSettings(), TrialSettings(), time.process_time)
+    robot = Robot(session.nominal, rectifier, LocalizerSettings(), TrialSettings())
     robot.use(loaded)
     truth_m = session.motion.map_from_body(np.zeros(1))[0][:3, 3]
     fix_s = tracking_s = None
-    is_wrong, lost_ms, last_ns = False, [], 0
-    for number, frame in enumerate(frames):
+    is_wrong, last_ns = False, 0
+    for frame in frames:
         until_ns = frame.stamp_ns + 1
         bundle = SensorBundle(
             frame, session.imu.between(last_ns, until_ns), list(wheel_between(session.wheel, last_ns, until_ns))
@@ -102,9 +97,7 @@ def start(session: Session, frames: Sequence[CameraFrame], loaded: LoadedMap) ->
             is_right = np.linalg.norm(estimate.map_from_body[:3, 3] - truth_m) <= WRONG_M
             is_wrong |= not is_right
             tracking_s = after_s if is_right and tracking_s is None else tracking_s
-        elif number:
-            lost_ms.append(1e3 * outcome.cpu_s)
-    return Start(fix_s, tracking_s, is_wrong, tuple(lost_ms))
+    return Start(fix_s, tracking_s, is_wrong)
 
 
 def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, float]:
@@ -124,13 +117,6 @@ def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, floa
     }
 
 
-def costs(lost: Sequence[Start], seen: Sequence[float | None]) -> dict[str, float | None]:
-    """CPU milliseconds of a frame of robots that search, as the reference machine would take."""
-    every = np.concatenate([s.lost_ms for s in lost])
-    percentiles = {f"p{q}_ms": float(np.percentile(every, q)) for q in (50, 99)}
-    return {key: at_reference(value, list(seen)) for key, value in percentiles.items()}
-
-
 def main() -> None:
     """Prints the tables; writes them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -147,8 +133,6 @@ def main() -> None:
         loaded = load_map(link.source)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
     found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.pipeline or PIPELINES}
-    lost: dict[int, list[Start]] = {1: [], _SLICES: []}
-    slow = [slowness()]
     for number, time_s in enumerate(np.linspace(0.5, drive.motion.duration_s - 0.5, arguments.starts).tolist()):
         session = standing(drive, time_s, number, _FOLLOWED_S)
         frames = list(session.frames())
@@ -158,20 +142,12 @@ def main() -> None:
             shown = [process_frame(frame, find_pipeline(name), number) for frame in frames]
             mapped.append(start(session, shown, loaded))
             unmapped.append(start(session, shown, rest))
-            print(f"{time_s:5.1f} s, {name:10} {replace(mapped[-1], lost_ms=())} {unmapped[-1].is_wrong}", flush=True)
-        lost[_SLICES].append(start(session, frames, rest) if "clean" not in found else found["clean"][1][-1])
-        map_query._MORE_SLICES = 1
-        lost[1].append(start(session, frames, rest))
-        map_query._MORE_SLICES = _SLICES
-        slow.append(slowness())
+            print(f"{time_s:5.1f} s, {name:10} {mapped[-1]} {unmapped[-1].is_wrong}", flush=True)
     drive.renderer.close()
     results = {name: figures(*starts) for name, starts in found.items()}
     for name, row in results.items():
         show(f"{name}, seed {arguments.seed}", row)
-    spent = {slices: costs(starts, slow) for slices, starts in lost.items()}
-    for slices, row in spent.items():
-        show(f"frames of a robot that searches, {slices} slices a frame", row)
-    write_results(arguments.out, {"figures": results, "costs": spent})
+    write_results(arguments.out, {"figures": results})
 
 
 if __name__ == "__main__":

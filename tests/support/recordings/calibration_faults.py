@@ -23,24 +23,17 @@ AXES = {"pitch": (1.0, 0.0, 0.0), "yaw": (0.0, 1.0, 0.0), "roll": (0.0, 0.0, 1.0
 
 @dataclass(frozen=True, slots=True)
 class RigFault:
-    """One wrong parameter. kind: a key for tables; size in `unit`, with sign; needs: the fewest sensors with which it means something."""
+    """One wrong parameter. kind: a key for tables; size in `unit`, with sign."""
 
     kind: str
     size: float
     unit: str
     change: RigChange
-    needs_imu: bool = False
-    needs_pair: bool = True
 
     @property
     def name(self) -> str:
         """Kind, size and unit in words."""
         return f"{self.kind} {self.size:+g} {self.unit}"
-
-    def applies_to(self, recording: Recording) -> bool:
-        """Whether the recording has the sensors that this fault is about."""
-        rig = recording.calibration
-        return (rig.imu is not None or not self.needs_imu) and (len(rig.cameras) > 1 or not self.needs_pair)
 
     def recording(self, good: Recording) -> Recording:
         """The good recording as it opens with the wrong calibration."""
@@ -71,7 +64,7 @@ def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
         return _with_cameras(rig, scaled, chosen)
 
     kind = "focal" if chosen is None else "focal of cam" + ",".join(map(str, sorted(chosen)))
-    return RigFault(kind, percent, "%", change, needs_pair=chosen is not None)
+    return RigFault(kind, percent, "%", change)
 
 
 def pair_turn(axis: str, degrees: float) -> RigFault:
@@ -94,7 +87,7 @@ def camera_imu_turn(axis: str, degrees: float) -> RigFault:
         about_left = se3(turn, centre - turn @ centre)
         return _with_cameras(rig, lambda c: replace(c, body_from_cam=about_left @ c.body_from_cam), None)
 
-    return RigFault(f"camera-imu {axis}", degrees, "deg", change, needs_imu=True, needs_pair=False)
+    return RigFault(f"camera-imu {axis}", degrees, "deg", change)
 
 
 def delay(milliseconds: float) -> RigFault:
@@ -103,7 +96,7 @@ def delay(milliseconds: float) -> RigFault:
     def change(rig: RigCalibration) -> RigCalibration:
         return _with_cameras(rig, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
 
-    return RigFault("delay", milliseconds, "ms", change, needs_imu=True, needs_pair=False)
+    return RigFault("delay", milliseconds, "ms", change)
 
 
 def another_robots_file(rig: RigCalibration) -> RigFault:
@@ -124,9 +117,7 @@ def unlike_robot(rig: RigCalibration, seed: int) -> RigCalibration:
         own = se3(so3_exp(np.radians(0.4) * rng.standard_normal(3)), np.zeros(3))
         return replace(camera, intrinsics_px=lens, body_from_cam=camera.body_from_cam @ own)
 
-    other = (
-        baseline(float(rng.standard_normal())).change(_with_cameras(rig, built, None)) if len(rig.cameras) > 1 else rig
-    )
+    other = baseline(float(rng.standard_normal())).change(_with_cameras(rig, built, None))
     turned = se3(so3_exp(np.radians(1.0) * rng.standard_normal(3)), np.zeros(3))
     return _with_cameras(other, lambda c: replace(c, body_from_cam=turned @ c.body_from_cam), None)
 
@@ -144,58 +135,27 @@ def standard_faults() -> list[RigFault]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class ImageFault:
-    """Images that are not what the calibration describes."""
+def swapped(good: Recording) -> Recording:
+    """Left images in the place of right ones."""
 
-    kind: str
-    spoil: Callable[[StoredFrame], StoredFrame]
+    def exchanged(frame: StoredFrame) -> StoredFrame:
+        assert frame.right is not None
+        return replace(frame, left=frame.right, right=frame.left)
 
-    @property
-    def name(self) -> str:
-        """The kind, as for a RigFault."""
-        return self.kind
-
-    def recording(self, good: Recording) -> Recording:
-        """The good recording with these images."""
-        return with_frames(good, np.arange(len(good)), self.spoil)
+    return with_frames(good, np.arange(len(good)), exchanged)
 
 
-def _exchanged(frame: StoredFrame) -> StoredFrame:
-    assert frame.right is not None
-    return replace(frame, left=frame.right, right=frame.left)
+def mirrored(good: Recording) -> Recording:
+    """All images mirrored."""
 
+    def flipped(image: StoredImage) -> StoredImage:
+        return png_image(np.ascontiguousarray(cv2.flip(decode_grey(image), 1)))
 
-def _mirrored(frame: StoredFrame) -> StoredFrame:
-    right = None if frame.right is None else _flipped(frame.right)
-    return replace(frame, left=_flipped(frame.left), right=right)
+    def changed(frame: StoredFrame) -> StoredFrame:
+        assert frame.right is not None
+        return replace(frame, left=flipped(frame.left), right=flipped(frame.right))
 
-
-def _one_mirrored(frame: StoredFrame) -> StoredFrame:
-    assert frame.right is not None
-    return replace(frame, right=_flipped(frame.right))
-
-
-def _upside_down(frame: StoredFrame) -> StoredFrame:
-    right = None if frame.right is None else _flipped(frame.right, -1)
-    return replace(frame, left=_flipped(frame.left, -1), right=right)
-
-
-IMAGE_FAULTS = {
-    fault.kind: fault
-    for fault in (
-        ImageFault("swapped", _exchanged),
-        ImageFault("mirrored", _mirrored),
-        ImageFault("mirrored and swapped", lambda frame: _exchanged(_mirrored(frame))),
-        ImageFault("right mirrored", _one_mirrored),
-        ImageFault("upside down", _upside_down),
-        ImageFault("upside down and swapped", lambda frame: _exchanged(_upside_down(frame))),
-    )
-}
-
-
-def _flipped(image: StoredImage, how: int = 1) -> StoredImage:
-    return png_image(np.ascontiguousarray(cv2.flip(decode_grey(image), how)))
+    return with_frames(good, np.arange(len(good)), changed)
 
 
 def _rotation(axis: tuple[float, float, float], degrees: float) -> Array:
