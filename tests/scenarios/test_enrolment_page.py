@@ -85,7 +85,7 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
         made.close()
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(600)
 def test_a_new_user_follows_the_page(machine: Machine, tmp_path: Path) -> None:
     page = (REPOSITORY / "docs" / "security.md").read_text("utf-8").split("\n### Enrolling robots\n")[1].split("\n#")[0]
     commands = [" ".join(match.split()) for match in _COMMAND.findall(page)]
