@@ -17,6 +17,7 @@ last bit.
 
 import io
 import reprlib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 20_000
 _WORDS = reprlib.Repr()
 _WORDS.maxlevel = 2
@@ -55,6 +56,21 @@ _IMU_INTRINSICS: dict[str, Any] = {
 }
 _LARGEST_PX = 32_768
 Values = Mapping[str, Any]
+
+
+class _RepeatedKeyError(ValueError):
+    """Its text is the key."""
+
+
+class _Loader(_SAFE_LOADER):  # type: ignore[misc]
+    """Refuses a key that a mapping has twice; YAML's own loader takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for key, count in keys.items():
+            if count > 1:
+                raise _RepeatedKeyError(_brief(key))
+        return dict(super().construct_mapping(node, deep))
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,7 +392,9 @@ def _parse_yaml(text: str, where: str) -> Values:
     plain = "\n".join(lines)
     try:
         _check_events(plain, where)
-        values = yaml.load(plain, Loader=_LOADER)
+        values = yaml.load(plain, Loader=_Loader)
+    except _RepeatedKeyError as error:
+        raise CalibrationError(f"{where} has the key {error} twice; keep the one that is right") from error
     # The loader's own constructors raise ValueError for 2026-02-30.
     except (yaml.YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
@@ -392,37 +410,18 @@ def _parse_yaml(text: str, where: str) -> Values:
 def _check_events(text: str, where: str) -> None:
     """CalibrationError for what no calibration has and what is dear to load: aliases, tags, deep nesting, long words."""
     depth = 0
-    mappings: list[tuple[set[str], list[bool]] | None] = []
-    for count, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+    for count, event in enumerate(yaml.parse(text, Loader=_SAFE_LOADER)):
         if count > _MAX_EVENTS:
             raise CalibrationError(f"{where} holds more than {_MAX_EVENTS} values; a calibration has some hundred")
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             raise CalibrationError(f"{where} uses YAML's aliases (& and *); write the values out")
         if (tag := getattr(event, "tag", None)) is not None:
             raise CalibrationError(f"{where} uses the YAML tag {_brief(tag)}; write plain values")
-        _check_repeated(event, mappings, where)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _MAX_DEPTH:
             raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
             raise CalibrationError(f"{where} holds a value of {len(event.value)} signs; the limit is {_MAX_WORD}")
-
-
-def _check_repeated(event: object, stack: list[tuple[set[str], list[bool]] | None], where: str) -> None:
-    """CalibrationError for a key that a mapping has twice. stack: for each open mapping its keys, and whether a key comes next."""
-    top = stack[-1] if stack else None
-    if isinstance(event, yaml.CollectionEndEvent):
-        stack.pop()
-        return
-    is_node = isinstance(event, yaml.NodeEvent)
-    if top is not None and is_node:
-        if isinstance(event, yaml.ScalarEvent) and top[1][0]:
-            if event.value in top[0]:
-                raise CalibrationError(f"{where} has the key {_brief(event.value)} twice; keep the one that is right")
-            top[0].add(event.value)
-        top[1][0] = not top[1][0]
-    if isinstance(event, yaml.CollectionStartEvent):
-        stack.append((set(), [True]) if isinstance(event, yaml.MappingStartEvent) else None)
 
 
 def _row(values: Array) -> str:

@@ -9,7 +9,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
 from fleetmap.recordings.image_series import SeriesFrames
-from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic
+from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -141,6 +141,8 @@ def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]
     for index in sorted({round(share * (len(frames.left) - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
         try:
             image = frames.reader.read(frames.left.sources[index], int(frames.left.stamps_ns[index]))
+            if index == 0 and not is_wide(image):
+                return 16  # as nearly all are: nothing more is read
             peak = max(peak, grey_peak(image))
         except RecordingError:
             continue

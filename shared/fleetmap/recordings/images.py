@@ -84,22 +84,16 @@ def _bmp_size(data: bytes) -> tuple[int, int]:
     return abs(width), abs(height)
 
 
-RAW_ENCODINGS = {
-    "mono8": (np.uint8, 1),
-    "8UC1": (np.uint8, 1),
-    "mono16": (np.uint16, 1),
-    "16UC1": (np.uint16, 1),
+_BAYER_ORDERS = ("rggb", "bggr", "gbrg", "grbg")
+# Type and channels of the pixels of images in rows, by ROS's names
+RAW_ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
+    **dict.fromkeys(("mono8", "8UC1", *(f"bayer_{order}8" for order in _BAYER_ORDERS)), (np.uint8, 1)),
+    **dict.fromkeys(("mono16", "16UC1", *(f"bayer_{order}16" for order in _BAYER_ORDERS)), (np.uint16, 1)),
     "32FC1": (np.float32, 1),
-    "rgb8": (np.uint8, 3),
-    "bgr8": (np.uint8, 3),
-    "8UC3": (np.uint8, 3),
-    "rgba8": (np.uint8, 4),
-    "bgra8": (np.uint8, 4),
-    "8UC4": (np.uint8, 4),
+    **dict.fromkeys(("rgb8", "bgr8", "8UC3"), (np.uint8, 3)),
+    **dict.fromkeys(("rgba8", "bgra8", "8UC4"), (np.uint8, 4)),
     **dict.fromkeys(("rgb16", "bgr16"), (np.uint16, 3)),
     **dict.fromkeys(("rgba16", "bgra16"), (np.uint16, 4)),
-    **{f"bayer_{order}8": (np.uint8, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
-    **{f"bayer_{order}16": (np.uint16, 1) for order in ("rggb", "bggr", "gbrg", "grbg")},
     # Two bytes a pixel, of which one is luma; ROS's older names and newer ones
     **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), (np.uint8, 2)),
     # A plane of luma, and colour behind it
@@ -108,20 +102,10 @@ RAW_ENCODINGS = {
 _COLOUR_ROWS = {"nv12": (1, 2), "nv21": (1, 2), "nv24": (2, 1)}  # of colour for each row of luma
 _LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 # OpenCV names a mosaic by the second row, its newer names by the first as ROS does
-_GREY_FROM_MOSAIC = {
-    "rggb": cv2.COLOR_BayerRGGB2GRAY,
-    "bggr": cv2.COLOR_BayerBGGR2GRAY,
-    "gbrg": cv2.COLOR_BayerGBRG2GRAY,
-    "grbg": cv2.COLOR_BayerGRBG2GRAY,
-}
-_GREY_FROM = {
-    "rgb8": cv2.COLOR_RGB2GRAY,
-    "bgr8": cv2.COLOR_BGR2GRAY,
-    "8UC3": cv2.COLOR_BGR2GRAY,
-    "rgba8": cv2.COLOR_RGBA2GRAY,
-    "bgra8": cv2.COLOR_BGRA2GRAY,
-    "rgb16": cv2.COLOR_RGB2GRAY,
-    "rgba16": cv2.COLOR_RGBA2GRAY,
+_GREY_FROM_MOSAIC = {order: getattr(cv2, f"COLOR_Bayer{order.upper()}2GRAY") for order in _BAYER_ORDERS}
+_GREY_FROM = {  # others are BGR
+    **dict.fromkeys(("rgb8", "rgb16"), cv2.COLOR_RGB2GRAY),
+    **dict.fromkeys(("rgba8", "rgba16"), cv2.COLOR_RGBA2GRAY),
 }
 INVERSE_DEPTH = "32FC1; compressedDepth"  # what ROS calls its quantized inverse depths
 _DEPTH_HEAD = struct.Struct("<iff")
@@ -211,13 +195,16 @@ def decode_grey(stored: StoredImage) -> Image:
     return np.ascontiguousarray(pixels, np.uint8)
 
 
+def is_wide(stored: StoredImage) -> bool:
+    """True for an image of 16 bits, by its encoding or the head of a PNG file."""
+    dtype, _ = RAW_ENCODINGS.get(stored.encoding, (None, 0))
+    is_wide_png = stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
+    return dtype == np.uint16 if dtype is not None else is_wide_png
+
+
 def grey_peak(stored: StoredImage) -> int:
     """The largest value of an image of 16 bits; 0 for others, which are not decoded; RecordingError where it cannot be decoded."""
-    dtype, _ = RAW_ENCODINGS.get(stored.encoding, (None, 0))
-    is_wide = (
-        dtype == np.uint16 if dtype is not None else stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
-    )
-    return int(_decode(stored).max()) if is_wide else 0
+    return int(_decode(stored).max()) if is_wide(stored) else 0
 
 
 def grey_bits(peak: int) -> int:

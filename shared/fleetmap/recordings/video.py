@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.files import file_head, hash_file
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.images import StoredFrame, decode_frame, grey_image
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames
+from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.samples import CameraFrame, Image
+from fleetmap.sensors.samples import Image
 
 if TYPE_CHECKING:
     import av
@@ -47,70 +47,51 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
     given = calibration_of_options(options, log)
     if given is None:
         raise CalibrationError(f"{path}: a video holds no calibration; pass one with --calibration FILE")
-    index = _index(path, log)
+    series, keys = _index(path, log)
     log.issues.append(UNCERTAIN_STAMPS)
-    frames = VideoFrames(log.files, index.keys, index.pts, index.stamps_ns)
+    reader = VideoReader(log.files, keys)
     try:
-        if frames.rotation():
-            log.note(
-                "video turned",
-                f"players turn it by {frames.rotation()} degrees; images are used as the sensor gave them",
-            )
+        if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
+            log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
         parts = RecordingParts(
             path=path,
             name=path.stem,
             format="video",
             calibration=given.calibration,
-            frame_stamps_ns=np.array(index.stamps_ns, np.int64),
-            frames=frames,
+            frame_stamps_ns=series.stamps_ns,
+            frames=SeriesFrames(reader, series),
         )
         return finalize(parts, log)
     except BaseException:
-        frames.close()
+        reader.close()
         raise
 
 
-class _Index(NamedTuple):
-    """Presentation times of a video's frames in its own unit and in ns, rising, and those of its key frames."""
+class VideoReader:
+    """An ImageReader that decodes forward, from the last key frame before where it is asked to go elsewhere.
 
-    pts: tuple[int, ...]
-    stamps_ns: tuple[int, ...]
-    keys: tuple[int, ...]
-
-
-class VideoFrames:
-    """A FrameSource that decodes forward, from the last key frame before where it is asked to go elsewhere.
-
-    read_files: the video first; keys: presentation times of all key frames; pts, stamps_ns: of the frames.
+    Frames are told by their presentation time in the video's own unit. read_files: the video first; keys: those of all key frames.
     """
 
-    def __init__(
-        self, read_files: Sequence[Path], keys: Sequence[int], pts: Sequence[int], stamps_ns: Sequence[int]
-    ) -> None:
-        self._read_files, self._keys, self._pts, self._stamps_ns = read_files, keys, pts, stamps_ns
+    def __init__(self, read_files: Sequence[Path], keys: Sequence[int]) -> None:
+        self._read_files, self._keys = read_files, keys
         self._video: _Video | None = None
         self._is_closed = False
         self._decoded: Iterator[Any] = iter(())
         self._last: Any = None
 
-    def rotation(self) -> int:
+    def rotation(self, source: int, stamp_ns: int) -> int:
         """Degrees by which players turn the pictures."""
-        return int(self._at(0).rotation)
+        return int(self._at(source, stamp_ns).rotation)
 
-    def stored(self, index: int) -> StoredFrame:
-        """Frame `index`, decoded: nothing else of it can be copied without the frames around it."""
-        where = f"{self._read_files[0]} at {self._stamps_ns[index]}"
-        return StoredFrame(self._stamps_ns[index], grey_image(_luma(self._at(index)), where))
+    def read(self, source: int, stamp_ns: int) -> StoredImage:
+        """A frame, decoded: nothing else of it can be copied without the frames around it."""
+        return grey_image(_luma(self._at(source, stamp_ns)), f"{self._read_files[0]} at {stamp_ns}")
 
-    def frame(self, index: int) -> CameraFrame:
-        return decode_frame(self.stored(index))
+    def apart(self) -> "VideoReader":
+        return VideoReader(self._read_files, self._keys)
 
-    def part(self, indices: NDArray[np.int64]) -> "VideoFrames":
-        chosen = indices.tolist()
-        pts, stamps_ns = (tuple(values[i] for i in chosen) for values in (self._pts, self._stamps_ns))
-        return VideoFrames(self._read_files, self._keys, pts, stamps_ns)
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
+    def hash_into(self, digest: "hashlib._Hash", images: list[int]) -> None:
         """The bytes of the video, then those of the calibration file."""
         for path in self._read_files:
             hash_file(path, digest)
@@ -120,9 +101,8 @@ class VideoFrames:
             self._video.close()
         self._video, self._last, self._is_closed = None, None, True
 
-    def _at(self, index: int) -> Any:
-        wanted = self._pts[index]
-        where = f"{self._read_files[0]}: the frame at {self._stamps_ns[index]}"
+    def _at(self, wanted: int, stamp_ns: int) -> Any:
+        where = f"{self._read_files[0]}: the frame at {stamp_ns}"
         if self._is_closed:
             raise RecordingError(
                 f"{where} was asked for after the recording was closed; keep it open while frames are read"
@@ -182,9 +162,7 @@ def _opened(path: Path) -> _Video:
         raise
     except _errors() as error:
         file.close()
-        raise RecordingError(
-            f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}"
-        ) from error
+        raise _no_video(path) from error
     streams = container.streams.video
     codec = streams[0].codec_context if streams else None
     if codec is not None and codec.width * codec.height <= MAX_PIXELS:
@@ -237,35 +215,34 @@ def _errors() -> tuple[type[Exception], ...]:
     return (av.error.FFmpegError, OSError, ValueError)
 
 
-def _index(path: Path, log: ReadLog) -> _Index:
-    """The stamps of all frames, by what the container says of its packets; RecordingError where one has none."""
+def _index(path: Path, log: ReadLog) -> tuple[ImageSeries[int], list[int]]:
+    """The frames by what the container says of its packets, and the times of its key frames; RecordingError where there is none."""
     video = _opened(path)
     try:
         container, stream, _ = video
         packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
         told, unit = stream.frames, stream.time_base
     except _errors() as error:
-        raise RecordingError(
-            f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}"
-        ) from error
+        raise _no_video(path) from error
     finally:
         video.close()
-    if not packets:
+    stamped = {pts: is_key for pts, is_key in packets if pts is not None}
+    if not stamped or unit is None:
         raise RecordingError(f"{path} holds no frame; {_conversion(path)}")
-    if unit is None or any(pts is None for pts, _ in packets):
-        raise RecordingError(
-            f"{path} has frames without stamps; `ffmpeg -r RATE -i {path} -c copy {path.stem}-stamped.mp4` gives them a rate"
-        )
-    pts = tuple(sorted({pts for pts, _ in packets if pts is not None}))
-    if len(pts) < len(packets):
-        log.note("frames without a stamp of their own", f"{len(packets) - len(pts)} of {len(packets)} left out")
+    if len(stamped) < len(packets):
+        log.note("frames without a stamp of their own", f"{len(packets) - len(stamped)} of {len(packets)} left out")
     if told > len(packets):
         log.note("the video ends early", f"{len(packets)} of {told} frames are there")
-    stamps_ns = tuple(round(p * unit * 1_000_000_000) for p in pts)
+    pts = tuple(sorted(stamped))
+    stamps_ns = np.array([round(p * unit * 1_000_000_000) for p in pts], np.int64)
     steps_ms = np.diff(stamps_ns) * 1e-6
     if len(steps_ms) and steps_ms.max() > _UNEVEN * np.median(steps_ms):
         log.note("variable frame rate", f"steps of {steps_ms.min():.1f} to {steps_ms.max():.1f} ms")
-    return _Index(pts, stamps_ns, tuple(sorted(pts for pts, is_key in packets if is_key and pts is not None)))
+    return ImageSeries(stamps_ns, pts), sorted(time for time, is_key in packets if is_key and time is not None)
+
+
+def _no_video(path: Path) -> RecordingError:
+    return RecordingError(f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}")
 
 
 def _luma(frame: Any) -> Image:

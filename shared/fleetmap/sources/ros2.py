@@ -1,5 +1,6 @@
 """Sensors as ROS 2 topics over zenoh: CDR under the keys of rmw_zenoh, or of a bridge to DDS."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -8,16 +9,43 @@ from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.bags.topics import transports
-from fleetmap.recordings.images import grey_bits, grey_peak
+from fleetmap.recordings.images import StoredImage, grey_bits, grey_peak
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.stereo_pairs import StereoPairs
 
 _IDLE_S = 1.0
+_WAITING_IMAGES = 8  # of each side, for their partner
 Take = Callable[[Intake, bool, bytes], None]
+
+
+class StereoPairs:
+    """Frames of two streams whose stamps are within the tolerance of one rig; what finds no partner is counted."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, deque[tuple[int, StoredImage]]] = {"left": deque(), "right": deque()}
+        self.unpaired = 0
+
+    def add(self, side: str, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
+        """The frame that `image` completes, None while its partner is missing. side: left or right."""
+        others = self._waiting["right" if side == "left" else "left"]
+        partner = min(others, key=lambda item: abs(item[0] - stamp_ns), default=None)
+        if partner is None or abs(partner[0] - stamp_ns) > PAIR_TOLERANCE_NS:
+            own = self._waiting[side]
+            own.append((stamp_ns, image))
+            if len(own) > _WAITING_IMAGES:
+                own.popleft()
+                self.unpaired += 1
+            return None
+        for items in self._waiting.values():
+            while items and items[0][0] <= max(partner[0], stamp_ns):
+                if items.popleft() is not partner:
+                    self.unpaired += 1
+        left, right = (image, partner[1]) if side == "left" else (partner[1], image)
+        return StoredFrame(stamp_ns if side == "left" else partner[0], left, right)
 
 
 class Ros2Source:

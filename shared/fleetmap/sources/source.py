@@ -16,7 +16,7 @@ from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.playback import RecordingSource
 from fleetmap.sources.ros2 import Ros2Source
-from fleetmap.sources.uvc import UvcSource, VideoMode
+from fleetmap.sources.uvc import UvcSource
 
 
 class Source(Protocol):
@@ -55,8 +55,7 @@ def _uvc(section: SourceSection, topics: Topics, map_frame: str) -> Source:
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
     layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
     topic_source = Ros2Source(bus, layout, topics, calibration, images=False, map_frame=map_frame)
-    mode = VideoMode(section.width_px, section.height_px, section.rate_hz, section.delay_s)
-    return UvcSource(lambda: cv2.VideoCapture(device), calibration, mode, topic_source)
+    return UvcSource(lambda: cv2.VideoCapture(device), calibration, section, topic_source)
 
 
 def _calibration(section: SourceSection) -> RigCalibration:

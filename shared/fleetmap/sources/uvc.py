@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -10,20 +9,12 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
+from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0
-
-
-class VideoMode(NamedTuple):
-    """What is asked of a camera, and its latency. width_px, height_px: of both pictures together. delay_s: as in UvcSource."""
-
-    width_px: int
-    height_px: int
-    rate_hz: float
-    delay_s: float
 
 
 class UvcSource:
@@ -38,14 +29,14 @@ class UvcSource:
         self,
         open_capture: Callable[[], cv2.VideoCapture],
         calibration: RigCalibration,
-        mode: VideoMode,
+        section: SourceSection,
         topics: Ros2Source | None,
         *,
         monotonic_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """topics: where the other sensors come from, None for none."""
-        self._open, self._mode, self._topics = open_capture, mode, topics
+        """section: the pictures that are asked for, width_px x height_px together. topics: of the other sensors, None for none."""
+        self._open, self._section, self._topics = open_capture, section, topics
         self._monotonic_s, self._wall_ns = monotonic_s, wall_ns
         self.calibration, self.has_depth = calibration, False
 
@@ -73,9 +64,9 @@ class UvcSource:
         if not capture.isOpened():
             return
         for prop, value in (
-            (cv2.CAP_PROP_FRAME_WIDTH, self._mode.width_px),
-            (cv2.CAP_PROP_FRAME_HEIGHT, self._mode.height_px),
-            (cv2.CAP_PROP_FPS, self._mode.rate_hz),
+            (cv2.CAP_PROP_FRAME_WIDTH, self._section.width_px),
+            (cv2.CAP_PROP_FRAME_HEIGHT, self._section.height_px),
+            (cv2.CAP_PROP_FPS, self._section.rate_hz),
             (cv2.CAP_PROP_BUFFERSIZE, 1),  # of several, the oldest would come first
         ):
             capture.set(prop, value)
@@ -92,7 +83,7 @@ class UvcSource:
         now_s, wall_ns = self._monotonic_s(), self._wall_ns()
         driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0
-        return wall_ns - round((max(age_s, 0.0) + self._mode.delay_s) * 1e9)
+        return wall_ns - round((max(age_s, 0.0) + self._section.delay_s) * 1e9)
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:

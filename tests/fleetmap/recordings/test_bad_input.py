@@ -232,21 +232,9 @@ def test_missing_sensor_yaml(euroc: Path) -> None:
         ("left: {}", "no cam0"),
         ("cam0: 3", "cam0 is 3"),
         ("cam0: {camera_model: omni, distortion_model: radtan}", "omni with distortion radtan is not known"),
-        ("cam0: {camera_model: pinhole, intrinsics: [a, b, c, d], resolution: [1, 1]}", "are not numbers"),
-        ("cam0: {camera_model: pinhole, intrinsics: [1, 1, 1], resolution: [4, 4]}", "4 numbers are expected"),
-        ("cam0: {camera_model: pinhole, resolution: [4, 4]}", "intrinsics is missing"),
-        (
-            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [9, 9, 99, 9], resolution: [20, 20]}",
-            "principal point",
-        ),
         (
             "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [-9, 9, 9, 9], resolution: [20, 20]}",
             "focal lengths",
-        ),
-        (
-            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [9, 9, 9, 9], resolution: [20, 20], "
-            "T_cam_imu: [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
-            "no rotation and translation",
         ),
     ],
 )

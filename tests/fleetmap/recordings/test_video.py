@@ -13,7 +13,6 @@ import pytest
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, Recording, open_recording
-from fleetmap.recordings.video import _Video
 from fleetmap.sensors.samples import SensorSet
 from mapserver.doctor.run_checks import run_checks
 from support.recordings.recording_samples import HEIGHT, WIDTH, kalibr_text, make_sample, write_video
@@ -80,13 +79,6 @@ def test_a_variable_rate_keeps_its_stamps_and_is_named(tmp_path: Path, rig: Open
         np.testing.assert_array_equal(recording.read_frame(8).left, SAMPLE.left[8])
 
 
-def test_the_same_video_has_the_same_hash_and_frames(tmp_path: Path, rig: OpenOptions) -> None:
-    first, second = movie(tmp_path / "a.mp4"), tmp_path / "b.mp4"
-    second.write_bytes(first.read_bytes())
-    with open_recording(first, rig) as a, open_recording(second, rig) as b:
-        assert a.content_hash() == b.content_hash()
-
-
 def test_a_calibration_must_be_given(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="a video holds no calibration; pass one with --calibration FILE"):
         open_recording(movie(tmp_path / "a.mp4"))
@@ -113,7 +105,7 @@ def test_flipped_bytes_never_end_in_an_error_of_the_library(tmp_path: Path, rig:
     sound, rng = movie(tmp_path / "a.mp4").read_bytes(), np.random.default_rng(1)
     index_at = sound.index(b"moov")
     path = tmp_path / "flipped.mp4"
-    for number in range(60):
+    for number in range(20):
         data = bytearray(sound)
         for at in rng.integers(*[(0, index_at), (index_at, len(data))][number % 2], 1 + number % 9):
             data[at] = rng.integers(256)
@@ -187,18 +179,6 @@ def test_tables_tell_of_no_more_samples_than_there_are_bytes(tmp_path: Path, rig
     path.write_bytes(data)
     with pytest.raises(RecordingError, match="its tables tell of"):
         open_recording(path, rig)
-
-
-def test_frames_without_stamps(tmp_path: Path, rig: OpenOptions, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MP4 always has them; the demuxer of a container without them gives None."""
-    path = movie(tmp_path / "a.mp4")
-    packet = type("Packet", (), {"pts": None, "is_keyframe": True, "size": 5, "is_discard": False})
-    container = type("Container", (), {"demux": lambda *_: [packet], "close": lambda _: None})()
-    with av.open(str(path)) as opened, path.open("rb") as file:
-        video = _Video(container, opened.streams.video[0], file)
-        monkeypatch.setattr("fleetmap.recordings.video._opened", lambda _: video)
-        with pytest.raises(RecordingError, match=r"has frames without stamps; `ffmpeg -r RATE -i .*a\.mp4 -c copy"):
-            open_recording(path, rig)
 
 
 def test_without_the_library_the_message_names_the_extra(

@@ -23,9 +23,8 @@ from fleetmap.recordings.ros2.messages import (
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import Ros2Source
+from fleetmap.sources.ros2 import Ros2Source, StereoPairs
 from fleetmap.sources.source import open_source
-from fleetmap.sources.stereo_pairs import StereoPairs
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 

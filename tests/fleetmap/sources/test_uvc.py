@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError
+from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.uvc import UvcSource, VideoMode, split_frame
+from fleetmap.sources.uvc import UvcSource, split_frame
 from support.recordings.recording_samples import calibration
 
 
@@ -44,8 +45,8 @@ def played(cameras: list[PlayedCamera], *, delay_s: float = 0.0) -> tuple[Intake
     waits: list[float] = []
     left = list(cameras)
     clock = iter(range(10**9, 10**12, 10**6))
-    mode, wall_ns = VideoMode(640, 240, 30.0, delay_s), lambda: next(clock)
-    source = UvcSource(lambda: left.pop(0), calibration(), mode, None, monotonic_s=lambda: 50.0, wall_ns=wall_ns)
+    section, wall_ns = SourceSection(width_px=640, height_px=240, delay_s=delay_s), lambda: next(clock)
+    source = UvcSource(lambda: left.pop(0), calibration(), section, None, monotonic_s=lambda: 50.0, wall_ns=wall_ns)
 
     def wait(seconds: float) -> bool:
         waits.append(seconds)

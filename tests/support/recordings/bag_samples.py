@@ -3,10 +3,12 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from fleetmap.recordings import Recording
 from support.recordings.mcap_samples import Message
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -49,3 +51,19 @@ def write_rosbag1(
                 connections[topic] = writer.add_connection(topic, kind, typestore=_STORE1)
             writer.write(connections[topic], stamp_ns, _STORE.cdr_to_ros1(data, kind))
     return path
+
+
+def assert_same(first: Recording, second: Recording) -> None:
+    """The same samples to the bit."""
+    assert first.sensor_set == second.sensor_set
+    np.testing.assert_array_equal(first.frame_stamps_ns, second.frame_stamps_ns)
+    for name in ("stamps_ns", "gyro_radps", "accel_mps2"):
+        np.testing.assert_array_equal(getattr(first.imu, name), getattr(second.imu, name))
+    for index in (3, 0, 1, 1):
+        ours, theirs = first.read_frame(index), second.read_frame(index)
+        np.testing.assert_array_equal(ours.left, theirs.left)
+        assert ours.right is not None
+        np.testing.assert_array_equal(ours.right, theirs.right)
+    for ours_camera, other in zip(first.calibration.cameras, second.calibration.cameras, strict=True):
+        np.testing.assert_array_equal(ours_camera.body_from_cam, other.body_from_cam)
+        np.testing.assert_array_equal(ours_camera.intrinsics_px, other.intrinsics_px)

@@ -102,13 +102,11 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
     others = [topic for topic in images if topic not in (*depths, *lefts, *rights)]
     if "left" not in chosen:
         left, right = _of_one_camera(lefts), _of_one_camera(rights)
-        only = _of_one_camera(others)
-        if left:
-            chosen["left"] = left
-            if right:
+        only = None if lefts else _of_one_camera(others)
+        if left or only:
+            chosen["left"] = left or only or ""
+            if left and right:
                 chosen.setdefault("right", right)
-        elif not lefts and only:
-            chosen["left"] = only
         else:
             issues = "".join(f". {issue.what}: {issue.detail}" for issue in log.issues)
             raise RecordingError(

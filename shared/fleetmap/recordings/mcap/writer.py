@@ -6,6 +6,7 @@ the lenses in CameraInfo, for ROS tools; the whole calibration to the last bit i
 calls make equal bytes.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -62,7 +63,7 @@ class McapRecordingWriter:
         self._topics = topics or Topics()
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._links_are_written = False
         try:
             self._file = self._part.open("wb")
@@ -95,7 +96,6 @@ class McapRecordingWriter:
             self._write_image(topics.depth, stamp_ns, "cam0", stored.depth, is_depth=True)
 
     def write_imu(self, samples: ImuSamples) -> None:
-        """Inertial samples, in body axes."""
         for stamp_ns, gyro, accel in zip(
             samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True
         ):
@@ -103,13 +103,11 @@ class McapRecordingWriter:
             self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
 
     def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
-        """Wheel odometry, one sample or several."""
         for sample in [samples] if isinstance(samples, WheelSample) else samples:
             data = messages.encode_odometry(sample, ODOM_FRAME, BASE_FRAME)
             self._write(self._topics.wheel, "nav_msgs/Odometry", sample.stamp_ns, data)
 
     def write_prior(self, priors: PositionPrior | Iterable[PositionPrior]) -> None:
-        """Position priors, one or several."""
         for prior in [priors] if isinstance(priors, PositionPrior) else priors:
             data = messages.encode_prior(prior, MAP_FRAME)
             self._write(self._topics.prior, "geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, data)
@@ -187,7 +185,6 @@ class McapRecordingWriter:
                 definition = ros2msg(type_name).encode()
                 self._schemas[type_name] = self._writer.register_schema(ros_name, "ros2msg", definition)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
-            self._counts[topic] = 0
         return self._channels[topic]
 
 

@@ -5,7 +5,6 @@ and services of DDS under their bare names.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 from fleetmap.errors import UsageError
 from fleetmap.recordings.ros2.keys import dds_type, ros_key, ros_key_expr, topic_chunks, type_hash, type_of_key
@@ -44,25 +43,6 @@ class NodeName:
     namespace: str = ""
 
 
-class KeyLayout(Protocol):
-    """How keys are made of ROS names."""
-
-    def key(self, name: str, type_name: str) -> str:
-        """The key of a topic or service."""
-
-    def subscription(self, topic: str) -> str:
-        """Matches the keys of a topic, whatever its type."""
-
-    def type_of(self, key: str) -> str:
-        """The message type of a key; empty where it names none."""
-
-    def node_token(self, node: NodeName) -> str:
-        """The token of a node."""
-
-    def token(self, node: NodeName, endpoint: Endpoint) -> str:
-        """The token of one of its endpoints."""
-
-
 class RmwZenohKeys:
     """Keys as rmw_zenoh makes them, from ROS 2 Iron on: earlier ones have no hashes of types."""
 
@@ -73,16 +53,18 @@ class RmwZenohKeys:
         return ros_key(self._domain, name, type_name)
 
     def subscription(self, topic: str) -> str:
+        """Matches the keys of a topic, whatever its type."""
         return ros_key_expr(self._domain, topic)
 
     def type_of(self, key: str) -> str:
+        """The message type of a key; empty where it names none."""
         return type_of_key(key)
 
     def node_token(self, node: NodeName) -> str:
         return f"@ros2_lv/{self._domain}/{node.session}/0/0/NN/{self._place(node)}"
 
     def token(self, node: NodeName, endpoint: Endpoint) -> str:
-        """See KeyLayout. The quality of service leaves out what is rmw_zenoh's default: reliable 1, volatile 2, keep last 1, 42."""
+        """The quality of service leaves out what is rmw_zenoh's default: reliable 1, volatile 2, keep last 1, 42."""
         name, kind = f"%{topic_chunks(endpoint.name).replace('/', '%')}", dds_type(endpoint.type_name)
         qos = f":{'1' if endpoint.qos.is_transient_local else ''}:,{endpoint.qos.depth}:,:,:,,"
         start = f"@ros2_lv/{self._domain}/{node.session}/0/{endpoint.number}/{endpoint.kind}"
@@ -106,16 +88,19 @@ class BridgedDdsKeys:
         return ""
 
     def node_token(self, node: NodeName) -> str:
-        """See KeyLayout. To a bridge a node is another bridge."""
+        """To a bridge a node is another bridge."""
         return f"@/{node.session}/@ros2_lv"
 
     def token(self, node: NodeName, endpoint: Endpoint) -> str:
-        """See KeyLayout. The quality of service is in Cyclone DDS's numbers: reliable 1, transient local 1, keep last 0."""
+        """The quality of service is in Cyclone DDS's numbers: reliable 1, transient local 1, keep last 0."""
         name, (package, *_, short) = topic_chunks(endpoint.name).replace("/", "§"), endpoint.type_name.split("/")
         if endpoint.kind == SERVICE:
             return f"@/{node.session}/@ros2_lv/SS/{name}/{package}§srv§{short}"
         qos = f":1:{int(endpoint.qos.is_transient_local)}:0,{endpoint.qos.depth}:typehash=RIHS01_{type_hash(endpoint.type_name)};"
         return f"@/{node.session}/@ros2_lv/{endpoint.kind}/{name}/{package}§msg§{short}/{qos}"
+
+
+KeyLayout = RmwZenohKeys | BridgedDdsKeys
 
 
 def key_layout(name: str, domain: int) -> KeyLayout:

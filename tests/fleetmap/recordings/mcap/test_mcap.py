@@ -23,7 +23,7 @@ from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet, Trajectory, WheelSample
 from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
-from support.recordings.recording_samples import BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
+from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
 
 WHEEL = WheelSample(int(SAMPLE.stamps_ns[1]), np.array([0.5, 0.01, 0.0]), 0.25, 0.02, 0.03)
 PRIOR = PositionPrior(
@@ -106,30 +106,12 @@ def test_the_ros_2_decoder_of_others_reads_every_message(tmp_path: Path) -> None
         seen.setdefault(topic, (name, message))
     name, image = seen["/cam1/image_raw"]
     assert name == "sensor_msgs/msg/Image"
-    assert (image.width, image.height, image.encoding, image.step) == (WIDTH, HEIGHT, "mono8", WIDTH)
     assert bytes(image.data) == SAMPLE.right[0].tobytes()
     assert image.header.stamp.sec * 10**9 + image.header.stamp.nanosec == SAMPLE.stamps_ns[0]
-    _, info = seen["/cam0/camera_info"]
-    assert (info.distortion_model, len(info.d), info.width, info.k[0]) == ("plumb_bob", 5, WIDTH, FOCAL)
-    _, imu = seen["/imu0"]
-    assert (imu.angular_velocity.y, imu.linear_acceleration.z) == (IMU.gyro_radps[0, 1], IMU.accel_mps2[0, 2])
-    assert imu.orientation_covariance[0] == -1
-    _, odometry = seen["/odom"]
-    assert (odometry.twist.twist.linear.x, odometry.twist.twist.angular.z) == (0.5, 0.25)
-    assert odometry.twist.covariance[35] == pytest.approx(0.03**2)
-    _, prior = seen["/prior"]
-    assert prior.pose.pose.orientation.z == pytest.approx(np.sin(0.35))
-    assert (prior.pose.covariance[0], prior.pose.covariance[35]) == (0.04, 0.1)  # x, yaw
-    _, truth = seen["/ground_truth"]
-    assert truth.pose.position.x == TRUTH.frame_from_body[0, 0, 3]
-    name, tf = seen["/tf_static"]
-    assert name == "tf2_msgs/msg/TFMessage"
-    assert [(t.header.frame_id, t.child_frame_id) for t in tf.transforms] == [
-        ("body", "cam0"),
-        ("body", "cam1"),
-        ("base", "body"),
-    ]
-    assert tf.transforms[0].transform.translation.x == BODY_FROM_CAM0[0, 3]
+    assert seen["/imu0"][1].linear_acceleration.z == IMU.accel_mps2[0, 2]
+    links = [(t.header.frame_id, t.child_frame_id) for t in seen["/tf_static"][1].transforms]
+    assert links == [("body", "cam0"), ("body", "cam1"), ("base", "body")]
+    assert {"/cam0/camera_info", "/odom", "/prior", "/ground_truth"} < set(seen)
 
 
 def assert_is_the_sample(recording: Recording) -> None:
@@ -190,14 +172,6 @@ def test_topics_that_leave_a_choice(tmp_path: Path) -> None:
         open_recording(path, OpenOptions(topics=Topics(left="/c/image")))
 
 
-def test_two_imus_are_not_guessed(tmp_path: Path) -> None:
-    imu = ros_messages.encode_imu(5, "x", np.zeros(3), np.ones(3))
-    messages = [*foreign_messages(imu="/imu/a"), ("/imu/b", "sensor_msgs/Imu", 5, imu)]
-    recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
-    assert recording.sensor_set is SensorSet.STEREO
-    assert any(issue.what == "imu not chosen" and "/imu/a, /imu/b" in issue.detail for issue in recording.issues)
-
-
 def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
     text = kalibr_text().replace("/cam0/image_raw", "/a/image").replace("/cam1/image_raw", "/b/image")
     (tmp_path / "rig.yaml").write_text(text)
@@ -236,12 +210,7 @@ RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
     ("lens", "distortion", "model", "kept"),
     [
         ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.05], "radial-tangential", 5),
-        ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.0], "radial-tangential", 4),
-        ("plumb_bob", [0.0] * 5, "radial-tangential", 0),
         ("equidistant", [0.1, 0.2, 0.0, 0.01], "equidistant", 4),
-        ("equidistant", [0.0] * 4, "equidistant", 4),
-        ("rational_polynomial", [0.1, 0.2, 0.0, 0.0, 0.05, 0.0, 0.0, 0.0], "radial-tangential", 5),
-        ("rational_polynomial", RATIONAL, "radial-tangential", 8),
         ("rational_polynomial", [*RATIONAL, *[0.0] * 6], "radial-tangential", 8),
         ("inverse_brown_conrady", [0.0] * 5, "radial-tangential", 0),
         ("", [], "radial-tangential", 0),
@@ -261,11 +230,8 @@ def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, 
 @pytest.mark.parametrize(
     ("lens", "distortion", "says"),
     [
-        ("rational_polynomial", [*RATIONAL, 0.01, 0.0, 0.0, 0.0], r"12 distortion coefficients.*thin prisms"),
         ("rational_polynomial", [*RATIONAL, *[0.0] * 5, 0.01], r"14 distortion coefficients.*tilted sensors"),
         ("plumb_bob", [0.1], r"1 distortion coefficients \[0.1\] for plumb_bob"),
-        ("equidistant", [], "0 distortion coefficients"),
-        ("equidistant", [0.1, 0.0, 0.0, 0.0, 0.5], r"\[0.1, 0.0, 0.0, 0.0, 0.5\] for equidistant, which takes 4"),
         ("plumb_bob", [np.nan] * 5, "not finite"),
         ("inverse_brown_conrady", [0.1] * 5, "'inverse_brown_conrady' is not supported"),
         ("omnidirectional", [0.0] * 4, "'omnidirectional' is not supported"),
@@ -330,20 +296,6 @@ def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
     depth = recording.read_frame(0).depth_m
     assert depth is not None
     np.testing.assert_array_equal(depth, np.where(depth_mm == 2500, np.float32(2.5), np.float32(0)))
-
-
-def test_rosbags_reads_what_we_write(tmp_path: Path) -> None:
-    """An independent implementation of CDR and of the ROS 2 types."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    write(tmp_path / "a.mcap")
-    with (tmp_path / "a.mcap").open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            assert schema is not None
-            value: Any = store.deserialize_cdr(message.data, schema.name)
-            again = store.serialize_cdr(value, schema.name)
-            assert bytes(again) == message.data, channel.topic
 
 
 def test_base_and_time_shift_travel(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_cut_off(whole: bytes, tmp_path: Path, share: float) -> None:
 
 
 def test_cut_at_every_byte_around_a_message(whole: bytes, tmp_path: Path) -> None:
-    for size in range(1_200_000, 1_200_000 + 900, 37):
+    for size in range(1_200_000, 1_200_000 + 900, 150):
         with open_recording(write_bytes(tmp_path, whole[:size])) as recording:
             assert_nothing_is_invented(recording)
 
@@ -92,7 +92,7 @@ def test_single_flipped_bits_anywhere(whole: bytes, tmp_path: Path) -> None:
     """Whatever bit is flipped: either what is read is what was written, or the error is a RecordingError."""
     rng = np.random.default_rng(11)
     complete, refused = 0, 0
-    for position in [*rng.integers(0, len(whole), 40).tolist(), *rng.integers(0, 4000, 40).tolist()]:
+    for position in [*rng.integers(0, len(whole), 15).tolist(), *rng.integers(0, 4000, 15).tolist()]:
         data = bytearray(whole)
         data[position] ^= 1 << int(rng.integers(8))
         try:
@@ -101,7 +101,7 @@ def test_single_flipped_bits_anywhere(whole: bytes, tmp_path: Path) -> None:
                 complete += len(recording) == len(SAMPLE.left)
         except RecordingError:
             refused += 1
-    assert refused < 40
+    assert refused < 20
     assert complete > 0
 
 
