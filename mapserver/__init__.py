@@ -12,9 +12,9 @@ The names are imported when they are first used, so that `import mapserver` and 
 """
 
 import importlib
-from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
+from fleetmap import __version__
 from fleetmap.errors import FleetmapError
 
 if TYPE_CHECKING:
@@ -32,11 +32,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
 __all__ += ["__version__", "open_store"]
-
-try:
-    __version__ = metadata.version("fleetmap")
-except metadata.PackageNotFoundError:  # a source tree that is not installed
-    __version__ = "0+unknown"
 
 
 def __getattr__(name: str) -> Any:

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
 from http import HTTPMethod
-from importlib import metadata
 from itertools import accumulate
 
 from fastapi import Depends, FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+import fleetmap
 from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
@@ -47,7 +47,7 @@ def create_app(
     app = FastAPI(
         title="fleetmap",
         description="Versions of maps, the robots that use them, and the jobs that make them.",
-        version=fleetmap_version(),
+        version=str(fleetmap.__version__),
         docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
@@ -70,14 +70,6 @@ def create_app(
     return app
 
 
-def fleetmap_version() -> str:
-    """The installed distribution's version, "not installed" in a source tree."""
-    try:
-        return metadata.version("fleetmap")
-    except metadata.PackageNotFoundError:
-        return "not installed"  # run from a source tree
-
-
 def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics: Metrics, bus: Bus | None) -> None:
     @app.get("/healthz")
     def healthz() -> views.ServiceState:
@@ -97,7 +89,7 @@ def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics
     @app.get("/version")
     def version() -> views.ServerVersion:
         """What runs here."""
-        return views.ServerVersion(fleetmap_version(), TILE_FORMAT, MANIFEST_FORMAT)
+        return views.ServerVersion(str(fleetmap.__version__), TILE_FORMAT, MANIFEST_FORMAT)
 
     @app.get("/metrics", response_class=Response)
     def metrics_text() -> Response:

@@ -66,7 +66,6 @@ from mapserver.store.version_rows import (
     extras,
     insert_draft,
     insert_extras,
-    insert_verdict,
     site_releases,
 )
 
@@ -202,7 +201,15 @@ class MapStore(StoreQueries):
     def record_verdict(self, draft: VersionInfo, verdict: VerdictRow, actor: Actor) -> None:
         """Keeps what the gate said of a draft; a refusal also stands in the log."""
         with self._transactions.write() as connection:
-            insert_verdict(connection, (draft.site, draft.version), verdict)
+            connection.execute(
+                """INSERT INTO verdicts (site, version, stamp_ns, accepted, forced, reasons, report)
+                   VALUES (?, ?, ?, ?, ?, ?, ?)""",
+                (
+                    *(draft.site, draft.version, verdict.stamp_ns, int(verdict.accepted), int(verdict.forced)),
+                    to_json(verdict.reasons).decode(),
+                    to_json(verdict.report, order="sorted").decode(),
+                ),
+            )
             if verdict.reasons:
                 kind = "forced" if verdict.forced else "refused"
                 detail = f"draft {draft.version}: {'; '.join(verdict.reasons)}"

@@ -3,11 +3,10 @@
 import sqlite3
 from collections.abc import Iterable, Mapping
 
-from fleetmap.encoding import to_json
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import FOR_ROBOTS
 from mapserver.store.database import Transactions
-from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VerdictRow, VersionInfo
+from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VersionInfo
 
 EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
 """By kind: where the bytes stand that a version has beside those that its robots need."""
@@ -73,14 +72,6 @@ def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: s
            retired_ns = CASE WHEN ?1 = 'retired' THEN ?2 END WHERE site = ?3 AND version = ?4""",
         (state, now_ns, *version),
     )
-
-
-def insert_verdict(connection: sqlite3.Connection, version: tuple[str, int], verdict: VerdictRow) -> None:
-    """A verdict on (site, number)."""
-    judged = (verdict.stamp_ns, int(verdict.accepted), int(verdict.forced))
-    texts = (to_json(verdict.reasons).decode(), to_json(verdict.report, order="sorted").decode())
-    columns = "site, version, stamp_ns, accepted, forced, reasons, report"
-    connection.execute(f"INSERT INTO verdicts ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*version, *judged, *texts))
 
 
 def insert_draft(

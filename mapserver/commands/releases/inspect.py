@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -53,10 +53,22 @@ def inspect(
         manifest = maps.manifest(site, info.version)
         verdicts = maps.verdicts(site, info.version)
         history = [event for event in maps.events(site) if event.version == info.version]
-    if json:
-        _print_json(info, manifest, verdicts, history)
-    else:
+    if not json:
         _print_words(info, manifest, verdicts, history)
+        return
+    from fleetmap.encoding import to_plain
+
+    print_json(
+        {
+            "state": info.state,
+            "manifest_sha256": info.manifest_sha256,
+            "map_bytes": info.map_bytes,
+            "bytes_per_m": bytes_per_m(info, manifest),
+            "verdicts": verdicts,
+            "history": history,
+            "manifest": to_plain(manifest),
+        }
+    )
 
 
 def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
@@ -72,24 +84,6 @@ def bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
     """Size of the map per metre of surveyed path, None where the report does not know the path."""
     path_m = manifest.report.get("path_m")
     return info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
-
-
-def _print_json(
-    info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
-) -> None:
-    from fleetmap.encoding import to_plain
-
-    built: dict[str, Any] = to_plain(manifest)
-    shown = {
-        "state": info.state,
-        "manifest_sha256": info.manifest_sha256,
-        "map_bytes": info.map_bytes,
-        "bytes_per_m": bytes_per_m(info, manifest),
-        "verdicts": verdicts,
-        "history": history,
-        "manifest": built,
-    }
-    print_json(shown)
 
 
 _FIGURES = {
