@@ -3,7 +3,6 @@
 from mapserver.calibration.estimate import CalibrationEstimate, ParameterEstimate, estimate_from
 from mapserver.calibration.parameters import CalibrationParameter
 from mapserver.calibration.recordings import estimate_calibration
-from mapserver.calibration.survey_data import stretch_of_survey
 
 __all__ = [
     "CalibrationEstimate",
@@ -11,5 +10,4 @@ __all__ = [
     "ParameterEstimate",
     "estimate_calibration",
     "estimate_from",
-    "stretch_of_survey",
 ]

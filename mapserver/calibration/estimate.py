@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration.estimator import Adjusted, adjust, prior_information
-from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, CalibrationParameter, RigAxes, corrected_rig
+from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, SHOWN, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData
 
 P = CalibrationParameter
@@ -41,16 +42,6 @@ class ParameterEstimate:
     unit: str
     is_judged: bool
     reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Sensors:
-    """What took part."""
-
-    has_pair: bool
-    has_imu: bool
-    has_wheels: bool
-    keyframes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +115,15 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
         covariance[INDEX[P.FOCAL], INDEX[P.FOCAL]] += max(each.focal_by_lens for each in adjusted) ** 2
     keyframes = sum(len(data.stamps_ns) for data in stretches)
     has_wheels = any(len(data.wheel) > 0 for data in stretches)
-    sensors = Sensors(len(first.calibration.cameras) > 1, first.is_inertial, has_wheels, keyframes)
+    has_pair, has_imu = len(first.calibration.cameras) > 1, first.is_inertial
     sigmas = np.sqrt(np.diag(covariance))
-    found = [_judged(p, float(theta[INDEX[p]]), float(sigmas[INDEX[p]]), sensors) for p in COLUMNS]
-    given = first.calibration.imu
-    for name, scale, sigma in () if given is None else _noise(adjusted):
-        found.append(_judged(name, scale - 1.0, sigma, sensors))
+    values = [(p, float(theta[INDEX[p]]), float(sigmas[INDEX[p]])) for p in COLUMNS]
+    if first.calibration.imu is not None:
+        values += [(name, scale - 1.0, sigma) for name, scale, sigma in _noise(adjusted)]
+    found = [
+        _judged(*value, keyframes, _reason(value[0], has_pair=has_pair, has_imu=has_imu, has_wheels=has_wheels))
+        for value in values
+    ]
     return CalibrationEstimate(tuple(found), covariance, keyframes, sum(each.observations for each in adjusted))
 
 
@@ -176,26 +170,46 @@ def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, flo
     return found
 
 
-def _judged(name: CalibrationParameter, estimate: float, sigma: float, sensors: Sensors) -> ParameterEstimate:
+def _judged(
+    name: CalibrationParameter, estimate: float, sigma: float, keyframes: int, reason: str
+) -> ParameterEstimate:
+    """reason: what would show it where it is not sharp."""
     limits = RANGES[name]
-    is_long = sensors.keyframes >= MIN_KEYFRAMES
+    is_long = keyframes >= MIN_KEYFRAMES
     is_sharp = sigma <= min(limits.useful_sigma, _LARGEST_PRIOR_SHARE * limits.prior_sigma)
-    short = f"too short: {sensors.keyframes} keyframes, {MIN_KEYFRAMES} are needed"
-    lacking = [*([] if is_long else [short]), *([] if is_sharp else [_reason(name, sensors)])]
+    short = f"too short: {keyframes} keyframes, {MIN_KEYFRAMES} are needed"
+    lacking = [*([] if is_long else [short]), *([] if is_sharp else [reason])]
     return ParameterEstimate(name, estimate, sigma, limits.unit, not lacking, "; ".join(lacking))
 
 
-def _reason(name: CalibrationParameter, sensors: Sensors) -> str:
-    if name in _PAIR and not sensors.has_pair:
+def _reason(name: CalibrationParameter, *, has_pair: bool, has_imu: bool, has_wheels: bool) -> str:
+    if name in _PAIR and not has_pair:
         return "there is one camera"
-    if name in _INERTIAL and not sensors.has_imu:
+    if name in _INERTIAL and not has_imu:
         return "there is no IMU"
-    if name is P.WHEEL_SCALE and not sensors.has_wheels:
+    if name is P.WHEEL_SCALE and not has_wheels:
         return "there is no wheel odometry"
-    if name is P.FOCAL and not sensors.has_imu:
+    if name is P.FOCAL and not has_imu:
         return "without the turns of an IMU an error of the lens looks the same: record one"
-    if name is P.BASELINE and not (sensors.has_imu or sensors.has_wheels):
+    if name is P.BASELINE and not (has_imu or has_wheels):
         return "neither an IMU nor wheels measure metres: record one of them"
-    if name.startswith("camera position") and not (sensors.has_imu or sensors.has_wheels):
+    if name.startswith("camera position") and not (has_imu or has_wheels):
         return "there is neither an IMU nor wheel odometry"
     return _ADVICE[name]
+
+
+def in_words(parameter: ParameterEstimate) -> tuple[str, str]:
+    """A correction and its sigma, in per cent, degrees, milliseconds, millimetres or pixels."""
+    scale, unit, _ = SHOWN[parameter.unit]
+    return f"{parameter.estimate * scale:+.3f} {unit}", f"{parameter.sigma * scale:.3f} {unit}"
+
+
+def corrected_file(estimate: CalibrationEstimate, rig: RigCalibration, names: list[str]) -> str:
+    """The text of a camchain: the corrected rig, and in comments what was measured and what kept its value."""
+    lines = [f"# Measured by `mapserver calibrate` from {', '.join(names)}."]
+    for p in estimate.parameters:
+        value, sigma = in_words(p)
+        what = f"corrected by {value}, sigma {sigma}" if p.is_judged else f"NOT JUDGED, old value kept: {p.reason}"
+        lines.append(f"# {p.name.value}: {what}")
+    lines.append("# The wheels' scale and the IMU's noise are for information: this file keeps the noise that it had.")
+    return "\n".join(lines) + "\n" + format_calibration(estimate.corrected(rig))

@@ -1,25 +1,31 @@
 """Calibration of a pair of which only the image size and the baseline are known: focal length = image width, no distortion.
 
-First epipolar geometry, then passes of the self-calibrating adjustment with wide priors, images alone; after each the images are
-rectified again and followed anew. It ends where nothing moves any more, and says so where that does not happen.
+First epipolar geometry: matches of the pair and of the left camera in time, in raw pixels. Nothing is known but that both lenses are of one
+make, have square pixels and look about the same way. Every focal length of a wide range is tried; what explains the matches best is within
+some percent. Then passes of the self-calibrating adjustment with wide priors, images alone; after each the images are rectified again and
+followed anew. It ends where nothing moves any more, and says so where that does not happen.
+Sources: Hartley and Zisserman 2004, section 11.4 (Sampson distance); Brown 1966 (distortion).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from msgspec import structs
+from scipy.optimize import least_squares
+from scipy.sparse import lil_matrix
 
 from fleetmap.errors import RecordingError
 from fleetmap.features.matching import hamming_knn2
 from fleetmap.features.orb import Features, detect
 from fleetmap.features.settings import OrbSettings
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
+from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.recording import Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from mapserver.calibration.epipolar_guess import RawMatches, guessed_rig
 from mapserver.calibration.estimate import MIN_KEYFRAMES
 from mapserver.calibration.estimator import Adjusted, adjust
 from mapserver.calibration.parameters import INDEX, CalibrationParameter, RigAxes, corrected_rig
@@ -36,6 +42,14 @@ _LARGEST_PIXEL_SCALE = 3.0  # of the pixels' errors: above, no pinhole lens expl
 FOCAL_FLOOR = 0.01
 _MOMENTS, _STEPS, _MATCHES = 20, (4, 10), 120
 _LEAST_FLOW_PX = 8.0  # of a motion, in the median
+
+
+@dataclass(frozen=True)
+class RawMatches:
+    """Matched raw pixels (N, 4), u v of each view: of the pair, and for each motion of the left camera."""
+
+    pair: Array
+    motions: Sequence[Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,3 +149,183 @@ def _matched(first: Features, second: Features) -> Array:
     cv2.setRNGSeed(0)
     _, fits = cv2.findFundamentalMat(matches[:, :2], matches[:, 2:], cv2.FM_RANSAC, 3.0, 0.99)
     return matches[fits.ravel() > 0] if fits is not None else np.zeros((0, 4))
+
+
+_START_SHARES = (0.6, 1.0, 1.4)  # focal lengths in image widths: from 80 to 40 degrees across
+_ROBUST_PX = 0.5
+_MOST_EVALUATIONS = 60
+# Sigmas of lenses and mounts before anything is seen: right centre in widths, distortion in widths, angles, direction.
+_CENTRE_SIGMA, _DISTORTION_SIGMA, _TURN_SIGMA, _DIRECTION_SIGMA = 0.02, 1.0, 0.05, 0.03
+_GRID = (30, 24)  # pixels at which a lens is compared with another
+_LENS, _MOTION = 10, 6  # unknowns: of the rig, of each motion
+_LARGEST_SIGMA = 0.25  # of the focal length: from there the adjustment finds its way, from farther nobody has seen it
+
+
+class _Unknowns(NamedTuple):
+    """Of the rig: log of the focal length in widths, k1 k2 in widths, turn and direction y z of the right camera, its centre in widths."""
+
+    focal: float
+    distortion: Array
+    turn: Array
+    direction: Array
+    centre: Array
+
+    @classmethod
+    def of(cls, values: Array) -> "_Unknowns":
+        return cls(float(np.exp(values[0])), values[1:3], values[3:6], values[6:8], values[8:10])
+
+
+def guessed_rig(given: RigCalibration, matches: RawMatches) -> RigCalibration:
+    """`given` with lenses and the pair's turn as the matches show them; the length of the baseline stays.
+
+    RecordingError where they do not show the focal length.
+    """
+    width, baseline_m = given.cameras[0].width_px, _baseline_m(given)
+    if len(matches.pair) < 100 or not matches.motions:
+        raise RecordingError(
+            f"{len(matches.pair)} matches between the cameras and {len(matches.motions)} motions of the left one: too few to "
+            "guess lenses from; record a drive with turns in the light"
+        )
+    problem = _EpipolarProblem(given.cameras[0], matches)
+    fits = [problem.fit(share) for share in _START_SHARES]
+    _, sigma, best = min(fits, key=lambda fit: fit[0])
+    found = _Unknowns.of(best)
+    if not sigma <= _LARGEST_SIGMA or not 0.3 <= found.focal <= 3.0:
+        raise RecordingError(
+            f"the focal length is known to {100 * sigma:.0f} % only: the lenses cannot be guessed from this drive; record turns "
+            "to both sides, or give a calibration file"
+        )
+    focal_px = found.focal * width
+    left = _distorted(given.cameras[0], focal_px, found.distortion)
+    right = replace(left, intrinsics_px=left.intrinsics_px + np.concatenate([np.zeros(2), found.centre * width]))
+    apart = np.array([1.0, *found.direction])
+    body_from_right = left.body_from_cam @ se3(so3_exp(found.turn), apart * (baseline_m / np.linalg.norm(apart)))
+    return replace(given, cameras=(left, replace(right, body_from_cam=body_from_right)))
+
+
+def _baseline_m(rig: RigCalibration) -> float:
+    left, right = (camera.body_from_cam[:3, 3] for camera in rig.cameras)
+    return float(np.linalg.norm(right - left))
+
+
+class _EpipolarProblem:
+    """Sampson distances of all matches, in pixels, as a function of the rig and of each motion."""
+
+    def __init__(self, camera: CameraCalibration, matches: RawMatches) -> None:
+        self.width, self.matches = camera.width_px, matches
+        self.middle = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
+
+    def fit(self, share: float) -> tuple[float, float, Array]:
+        """Cost of the best explanation near a focal length of so many widths, sigma of the focal length as a share, the unknowns."""
+        start = np.zeros(_LENS + _MOTION * len(self.matches.motions))
+        start[0] = np.log(share)
+        for n, match in enumerate(self.matches.motions):
+            start[_LENS + _MOTION * n :][:_MOTION] = self._motion(match, share * self.width)
+        fit = least_squares(
+            self.residuals,
+            start,
+            loss="soft_l1",
+            f_scale=_ROBUST_PX,
+            jac_sparsity=self._pattern(len(start)),
+            max_nfev=_MOST_EVALUATIONS,
+            x_scale="jac",
+        )
+        jacobian = np.asarray(fit.jac.todense())  # type: ignore[union-attr]
+        information = jacobian.T @ jacobian + 1e-9 * np.eye(len(start))
+        return float(fit.cost), float(np.sqrt(np.linalg.inv(information)[0, 0])), np.asarray(fit.x)
+
+    def residuals(self, values: Array) -> Array:
+        """Distances of the pair's matches, of each motion's, then how far the unknowns are from what is usual, in sigmas."""
+        rig = _Unknowns.of(values)
+        pair, focal_px = self.matches.pair, rig.focal * self.width
+        left, right = self._rays(pair[:, :2], rig, 0), self._rays(pair[:, 2:], rig, 1)
+        apart = np.array([1.0, *rig.direction])
+        rows = [focal_px * _sampson(left, right, so3_exp(rig.turn), apart / np.linalg.norm(apart))]
+        usual = [rig.distortion / _DISTORTION_SIGMA, rig.turn / _TURN_SIGMA]
+        usual += [rig.direction / _DIRECTION_SIGMA, rig.centre / _CENTRE_SIGMA]
+        for match, motion in zip(self.matches.motions, values[_LENS:].reshape(-1, _MOTION), strict=True):
+            before, after = self._rays(match[:, :2], rig, 0), self._rays(match[:, 2:], rig, 0)
+            length = float(np.linalg.norm(motion[3:]))
+            rows.append(focal_px * _sampson(before, after, so3_exp(motion[:3]), motion[3:] / length))
+            usual.append(np.array([length - 1.0]))
+        return np.concatenate([*rows, *usual])
+
+    def _rays(self, pixels: Array, rig: _Unknowns, number: int) -> Array:
+        """(N, 3) with z = 1; radial terms act on the distorted place, so that nothing must be inverted."""
+        places = (pixels - self.middle) / self.width - number * rig.centre
+        squared = (places**2).sum(axis=1)
+        straight = places * (1.0 + rig.distortion[0] * squared + rig.distortion[1] * squared**2)[:, None] / rig.focal
+        return np.column_stack([straight, np.ones(len(pixels))])
+
+    def _motion(self, match: Array, focal_px: float) -> Array:
+        """(6,) rotation vector and direction of a motion, under a focal length."""
+        matrix = np.diag([focal_px, focal_px, 1.0])
+        matrix[:2, 2] = self.middle
+        essential, _ = cv2.findEssentialMat(match[:, 2:], match[:, :2], matrix, cv2.RANSAC, 0.99, 1.5)
+        if essential is None or essential.shape != (3, 3):
+            return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+        _, turn, way, _ = cv2.recoverPose(essential, match[:, 2:], match[:, :2], matrix)
+        return np.concatenate([so3_log(np.asarray(turn, np.float64)), way.ravel()])
+
+    def _pattern(self, unknowns: int) -> lil_matrix:
+        """Which residual depends on which unknown."""
+        counts = [len(match) for match in self.matches.motions]
+        seen = len(self.matches.pair)
+        pattern = lil_matrix((seen + sum(counts) + _LENS - 1 + len(counts), unknowns), dtype=int)
+        pattern[:seen, :_LENS] = 1
+        pattern[seen:, :3] = 1
+        usual = seen + sum(counts)
+        pattern[usual : usual + _LENS - 1, :_LENS] = 1
+        for n, count in enumerate(counts):
+            own = slice(_LENS + _MOTION * n, _LENS + _MOTION * (n + 1))
+            pattern[seen : seen + count, own] = 1
+            pattern[usual + _LENS - 1 + n, own] = 1
+            seen += count
+        return pattern
+
+
+def _sampson(first: Array, second: Array, rotation: Array, direction: Array) -> Array:
+    """(N,) distances of rays (N, 3), z = 1, from the epipolar lines of a motion: first = rotation second + direction."""
+    essential = skew(direction) @ rotation
+    line, other = second @ essential.T, first @ essential
+    scale = np.sqrt((line[:, :2] ** 2).sum(axis=1) + (other[:, :2] ** 2).sum(axis=1))
+    return np.asarray((first * line).sum(axis=1) / np.maximum(scale, 1e-12))
+
+
+def _distorted(camera: CameraCalibration, focal_px: float, terms: Array) -> CameraCalibration:
+    """The lens of radial-tangential form that has the rays of the guess, at least squares over the image."""
+    columns, rows = np.meshgrid(
+        np.linspace(0, camera.width_px - 1, _GRID[0]), np.linspace(0, camera.height_px - 1, _GRID[1])
+    )
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    middle = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
+    places = (pixels - middle) / camera.width_px
+    squared = (places**2).sum(axis=1)
+    straight = places * (1.0 + terms[0] * squared + terms[1] * squared**2)[:, None] * (camera.width_px / focal_px)
+    around = (straight**2).sum(axis=1)[:, None]
+    design = np.column_stack([(straight * around).ravel(), (straight * around**2).ravel()])
+    found = np.linalg.lstsq(design, ((pixels - middle) / focal_px - straight).ravel(), rcond=None)[0]
+    intrinsics = np.array([focal_px, focal_px, *middle])
+    return replace(camera, intrinsics_px=intrinsics, distortion=np.array([*found, 0.0, 0.0]))
+
+
+def guessed_in_words(found: GuessedCalibration) -> list[str]:
+    """What images alone showed, and what they cannot."""
+    left, right = found.rig.cameras
+    turn = np.degrees(so3_log((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, :3]))
+    lenses = [
+        f"cam{n}: focal length {c.intrinsics_px[0]:.1f} px, sigma {found.focal_sigma * c.intrinsics_px[0]:.1f}; centre "
+        f"{c.intrinsics_px[2]:.1f} {c.intrinsics_px[3]:.1f}; distortion {' '.join(f'{k:+.4f}' for k in c.distortion)}"
+        for n, c in enumerate((left, right))
+    ]
+    angles = f"cam1 is turned against cam0 by {turn[0]:+.2f} {turn[1]:+.2f} {turn[2]:+.2f} degrees"
+    lacking = "not judged: the baseline's length, which is as given, and how IMU and wheels are mounted"
+    return [*lenses, angles, lacking, f"{found.keyframes} keyframes, {found.passes} passes, images alone"]
+
+
+def guessed_file(found: GuessedCalibration, name: str) -> str:
+    """The text of a camchain of what was found from a guess."""
+    lines = [f"# Found by `mapserver calibrate` from {name}, beginning with focal length = image width."]
+    return (
+        "\n".join([*lines, *(f"# {line}" for line in guessed_in_words(found))]) + "\n" + format_calibration(found.rig)
+    )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array, so3_exp
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.calibration.parameters import (
     COLUMNS,
@@ -21,18 +21,18 @@ from mapserver.calibration.parameters import (
     RigAxes,
     corrected_rig,
     right_camera,
-    with_distortion,
 )
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.calibration.schur_kernels import ImageRows, weigh
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
-_LENS = [INDEX[P.FOCAL], INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]]
-_COMMON = slice(len(COLUMNS), len(COLUMNS) + DISTORTION)
-_APART = slice(_COMMON.stop, _COMMON.stop + DISTORTION)
-_RIGHT_CENTRE = slice(_APART.stop, UNKNOWNS)
-_STEP_PX, _STEP_DISTORTION = 0.01, 1e-5
+# What moves the measurements, and by how much for a difference: lenses in shares and pixels, the pair's angles, distortion
+_LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
+_LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
+_LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PAIR_ROLL]), 1e-5)
+_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION), 1e-5)
+_LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.01)
 HUBER_SIGMAS, CUTOFF_SIGMAS = 3.0, 8.0  # of an observation's four rows together
 
 
@@ -62,10 +62,10 @@ class Observations:
         sigmas[~np.isfinite(right).all(axis=1), 2:] = np.inf
         return cls(rig, axes, camera, left, right, np.where(np.isfinite(sigmas), sigmas, np.inf))
 
-    def measured(self, theta: Array) -> Array:
-        """(M, 4) rows: left pixel, disparity and row difference in the rectified image that theta gives."""
+    def measured(self, theta: Array, views: tuple[StereoCamera, StereoCamera] | None = None) -> Array:
+        """(M, 4) rows: left pixel, disparity and row difference in the rectified image that theta gives, at the scale of `views`."""
         rig = corrected_rig(self.calibration, self.axes, theta)
-        views = self.views(theta)
+        views = views or self.views(theta)
         left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
         if self.axes.baseline_m == 0:
             return np.column_stack([left, np.zeros_like(left)])
@@ -80,45 +80,13 @@ class Observations:
         return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
 
     def measured_slopes(self, theta: Array) -> Array:
-        """(M, 4, C) derivatives of `measured`, the scale of its pinholes held.
-
-        A ray depends on its pixel's distance to the principal point in focal lengths, so that what it changes by with the
-        pixel says what it changes by with the lens.
-        """
-        rig, slopes = corrected_rig(self.calibration, self.axes, theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
-        views = self.views(theta)
-        left = _pixel_slopes(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
-        slopes[:, :2, _LENS] = _by_lens(rig.cameras[0], self.left_px, left)
-        slopes[:, :2, INDEX[P.FOCAL]] /= 1.0 + theta[INDEX[P.FOCAL]]
-        by_lens = _by_distortion(rig.cameras[0], self.left_px, self.axes.rect_from_cam[0], views[0])
-        slopes[:, :2, _COMMON], slopes[:, :2, _APART] = by_lens, -0.5 * by_lens
-        if self.axes.baseline_m == 0:
-            return slopes
-        rect_from_right, _ = right_camera(self.axes, theta)
-        right = _pixel_slopes(rig.cameras[1], self.right_px, rect_from_right, views[1])
-        by_right = _by_lens(rig.cameras[1], self.right_px, right)
-        slopes[:, 2:] = slopes[:, :2]
-        slopes[:, 2:, INDEX[P.FOCAL_RATIO]] = -by_right[:, :, 0] / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
-        by_right[:, :, 0] /= 1.0 + theta[INDEX[P.FOCAL]]
-        slopes[:, 2:, _LENS] -= by_right
-        rays = rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T
-        by_lens = _by_distortion(rig.cameras[1], self.right_px, rect_from_right, views[1])
-        slopes[:, 2:, _COMMON] -= by_lens
-        slopes[:, 2:, _APART] -= 0.5 * by_lens
-        slopes[:, 2:, _RIGHT_CENTRE] = right
-        for axis, parameter in enumerate((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL)):
-            turned = np.cross(np.eye(3)[axis], rays)
-            slopes[:, 2:, INDEX[parameter]] = -_projected(rays, turned) * views[1].focal_px
+        """(M, 4, C) derivatives of `measured` by central differences, the scale of its pinholes held."""
+        views, slopes = self.views(theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
+        for column, size in _LENS_STEPS.items():
+            step = size * (np.arange(UNKNOWNS) == column)
+            change = self.measured(theta + step, views) - self.measured(theta - step, views)
+            slopes[:, :, column] = change / (2.0 * size)
         return slopes
-
-
-def _pixel_slopes(camera: CameraCalibration, pixels: Array, rect_from_cam: Array, view: StereoCamera) -> Array:
-    """(M, 2, 2) how the rectified pixel changes with the raw one, by central differences."""
-    columns = []
-    for step in np.eye(2) * _STEP_PX:
-        ends = [camera.ray_from_pixel(pixels + sign * step) @ rect_from_cam.T for sign in (1.0, -1.0)]
-        columns.append((_pixels(ends[0], view) - _pixels(ends[1], view)) / (2.0 * _STEP_PX))
-    return np.stack(columns, axis=2)
 
 
 def _pixels(rays: Array, view: StereoCamera) -> Array:
@@ -128,30 +96,6 @@ def _pixels(rays: Array, view: StereoCamera) -> Array:
 
 def _rays(camera: StereoCamera, pixels: Array) -> Array:
     return np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(len(pixels))])
-
-
-def _by_lens(camera: CameraCalibration, pixels: Array, slopes: Array) -> Array:
-    """(M, 2, 3) derivatives of rectified pixels by the logarithm of the focal length and by the principal point."""
-    by_focal = -np.einsum("mij,mj->mi", slopes, pixels - camera.intrinsics_px[2:])
-    return np.concatenate([by_focal[:, :, None], -slopes], axis=2)
-
-
-def _by_distortion(camera: CameraCalibration, pixels: Array, rect_from_cam: Array, view: StereoCamera) -> Array:
-    """(M, 2, 4) how the rectified pixel changes with the lens's distortion, by central differences."""
-    columns = []
-    for step in np.eye(DISTORTION) * _STEP_DISTORTION:
-        ends = []
-        for change in (step, -step):
-            other = replace(camera, distortion=with_distortion(camera.distortion, change))
-            ends.append(_pixels(other.ray_from_pixel(pixels) @ rect_from_cam.T, view))
-        columns.append((ends[0] - ends[1]) / (2.0 * _STEP_DISTORTION))
-    return np.stack(columns, axis=2)
-
-
-def _projected(rays: Array, change: Array) -> Array:
-    """(M, 2) how a ray's place in the plane z = 1 changes."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((change[:, :2] - rays[:, :2] / rays[:, 2:] * change[:, 2:]) / rays[:, 2:])
 
 
 @dataclass(frozen=True)

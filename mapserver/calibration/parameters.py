@@ -63,6 +63,14 @@ class ParameterRange:
     useful_sigma: float
 
 
+# By unit: how many of what people read, and with how many digits
+SHOWN = {
+    "": (100.0, "%", 2),
+    "rad": (float(np.degrees(1.0)), "degrees", 3),
+    "s": (1e3, "ms", 1),
+    "m": (1e3, "mm", 0),
+    "px": (1.0, "px", 2),
+}
 RANGES: dict[CalibrationParameter, ParameterRange] = {
     P.BASELINE: ParameterRange("", 0.3, 0.01),
     P.FOCAL: ParameterRange("", 0.3, 0.005),

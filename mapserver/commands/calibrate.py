@@ -53,7 +53,7 @@ def calibrate(
         return
     from fleetmap.console import plain_console
     from mapserver.calibration import estimate_calibration
-    from mapserver.calibration.calibration_file import corrected_file
+    from mapserver.calibration.estimate import corrected_file
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
@@ -104,8 +104,7 @@ def _write(out: Path, text: str, advice: str) -> None:
 
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
-    from mapserver.calibration.calibration_file import guessed_file, guessed_in_words
-    from mapserver.calibration.from_guess import calibration_from_guess, first_rig
+    from mapserver.calibration.from_guess import calibration_from_guess, first_rig, guessed_file, guessed_in_words
     from mapserver.config import survey_settings
 
     known = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4}):(\d*\.?\d+)", guess)
@@ -132,7 +131,7 @@ def _print(console: "Console", estimate: "CalibrationEstimate") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from mapserver.calibration.calibration_file import in_words
+    from mapserver.calibration.estimate import in_words
 
     table = Table(
         title=f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"

@@ -17,7 +17,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
-from mapserver.calibration.parameters import RANGES
+from mapserver.calibration.parameters import RANGES, SHOWN
 from mapserver.calibration.recordings import busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.sensors import SPARSE_S, median_period_s
@@ -68,13 +68,6 @@ TOLERANCES = {
 }
 # Which way a principal point's shift looks like a turn against the IMU.
 _SAME_BEARING = {P.CAMERA_IMU_X: (P.PRINCIPAL_Y, 1.0), P.CAMERA_IMU_Y: (P.PRINCIPAL_X, -1.0)}
-_SHOWN = {
-    "": (100.0, "%", 2),
-    "rad": (np.degrees(1.0), "degrees", 3),
-    "s": (1e3, "ms", 1),
-    "m": (1e3, "mm", 0),
-    "px": (1.0, "px", 2),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +133,7 @@ def corrected(rig: RigCalibration, measured: MeasuredCalibration) -> tuple[RigCa
 
 def in_words(name: str, value: float) -> str:
     """A correction as people read it, such as `-4.65 %`."""
-    factor, shown, digits = _SHOWN[RANGES[P(name)].unit]
+    factor, shown, digits = SHOWN[RANGES[P(name)].unit]
     return f"{factor * value:+.{digits}f} {shown}"
 
 
@@ -151,7 +144,7 @@ def unknown_calibration(reason: str, missing: str) -> MeasuredCalibration:
 
 def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> Finding:
     name, tolerance = parameter.name, TOLERANCES[parameter.name]
-    factor, unit, digits = _SHOWN[parameter.unit]
+    factor, unit, digits = SHOWN[parameter.unit]
     value, own_sigma = _net(parameter, estimate, focal_px)
     sigma_all = float(np.hypot(own_sigma, tolerance.floor))
     sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)

@@ -9,9 +9,8 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import RigCalibration
 from fleetsim.recorder import Order
-from mapserver.calibration.epipolar_guess import RawMatches, guessed_rig
 from mapserver.calibration.estimator import adjust
-from mapserver.calibration.from_guess import first_rig
+from mapserver.calibration.from_guess import RawMatches, first_rig, guessed_rig
 from mapserver.calibration.parameters import DISTORTION
 from support.worlds.calibration_scene import Stretch, make_stretch, measured
 

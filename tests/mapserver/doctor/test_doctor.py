@@ -22,6 +22,7 @@ from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import grouped, not_judged, summary
 from mapserver.doctor.gyro_images import fit_gyro, gyro_check
 from mapserver.doctor.images import flicker_check, sharpness
+from mapserver.doctor.metres import ImageMetres, judge_metres
 from mapserver.doctor.run_checks import TURN_FRAMES, _consecutive, _Frames
 from mapserver.doctor.sensors import (
     camera_checks,
@@ -179,25 +180,20 @@ def test_a_calibrated_offset_is_not_a_fault(good: Recording, turns: CameraTurns)
 
 
 @pytest.mark.parametrize(
-    ("turn", "says"),
+    ("change", "name", "says"),
     [
-        (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "x is "),
-        (np.diag([-1.0, -1.0, 1.0]), "wrong sign on its x and y axis"),
-        (np.diag([1.0, 1.0, -1.0]), "wrong sign on its z axis"),
-        (so3_exp(np.array([0.0, 0.35, 0.0])), "20.0 degrees|20.1 degrees|19.9 degrees"),
+        (np.diag([-1.0, -1.0, 1.0]), "gyro axes", "wrong sign on its x and y axis"),
+        (so3_exp(np.array([0.0, 0.35, 0.0])), "gyro axes", "20.0 degrees|20.1 degrees|19.9 degrees"),
+        (1.5 * np.eye(3), "gyro scale", "1.50|1.49|1.51"),
     ],
 )
-def test_wrong_axes(good: Recording, turns: CameraTurns, turn: np.ndarray, says: str) -> None:
-    finding = gyro_found(turns, replace(good.imu, gyro_radps=good.imu.gyro_radps @ turn.T))["gyro axes"]
+def test_a_gyro_that_turns_otherwise(
+    good: Recording, turns: CameraTurns, change: np.ndarray, name: str, says: str
+) -> None:
+    """Negated, exchanged and in degrees it is in test_contradictions."""
+    finding = gyro_found(turns, replace(good.imu, gyro_radps=good.imu.gyro_radps @ change.T))[name]
     assert finding.verdict is Verdict.FAIL
     assert any(part in finding.sentence for part in says.split("|"))
-
-
-def test_gyro_scale_against_the_images(good: Recording, turns: CameraTurns) -> None:
-    finding = gyro_found(turns, replace(good.imu, gyro_radps=1.5 * good.imu.gyro_radps))["gyro scale"]
-    assert (finding.verdict, finding.value) == (Verdict.FAIL, pytest.approx(1.5, abs=0.03))
-    degrees = gyro_found(turns, replace(good.imu, gyro_radps=np.degrees(good.imu.gyro_radps)))["gyro scale"]
-    assert "degrees per second" in degrees.sentence
 
 
 def test_an_imu_of_another_ride(good: Recording) -> None:
@@ -258,6 +254,13 @@ HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
 def test_timing(finding: Finding, verdict: Verdict, value: float, says: str) -> None:
     assert (finding.verdict, finding.value) == (verdict, pytest.approx(value, rel=1e-2))
     assert says in finding.sentence
+
+
+@pytest.mark.parametrize(("has_imu", "missing"), [(True, "start, stop and turn more often"), (False, "record an IMU")])
+def test_metres_that_nothing_tells_ask_for_what_is_missing(has_imu: bool, missing: str) -> None:
+    _, metres = judge_metres(None, None, ImageMetres(0.11, 2.0, 0.5), has_imu=has_imu)
+    assert metres.verdict is Verdict.NOT_JUDGED
+    assert metres.missing.startswith(missing)
 
 
 @pytest.mark.parametrize(("magnitude", "verdict"), [(9.81, Verdict.OK), (9.4, Verdict.WARN), (12.0, Verdict.FAIL)])
