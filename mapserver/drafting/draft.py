@@ -29,7 +29,6 @@ from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.drafting.report import (
     Accuracy,
-    BuildCost,
     BuildReport,
     accuracy,
     library_versions,
@@ -302,11 +301,14 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")
     archive = encode_archive(survey_map)
-    cost = BuildCost(
+    report = make_report(
+        built.surveyed,
+        built.joined,
+        built.accuracy,
+        evidence,
         seconds=time.perf_counter() - run.started_s,
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
-    report = make_report(built.surveyed, built.joined, built.accuracy, cost, evidence)
     asked = covered_requests(maps, site, built.joined)
     report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked)
     details = DraftDetails(

@@ -31,34 +31,33 @@ _FLAT_AXES = {(2, 1): (0, 1), (2, -1): (1, 0), (1, 1): (2, 0), (1, -1): (0, 2), 
 def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy, report: BuildReport) -> bytes:
     """A PNG: the map from above and, where the truth is known, position errors over time beside it."""
     with mpl.rc_context({"font.size": 9, "axes.edgecolor": _GRID, "axes.labelcolor": _INK, "text.color": _INK}):
-        plan = _Plan(survey_map)
-        figure, above, beside = _layout(plan, has_errors=found.rigid is not None)
-        _draw_map(above, plan, loops)
-        if beside is not None:
-            _draw_errors(beside, found, int(plan.stamps_ns[0]))
+        flat = _flat_axes(survey_map)
+        landmarks = survey_map.points_map[:: len(survey_map.points_map) // _MAX_LANDMARKS + 1, flat]
+        low, high = _view(survey_map.trajectory.positions_m[:, flat], landmarks)
+        width, height = high - low
+        map_height_in = 6.2 if width / height < 1.3 else 8.0 * height / width
+        map_width_in = map_height_in * width / height
+        beside_in = 1.0 if found.rigid is None else 5.6
+        figure = Figure((max(map_width_in + beside_in, 7.0), max(map_height_in, 3.6) + 1.9), layout="constrained")
+        if found.rigid is None:
+            above = figure.subplots()
+        else:
+            above, beside = figure.subplots(1, 2, width_ratios=(map_width_in + 0.6, 4.8))
+            _draw_errors(beside, found, int(survey_map.trajectory.stamps_ns[0]))
+        _draw_map(above, survey_map, flat, landmarks, loops)
+        above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         _write_titles(figure, title, report)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
 
 
-class _Plan:
-    """A survey from above: path (F, 2), places of keyframes (K, 2), landmarks (N, 2), corners low and high (2,)."""
-
-    def __init__(self, survey_map: SurveyMap) -> None:
-        flat = list(_FLAT_AXES[_up_axis(survey_map)])
-        self.labels = tuple(f"{'xyz'[axis]}, m" for axis in flat)
-        self.path = survey_map.trajectory.positions_m[:, flat]
-        self.places = survey_map.map_from_body[:, flat, 3]
-        self.landmarks = survey_map.points_map[:: len(survey_map.points_map) // _MAX_LANDMARKS + 1, flat]
-        self.guessed = self.path[~survey_map.trajectory_estimated]
-        self.stamps_ns = survey_map.trajectory.stamps_ns
-        self.low, self.high = _view(self.path, self.landmarks)
-
-    @property
-    def seconds(self) -> Array:
-        """(F,) since the first frame."""
-        return np.asarray((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
+def _flat_axes(survey_map: SurveyMap) -> list[int]:
+    """By the axis of the map that points up in most images, as an IMU has it too."""
+    map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
+    up_map = -map_from_cam[:, :3, 1].mean(axis=0)
+    axis = int(np.argmax(np.abs(up_map)))
+    return list(_FLAT_AXES[axis, 1 if up_map[axis] > 0 else -1])
 
 
 def _view(path: Array, landmarks: Array) -> tuple[Array, Array]:
@@ -74,86 +73,45 @@ def _view(path: Array, landmarks: Array) -> tuple[Array, Array]:
     return middle - 0.5 * wanted, middle + 0.5 * wanted
 
 
-def _up_axis(survey_map: SurveyMap) -> tuple[int, int]:
-    """Axis of the map that points up, and its sense: what is up in most images, as an IMU has it too."""
-    map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
-    up_map = -map_from_cam[:, :3, 1].mean(axis=0)
-    axis = int(np.argmax(np.abs(up_map)))
-    return axis, 1 if up_map[axis] > 0 else -1
+def _draw_map(axes: "Axes", survey_map: SurveyMap, flat: list[int], landmarks: Array, loops: Loops) -> None:
+    def dots(points: Array, **look: Any) -> None:
+        axes.scatter(points[:, 0], points[:, 1], **look)
 
-
-def _layout(plan: _Plan, *, has_errors: bool) -> "tuple[Figure, Axes, Axes | None]":
-    """A figure that fits the shape of the map; axes for the map and, if wanted, for the errors on its right."""
-    width, height = plan.high - plan.low
-    aspect = float(width / height)
-    map_height_in = 6.2 if aspect < 1.3 else 8.0 / aspect
-    map_width_in = map_height_in * aspect
-    size = (map_width_in + (5.6 if has_errors else 1.0), max(map_height_in, 3.6) + 1.9)
-    figure = Figure(figsize=(max(size[0], 7.0), size[1]), layout="constrained")
-    if not has_errors:
-        return figure, figure.subplots(), None
-    above, beside = figure.subplots(1, 2, width_ratios=(map_width_in + 0.6, 4.8))
-    return figure, above, beside
-
-
-def _draw_map(axes: "Axes", plan: _Plan, loops: Loops) -> None:
-    size = float(np.clip(20_000 / max(len(plan.landmarks), 1), 0.8, 4.0))
-    _dots(axes, plan.landmarks, s=size, c=_POINT, alpha=0.55, linewidths=0, zorder=1)
-    _draw_loops(axes, plan, loops)
-    steps = np.stack([plan.path[:-1], plan.path[1:]], axis=1)
-    pieces = LineCollection(list(steps), cmap=_TIME, linewidths=2.4, zorder=4, capstyle="round")
-    pieces.set_array(plan.seconds[:-1])
+    path, places = survey_map.trajectory.positions_m[:, flat], survey_map.map_from_body[:, flat, 3]
+    guessed = path[~survey_map.trajectory_estimated]
+    size = float(np.clip(20_000 / max(len(landmarks), 1), 0.8, 4.0))
+    dots(landmarks, s=size, c=_POINT, alpha=0.55, linewidths=0, zorder=1)
+    _draw_loops(axes, places, loops)
+    stamps_ns = survey_map.trajectory.stamps_ns
+    pieces = LineCollection(list(np.stack([path[:-1], path[1:]], axis=1)), cmap=_TIME, linewidths=2.4, zorder=4)
+    pieces.set_array((stamps_ns[:-1] - stamps_ns[0]) * 1e-9)
     axes.add_collection(pieces)
-    _dots(axes, plan.places, s=10, c="white", edgecolors=_INK, linewidths=0.6, zorder=5, label="keyframe")
-    if len(plan.guessed):
-        _dots(axes, plan.guessed, s=16, marker="x", c=_GUESS, linewidths=1, zorder=5, label="only guessed")
-    for points, marker, colour, label in ((plan.path[:1], "o", _GOOD, "start"), (plan.path[-1:], "s", _BAD, "end")):
-        look = {"marker": marker, "c": colour, "edgecolors": "white", "label": label}
-        _dots(axes, points, s=55, linewidths=1, zorder=6, **look)
-    axes.set(xlim=(plan.low[0], plan.high[0]), ylim=(plan.low[1], plan.high[1]))
-    axes.set(xlabel=plan.labels[0], ylabel=plan.labels[1])
+    dots(places, s=10, c="white", edgecolors=_INK, linewidths=0.6, zorder=5, label="keyframe")
+    if len(guessed):
+        dots(guessed, s=16, marker="x", c=_GUESS, linewidths=1, zorder=5, label="only guessed")
+    for points, marker, colour, label in ((path[:1], "o", _GOOD, "start"), (path[-1:], "s", _BAD, "end")):
+        dots(points, s=55, marker=marker, c=colour, edgecolors="white", linewidths=1, zorder=6, label=label)
+    axes.set(xlabel=f"{'xyz'[flat[0]]}, m", ylabel=f"{'xyz'[flat[1]]}, m")
     axes.set_aspect("equal", adjustable="box")
-    _tidy(axes)
-    _draw_scale_bar(axes, float(plan.high[0] - plan.low[0]))
+    _tidy(axes, columns=6)
     bar = axes.figure.colorbar(pieces, ax=axes, location="bottom", fraction=0.025, pad=0.02, aspect=60)
     bar.set_label("seconds since the start", color=_QUIET)
-    bar.ax.tick_params(colors=_QUIET, length=0)
     bar.ax.spines[:].set_visible(False)
-    spacing = {"columnspacing": 1.2, "handlelength": 1.4, "borderaxespad": 0.2}
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=6, frameon=False, fontsize=8, **spacing)
 
 
-def _dots(axes: "Axes", points: Array, **look: Any) -> None:
-    axes.scatter(points[:, 0], points[:, 1], **look)
-
-
-def _draw_loops(axes: "Axes", plan: _Plan, loops: Loops) -> None:
+def _draw_loops(axes: "Axes", places: Array, loops: Loops) -> None:
     """Accepted ones, and of the refused ones those that looked most alike."""
     accepted = [r for r in loops.records if r.verdict is LoopVerdict.ACCEPTED]
-    refused = sorted(
-        (r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED), key=lambda r: (-r.score, r.i, r.j)
-    )
+    refused = [r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED]
+    refused.sort(key=lambda r: (-r.score, r.i, r.j))
     for records, colour, width, alpha, order, label in (
         (refused[:_MAX_REFUSED], _BAD, 0.5, 0.35, 2, "loop refused"),
         (accepted, _GOOD, 1.1, 0.75, 3, "loop accepted"),
     ):
         if records:
-            ends = [plan.places[[r.i, r.j]] for r in records]
-            axes.add_collection(
-                LineCollection(ends, colors=colour, linewidths=width, alpha=alpha, zorder=order, label=label)
-            )
-
-
-def _draw_scale_bar(axes: "Axes", width_m: float) -> None:
-    """A bar of 1, 2 or 5 times a power of ten, at most a fifth of the width."""
-    power = 10.0 ** np.floor(np.log10(width_m / 5))
-    length_m = float(power * max(step for step in (1, 2, 5) if power * step <= width_m / 5))
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    x, y = left + 0.03 * (right - left), bottom + 0.04 * (top - bottom)
-    axes.plot([x, x + length_m], [y, y], color=_INK, linewidth=3, solid_capstyle="butt", zorder=7)
-    axes.annotate(
-        f"{length_m:g} m", (x + length_m / 2, y), (0, 4), textcoords="offset points", ha="center", fontsize=9, zorder=7
-    )
+            ends = [places[[r.i, r.j]] for r in records]
+            lines = LineCollection(ends, colors=colour, linewidths=width, alpha=alpha, zorder=order, label=label)
+            axes.add_collection(lines)
 
 
 def _draw_errors(axes: "Axes", found: Accuracy, start_ns: int) -> None:
@@ -165,16 +123,16 @@ def _draw_errors(axes: "Axes", found: Accuracy, start_ns: int) -> None:
     axes.axhline(found.rigid.rmse_m * 100, color=_INK, linewidth=1, linestyle=(0, (4, 3)), label="root mean square")
     span = max(float(seconds[-1] - seconds[0]), 1e-3)
     axes.set(xlim=(seconds[0] - 0.01 * span, seconds[-1] + 0.01 * span), ylim=(0, 1.1 * float(errors_cm.max()) + 1e-6))
-    _tidy(axes)
-    axes.spines[["top", "right"]].set_visible(False)
     axes.set(xlabel="seconds since the start", ylabel="position error after rigid alignment, cm")
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False, fontsize=8, borderaxespad=0.2)
+    axes.spines[["top", "right"]].set_visible(False)
+    _tidy(axes, columns=2)
 
 
-def _tidy(axes: "Axes") -> None:
+def _tidy(axes: "Axes", *, columns: int) -> None:
     axes.tick_params(colors=_QUIET, length=0)
     axes.grid(color=_GRID, linewidth=0.6)
     axes.set_axisbelow(True)
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, frameon=False, fontsize=8, borderaxespad=0.2)
 
 
 def _write_titles(figure: Figure, title: str, report: BuildReport) -> None:

@@ -34,24 +34,7 @@ _LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fle
 
 
 class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The stable keys.
-
-    recordings: their names. duration_s: from the first to the last selected frame. seconds: wall time from opening the recording until the
-    map is ready to be stored. realtime_factor: duration_s / seconds, above 1 faster than recorded. path_m: length of the estimated
-    trajectory of the selected frames. map_bytes: what a robot downloads for the whole site (manifest and tiles), vocabulary apart; None
-    until it is stored. loops: counts of candidates and their fates. ate_rmse_m, ate_sim3_rmse_m: root mean square position error of every
-    selected frame that has an estimate and a known truth, after one rigid (similarity) alignment; evaluated_share: their share of the
-    selected frames. All three are None without ground truth. scale: metric, or unknown for one camera that nothing told the metres;
-    scale_error: by how much the estimate is too large (0.01 is 1 %), None without ground truth. peak_rss_mb: most memory the process held,
-    with that of the process beside it, in 10^6 bytes. findings: by recording, what the doctor found wanting in it, and what was
-    corrected. corrections: of the calibration, by recording and parameter, in radians, seconds, pixels or shares. culled: what the
-    surveys did not hand on. sessions: what became of every recording, and of the map's landmarks by it. joins: the verdict on each that
-    is in the map.
-    directions: which way the places of each tile look, and which way none does. starts: robots that start without a prior where nothing
-    is mapped; lookalike_recall: of these, what a start must exceed to be believed, None where nothing could tell. grid: that of planners,
-    surfels: the map that renders; None without one. surveyed_requests: by id of a person's request the share of its places that these
-    recordings drove past.
-    """
+    """The stable keys, in the order in which docs/reports.md explains them. map_bytes is None until the draft is stored."""
 
     recordings: list[str]
     duration_s: float
@@ -125,17 +108,16 @@ def path_length_m(trajectory: Trajectory) -> float:
     return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
 
 
-class BuildCost(msgspec.Struct, frozen=True):
-    """What a build cost: wall seconds, most memory in 10^6 bytes."""
-
-    seconds: float
-    peak_rss_mb: float
-
-
 def make_report(
-    recordings: "Sequence[Surveyed]", joined: MergedMap, found: Accuracy, cost: BuildCost, evidence: Evidence
+    recordings: "Sequence[Surveyed]",
+    joined: MergedMap,
+    found: Accuracy,
+    evidence: Evidence,
+    *,
+    seconds: float,
+    peak_rss_mb: float,
 ) -> BuildReport:
-    """The report of surveyed recordings, map_bytes still unknown."""
+    """The report of surveyed recordings, map_bytes still unknown. peak_rss_mb: most memory that the build held, in 10^6 bytes."""
     survey_map = joined.map
     taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
@@ -144,8 +126,8 @@ def make_report(
     return BuildReport(
         recordings=[s.entry.name for s in taken],
         duration_s=round(duration_s, 6),
-        seconds=round(cost.seconds, 3),
-        realtime_factor=round(duration_s / max(cost.seconds, 1e-9), 4),
+        seconds=round(seconds, 3),
+        realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
         path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
         keyframes=len(survey_map.keyframe_stamps_ns),
         landmarks=len(survey_map.landmark_ids),
@@ -156,7 +138,7 @@ def make_report(
         evaluated_share=found.evaluated_share,
         scale="metric" if survey_map.scale_known else "unknown",
         scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
-        peak_rss_mb=round(cost.peak_rss_mb, 1),
+        peak_rss_mb=round(peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
         corrections={s.entry.name: s.corrections for s in taken if s.corrections},

@@ -2,11 +2,11 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -18,18 +18,17 @@ from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
 from mapserver.calibration import CalibrationParameter
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import SAMPLED_FRAMES, TURN_FRAMES, checked
+from mapserver.drafting.admission import SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
 from mapserver.drafting.draft_evidence import HeldOut, held_out_of
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.report import check_truth
 from mapserver.drafting.sensor_subset import reduced
-from mapserver.drafting.trajectory import OtherTrajectory, given_poses, with_depths
+from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
@@ -86,17 +85,10 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed: every statement of the doctor, the calibration to use, what was found of the given one.
+    """A recording fit to be surveyed, as the doctor found it, and its initial trajectory, None for our own odometry."""
 
-    given: its initial trajectory, None for our own odometry.
-    """
-
-    statements: tuple[str, ...]
-    rig: RigCalibration
-    calibration: RigEvidence
-    corrections: dict[str, float]
-    given: Trajectory | None = None
-    leaves_wheels_out: bool = False
+    checked: CheckedRecording
+    given: GivenPoses | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,17 +121,6 @@ class RecordingOptions:
         recording, indices = self.opened(path)
         with recording:
             yield recording, indices
-
-
-class Reading(Protocol):
-    """How recordings are opened: `RecordingOptions` anew each time, `OpenRecordings` once."""
-
-    @property
-    def trajectory(self) -> OtherTrajectory | None:
-        """See RecordingOptions."""
-
-    def open(self, path: Path) -> AbstractContextManager[tuple[Recording, NDArray[np.int64]]]:
-        """See RecordingOptions."""
 
 
 class OpenRecordings:
@@ -216,7 +197,7 @@ def survey_inputs_of(
 
 def admit_recordings(
     paths: Sequence[Path],
-    options: Reading,
+    options: RecordingOptions | OpenRecordings,
     console: Console,
     *,
     needs_truth: bool,
@@ -261,7 +242,7 @@ def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
 
 def _admission(
     path: Path,
-    options: Reading,
+    options: RecordingOptions | OpenRecordings,
     console: Console,
     needs_truth: bool,
     executor: Executor,
@@ -272,36 +253,36 @@ def _admission(
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
-        other = options.trajectory
         total, done = frames_to_check(recording, SAMPLED_FRAMES, TURN_FRAMES), count(1)
         result = checked(recording, lambda: progress("examination", min(next(done), total), total), executor)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        statements, found = tuple(result.statements()), result.calibration
-        wheels = result.leaves_wheels_out
-        admission = Admission(statements, result.rig, found, result.corrections, leaves_wheels_out=wheels)
-        if other is None:
-            return admission
-        given = given_poses(replace(recording, calibration=result.rig), indices, other)
+        if options.trajectory is None:
+            return Admission(result)
+        given = given_poses(replace(recording, calibration=result.rig), indices, options.trajectory)
         console.print(f"{recording.name}: {given.words}", markup=False)
-        return replace(admission, statements=(*admission.statements, given.words), given=given.trajectory)
+        return Admission(result, given)
 
 
 def survey_recording(
     path: Path,
     admission: Admission,
-    reading: Reading,
+    reading: RecordingOptions | OpenRecordings,
     pinhole: StereoCamera | None,
     options: SurveyConfig,
     tools: SurveyTools,
 ) -> Surveyed:
     """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
+    found, given = admission.checked, admission.given
+    rig, said = found.rig, () if given is None else (given.words,)
     with reading.open(path) as (opened, indices):
-        recording = replace(opened, calibration=admission.rig)
-        if admission.leaves_wheels_out:
+        recording = replace(opened, calibration=rig)
+        if found.leaves_wheels_out:
             recording = replace(recording, wheel=())
-        rectifier = Rectifier(admission.rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-        done = survey(survey_inputs_of(recording, indices, rectifier, admission.given), options, tools)
+        rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
+        done = survey(
+            survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory), options, tools
+        )
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
@@ -311,9 +292,9 @@ def survey_recording(
             truth=recording.ground_truth,
             survey=done,
             map_from_survey=map_from_survey,
-            findings=admission.statements,
-            calibration=admission.calibration,
-            corrections=admission.corrections,
+            findings=(*found.statements(), *said),
+            calibration=found.calibration,
+            corrections=found.corrections,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 

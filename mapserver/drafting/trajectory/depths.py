@@ -15,8 +15,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.drafting.trajectory.formats import array_in, read_poses
-from mapserver.drafting.trajectory.given import OtherTrajectory, check_span, stamps_on_clock
-from mapserver.drafting.trajectory.readings import NEAR_NS
+from mapserver.drafting.trajectory.given import NEAR_NS, OtherTrajectory, check_span, stamps_on_clock
 
 if TYPE_CHECKING:
     import hashlib

@@ -13,7 +13,7 @@ from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
-from mapserver.drafting.report import accuracy, check_truth, path_length_m
+from mapserver.drafting.report import accuracy, check_truth
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
@@ -64,12 +64,6 @@ def test_truth_is_asked_for_before_the_survey() -> None:
     check_truth("walk", np.array([0, 5, 10, 20]), truth)
     with pytest.raises(RecordingError, match="walk: 2 of 3 selected frames"):
         check_truth("walk", np.array([0, 10, 30]), truth)
-
-
-def test_path_length_is_along_the_corners() -> None:
-    corners = np.tile(np.eye(4), (4, 1, 1))
-    corners[:, :2, 3] = [[0, 0], [3, 4], [3, 10], [11, 10]]
-    assert path_length_m(Trajectory(np.arange(4, dtype=np.int64), corners)) == pytest.approx(5 + 6 + 8)
 
 
 def test_the_time_before_a_call_goes_to_the_stage_that_used_it() -> None:

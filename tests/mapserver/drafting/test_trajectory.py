@@ -19,8 +19,7 @@ from mapserver.drafting.sensor_subset import reduced
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses
 from mapserver.drafting.trajectory import given as given_module
 from mapserver.drafting.trajectory.formats import WrittenPoses
-from mapserver.drafting.trajectory.given import stamps_on_clock
-from mapserver.drafting.trajectory.readings import Followed, fitted_scale
+from mapserver.drafting.trajectory.given import Followed, fitted_scale, stamps_on_clock
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.state import OdometryPass
