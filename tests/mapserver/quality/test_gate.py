@@ -331,25 +331,32 @@ def with_calibrations(*rigs: RigEvidence, has_current: bool) -> GateVerdict:
     return judge(manifest(tiles, 2), manifest(tiles, 1) if has_current else None, GateSettings(), evidence)
 
 
-def test_a_first_version_whose_calibration_nobody_could_judge_waits_for_a_person() -> None:
-    said = with_calibrations(STRAIGHT, has_current=False)
+DOUBT = RigEvidence("a1", ["metric scale"], doubted={"pair geometry": "off by 0.2 degrees"})
+UNKNOWN = "pair geometry of calibration a1: drive curves"
+
+
+@pytest.mark.parametrize(
+    ("rigs", "has_current", "reason", "note"),
+    [
+        ((STRAIGHT,), False, f"nothing judged the {UNKNOWN}", ""),
+        ((STRAIGHT,), True, "", UNKNOWN),  # which is compared with the map
+        ((RigEvidence("a1", ["pair geometry"]), STRAIGHT), False, "", ""),
+        ((RigEvidence("a1", ["pair geometry"]), STRAIGHT), True, "", ""),
+        ((RigEvidence("b2", ["pair geometry"]), STRAIGHT), False, UNKNOWN, ""),
+        ((RigEvidence("b2", ["pair geometry"]), STRAIGHT), True, "", UNKNOWN),
+        ((DOUBT,), False, "calibration a1: pair geometry: off by 0.2 degrees", ""),
+        ((DOUBT,), True, "calibration a1: pair geometry: off by 0.2 degrees", ""),
+    ],
+)
+def test_what_is_known_of_a_calibration(
+    rigs: tuple[RigEvidence, ...], has_current: bool, reason: str, note: str
+) -> None:
+    """What nobody could judge of a first version, and any doubt, waits for a person; what an earlier recording judged is judged."""
+    said = with_calibrations(*rigs, has_current=has_current)
     assert not said.hard_reasons
-    assert len(said.reasons) == 1
-    assert "pair geometry of calibration a1: drive curves" in said.reasons[0]
-
-
-@pytest.mark.parametrize("has_current", [False, True])
-def test_what_an_earlier_recording_with_this_calibration_judged_is_judged(has_current: bool) -> None:
-    said = with_calibrations(RigEvidence("a1", ["pair geometry"]), STRAIGHT, has_current=has_current)
-    assert said.accepted, said.reasons
-    other = with_calibrations(RigEvidence("b2", ["pair geometry"]), STRAIGHT, has_current=has_current)
-    assert other.accepted is has_current
-
-
-def test_a_later_version_is_compared_with_the_map_and_says_what_was_not_judged() -> None:
-    said = with_calibrations(STRAIGHT, has_current=True)
-    assert said.accepted, said.reasons
-    assert "pair geometry of calibration a1: drive curves" in said.report["not_judged"]
+    assert len(said.reasons) == bool(reason)
+    assert reason in "".join(said.reasons)
+    assert (UNKNOWN in said.report["not_judged"]) is bool(note)
 
 
 @pytest.mark.parametrize(("rig", "passes"), [("a1", True), ("b2", False)])
@@ -364,13 +371,6 @@ def test_a_calibration_that_a_person_trusts_passes_and_another_one_does_not(rig:
     assert (words in said.report["not_judged"]) is passes
     doubt = RigEvidence("a1", doubted={"metric scale": "4 % off"})
     assert not judge(draft, None, GateSettings(), Evidence(calibrations=[doubt])).accepted
-
-
-@pytest.mark.parametrize("has_current", [False, True])
-def test_doubts_about_a_calibration_wait_for_a_person(has_current: bool) -> None:
-    doubt = RigEvidence("a1", ["metric scale"], doubted={"pair geometry": "off by 0.2 degrees"})
-    said = with_calibrations(doubt, has_current=has_current)
-    assert [reason for reason in said.reasons if "calibration a1: pair geometry: off by 0.2 degrees" in reason]
 
 
 def test_without_evidence_only_hard_limits_refuse() -> None:

@@ -70,25 +70,6 @@ def seen_per_view(survey: SurveyMap, chosen: np.ndarray) -> np.ndarray:
     return np.bincount(survey.obs_keyframe[chosen[survey.obs_landmark]], minlength=len(survey.map_from_body))
 
 
-def test_every_view_keeps_its_share() -> None:
-    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
-    chosen = choose_landmarks(survey, exactly(100), 16.0)
-    assert chosen.sum() == 100
-    counts = seen_per_view(survey, chosen)
-    assert counts.min() > 0.7 * counts.mean()
-
-
-def test_tiles_hold_what_was_chosen() -> None:
-    survey = random_survey(np.random.default_rng(1), keyframes=20, landmarks=800)
-    chosen = choose_landmarks(survey, exactly(100), 16.0)
-    tiles = tiles_from_survey(survey, 16.0, chosen=chosen)
-    ids = set(survey.landmark_ids[chosen].tolist())
-    assert {int(i) for tile in tiles for i in tile.landmark_ids} == ids
-    listed = {int(i) for tile in tiles for place in tile.place_landmark_ids for i in place}
-    assert listed == ids
-    assert sum(len(tile.place_ids) for tile in tiles) == 20
-
-
 def with_a_lonely_view(own: np.ndarray) -> SurveyMap:
     """Keyframe 9 of ten sees some of 400 landmarks that nobody else sees, and nothing else."""
     survey = random_survey(np.random.default_rng(2), keyframes=10, landmarks=400)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import SurveyError
-from fleetmap.mapformat import decode_tile, encode_tile
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
 
@@ -60,11 +59,6 @@ def test_places_list_the_best_observed_landmarks() -> None:
         count_of = {int(survey.landmark_ids[row]): int(counts[row]) for row in seen}
         assert len(ids) == 10
         assert min(count_of[i] for i in ids) >= max(n for i, n in count_of.items() if i not in ids)
-
-
-def test_tiles_can_be_encoded_at_once() -> None:
-    for tile in tiles_from_survey(random_survey(np.random.default_rng(6)), 16.0):
-        assert len(decode_tile(encode_tile(tile))) == len(tile)
 
 
 def test_a_landmark_seen_from_opposite_sides_has_the_widest_view() -> None:
