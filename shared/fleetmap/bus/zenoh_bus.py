@@ -13,9 +13,8 @@ import zenoh
 import zenoh.ext
 
 from fleetmap.access import Access
-from fleetmap.bus.endpoints import check_endpoint, has_tls, is_loopback, with_free_port
+from fleetmap.bus.endpoints import TlsFiles, check_endpoint, has_tls, is_loopback, with_free_port
 from fleetmap.bus.fair_queue import FairQueue, sender_of
-from fleetmap.bus.tls import TlsFiles
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UsageError
 from fleetmap.messages import own_map_key
 

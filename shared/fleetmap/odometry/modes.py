@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
+from fleetmap.odometry.filter.msckf import wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock

@@ -1,6 +1,7 @@
 """The right-invariant multi-state constraint filter: propagation, clones, update."""
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 
@@ -11,7 +12,6 @@ from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_log
 from fleetmap.inertial import GRAVITY_MAP
 from fleetmap.numerics.transform_kernels import earlier_from_later
 from fleetmap.odometry.filter import covariance_kernels, msckf_kernels, propagation_kernels, state_kernels
-from fleetmap.odometry.filter.measurements import CONSIDERED, LinearMeasurement
 from fleetmap.odometry.filter.msckf_kernels import Clones, NormalEquations, PixelModel, Tracks
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.filter.state_kernels import Window
@@ -19,13 +19,31 @@ from fleetmap.odometry.settings import FilterSettings
 from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import ImuSamples
+from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 _NAV = 15  # rotation, velocity, position, gyro bias, accelerometer bias
 _OFFSET = 15  # index of the time offset
 _CLONES = 16  # index of the first clone
 _PAIR = 2  # of the considered errors, which lie before all others: the pair's disparity offset and depth scale
 _POSITION_GATE = 11.345  # 0.99 of chi-square with 3 degrees of freedom
+CONSIDERED = (
+    4  # errors that are never estimated: disparity offset, depth scale, scales of the wheels' speed and yaw rate
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearMeasurement:
+    """residual (n,) = jacobian (n, m) @ error + noise (n, n), for the first m errors of the filter.
+
+    The covariances: noise weighs the measurement; true_noise, where it differs, and by_considered (n, 4), derivatives by
+    the considered errors, go into the true error's covariance.
+    """
+
+    jacobian: Array
+    residual: Array
+    noise: Array
+    true_noise: Array | None = None
+    by_considered: Array | None = None
 
 
 class InvariantFilter:
@@ -338,6 +356,33 @@ class InvariantFilter:
     def _correct(self, error: Array) -> None:
         self.imu_minus_cam_s += float(error[_OFFSET])
         state_kernels.apply_error(self.state.arrays, self._rotations, self._positions, error)
+
+
+def zero_velocity(
+    state: NavState, gyro_mean_radps: Array, gyro_sigma_radps: float, settings: FilterSettings
+) -> LinearMeasurement:
+    """The body neither moves nor turns: velocity zero, the gyro shows its bias alone (ZUPT).
+
+    gyro_mean_radps (3,) over the time since the last frame, known to gyro_sigma_radps.
+    """
+    jacobian = np.zeros((6, _NAV))
+    jacobian[:3, :3], jacobian[:3, 3:6] = -skew(state.velocity_mps), np.eye(3)
+    jacobian[3:, 9:12] = np.eye(3)
+    residual = np.concatenate([-state.velocity_mps, gyro_mean_radps - state.gyro_bias_radps])
+    sigmas = np.array([settings.still_sigma_mps] * 3 + [gyro_sigma_radps] * 3)
+    return LinearMeasurement(jacobian, residual, np.diag(sigmas**2))
+
+
+def wheel_odometry(
+    state: NavState, sample: WheelSample, gyro_radps: Array, base_from_body: Array, settings: FilterSettings
+) -> LinearMeasurement:
+    """The motion of `base` by its wheels: forward speed, no other, and yaw rate. gyro_radps (3,): measured at the same time."""
+    jacobian, by_considered = np.zeros((4, _NAV)), np.zeros((4, CONSIDERED))
+    measured = sample.velocity_base_mps, float(sample.yaw_rate_radps), gyro_radps, base_from_body
+    residual = state_kernels.wheel_rows(state.arrays, *measured, jacobian, by_considered)
+    sigmas = np.array([sample.sigma_mps, settings.wheel_slip_mps, settings.wheel_slip_mps, sample.sigma_radps])
+    weighed = np.diag((settings.wheel_sigma_scale * sigmas) ** 2)
+    return LinearMeasurement(jacobian, residual, weighed, np.diag(sigmas**2), by_considered)
 
 
 @lru_cache

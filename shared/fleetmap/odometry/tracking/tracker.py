@@ -143,18 +143,14 @@ class Tracker:
         tracker_kernels.stereo_points(pixels, self._lens, points_cam)
         return points_cam
 
-    def _predict(self, points_cam: Array, pixels: Array, cam_from_previous: Array) -> Array:
-        """Where the previous points should appear; those without depth move as if far away."""
-        predicted = np.empty((len(pixels), 2))
-        tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
-        return predicted
-
     def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[PnpResult | None, float]:
         """sure: the motion is a prediction, not a guess."""
         if not len(self._points.ids):
             return None, 0.0
         pixels, points_cam = self._points.pixels, self._points_cam(self._points.pixels)
-        flowed, kept = self._flow(frame, self._predict(points_cam, pixels, cam_from_previous), sure)
+        predicted = np.empty((len(pixels), 2))  # points without depth move as if far away
+        tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
+        flowed, kept = self._flow(frame, predicted, sure)
         pnp = self._motion(points_cam, flowed, kept, cam_from_previous)
         before = int(kept.sum())
         carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one

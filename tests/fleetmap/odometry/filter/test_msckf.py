@@ -5,8 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
-from fleetmap.odometry.filter.measurements import wheel_odometry, zero_velocity
-from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.msckf import InvariantFilter, wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse, so3_exp
-from fleetmap.odometry.filter.measurements import LinearMeasurement
-from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.msckf import InvariantFilter, LinearMeasurement
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
