@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.features.matching import packed
-from fleetmap.relocalization.descriptor_index import DescriptorIndex
 from fleetmap.relocalization.descriptor_index_kernels import nearest_cells
+from fleetmap.relocalization.map_view import DescriptorIndex
 from support.worlds.vocabulary_training import train_vocabulary
 
 Descriptors = NDArray[np.uint8]
