@@ -20,6 +20,20 @@ def verdict(test: MembershipTest) -> tuple[MembershipVerdict, SessionPlace | Mem
     return (MembershipVerdict.JOINED, located) if refused is None else (refused.verdict, refused)
 
 
+def refused(test: MembershipTest, wanted: MembershipVerdict = MembershipVerdict.UNDECIDED) -> Membership:
+    said, held = verdict(test)
+    assert said is wanted
+    assert isinstance(held, Membership)
+    return held
+
+
+def joined(test: MembershipTest) -> SessionPlace:
+    said, located = verdict(test)
+    assert said is MembershipVerdict.JOINED
+    assert isinstance(located, SessionPlace)
+    return located
+
+
 def restocked(share: float, seed: int) -> Aisle:
     """Home with a share of its half metres of shelf changed."""
     shelf = np.floor(HOME.points_map * 2.0).astype(np.int64)
@@ -47,18 +61,14 @@ def docks(metres: float = 0.0) -> Array:
 @pytest.mark.parametrize("share", [0.3])
 def test_a_session_of_the_site_is_joined_where_it_is(share: float) -> None:
     for given in (None, docks()):
-        said, located = verdict(membership(KNOWN, restocked(share, 3), PLACES, given))
-        assert said is MembershipVerdict.JOINED
-        assert isinstance(located, SessionPlace)
+        located = joined(membership(KNOWN, restocked(share, 3), PLACES, given))
         assert located.placed.places >= 8
         assert np.linalg.norm((located.map_from_body - PLACES)[:, :3, 3], axis=1).max() < 0.03
 
 
 def test_another_building_is_foreign_however_well_its_fixes_agree_and_its_docks_fit() -> None:
     """Its fixes agree at eight places and more, to the centimetre: what it shares with the site is really there."""
-    said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, docks()))
-    assert said is MembershipVerdict.FOREIGN
-    assert isinstance(held, Membership)
+    held = refused(membership(KNOWN, shared_above(1.2), PLACES, docks()), MembershipVerdict.FOREIGN)
     assert held.evidence.places >= 8
     assert held.evidence.share_high < 0.5
     assert "another --site" in held.reason
@@ -66,9 +76,7 @@ def test_another_building_is_foreign_however_well_its_fixes_agree_and_its_docks_
 
 def test_without_docks_another_building_may_as_well_be_an_aisle_of_the_site_the_other_way_round() -> None:
     """A session against the survey's direction is found in a neighbouring aisle that was surveyed its way: none of it is foreign."""
-    said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, None))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    held = refused(membership(KNOWN, shared_above(1.2), PLACES, None))
     assert held.evidence.share_high < 0.5
     assert "elsewhere" in held.reason
     assert "direction" in held.reason
@@ -85,39 +93,29 @@ def test_what_halls_of_one_maker_share_never_joins(given: Array | None) -> None:
 
 def test_against_the_surveys_direction_nothing_is_decided() -> None:
     around = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
-    said, held = verdict(membership(KNOWN, HOME, PLACES[::-1] @ around, PLACES[-1] @ around))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    refused(membership(KNOWN, HOME, PLACES[::-1] @ around, PLACES[-1] @ around))
 
 
 def test_a_session_between_both_is_held_with_its_figures() -> None:
-    said, held = verdict(membership(KNOWN, restocked(0.65, 4), PLACES, None))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    held = refused(membership(KNOWN, restocked(0.65, 4), PLACES, None))
     assert held.evidence.share_low < 0.5 < held.evidence.share_high
     assert "not certain" in held.reason
 
 
 def test_a_building_that_shares_nothing_is_not_found_with_any_docks() -> None:
     for given in (None, docks(), docks(7.0)):
-        said, held = verdict(membership(KNOWN, aisle(9), PLACES, given))
-        assert said is MembershipVerdict.UNDECIDED
-        assert isinstance(held, Membership)
+        held = refused(membership(KNOWN, aisle(9), PLACES, given))
         assert "not found in the map" in held.reason
 
 
 def test_docks_that_contradict_what_is_seen_hold_a_session() -> None:
-    said, held = verdict(membership(KNOWN, HOME, PLACES, docks(8.0)))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    held = refused(membership(KNOWN, HOME, PLACES, docks(8.0)))
     assert held.evidence.priors_off_m == pytest.approx(8.0, abs=0.1)
     assert "docks" in held.reason
 
 
 def test_docks_are_not_doubted_because_some_other_place_is_a_little_like_it() -> None:
-    said, held = verdict(membership(KNOWN, shared_above(1.2), PLACES, docks(8.0)))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    held = refused(membership(KNOWN, shared_above(1.2), PLACES, docks(8.0)))
     assert "not found where its docks are" in held.reason
 
 
@@ -125,24 +123,18 @@ def test_aisles_that_look_the_same_hold_a_session_until_a_dock_tells_them_apart(
     twin = aisle(1, y_m=30.0)
     both = together(HOME, twin)
     known = relocalizer(both, np.concatenate([drive(56), drive(56, y_m=30.0)]))
-    said, held = verdict(membership(known, both, PLACES, None))
-    assert said is MembershipVerdict.UNDECIDED
-    assert isinstance(held, Membership)
+    held = refused(membership(known, both, PLACES, None))
     assert "look alike" in held.reason
     for y_m in (0.0, 30.0):
         places = drive(30, start_m=2.0, y_m=y_m)
-        said, located = verdict(membership(known, both, places, places[0]))
-        assert said is MembershipVerdict.JOINED
-        assert isinstance(located, SessionPlace)
+        located = joined(membership(known, both, places, places[0]))
         assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
 
 
 def test_a_session_is_joined_by_its_overlap_which_must_be_long_enough() -> None:
     """Two thirds of it lead through what the map has not; two metres of overlap are too few places."""
     known = relocalizer(HOME, drive(26))
-    said, located = verdict(membership(known, HOME, drive(40, start_m=6.0), None))
-    assert said is MembershipVerdict.JOINED
-    assert isinstance(located, SessionPlace)
+    located = joined(membership(known, HOME, drive(40, start_m=6.0), None))
     assert np.linalg.norm((located.map_from_body - drive(40, start_m=6.0))[:10, :3, 3], axis=1).max() < 0.03
     said, _ = verdict(membership(KNOWN, HOME, drive(5, start_m=6.0), None))
     assert said is MembershipVerdict.UNDECIDED
