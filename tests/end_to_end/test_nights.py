@@ -22,18 +22,8 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rides = (out_and_back(4.0), out_and_back(3.6, reach_m=2.2, start_m=(-1.1, 0.5, 0.1)))
     for number, ride in enumerate(rides, 1):
         write_euroc(inbox / f"ride{number}", ride_sample(ride, 38, 0.1, seed=number))
-        words = [
-            "nightly",
-            "--site",
-            "lab",
-            "--inbox",
-            str(inbox),
-            "--store",
-            str(tmp_path / "store"),
-            "--settle-s",
-            "0",
-        ]
-        monkeypatch.setattr(sys, "argv", ["mapserver", *words, "--report", str(report)])
+        words = f"mapserver nightly --site lab --inbox {inbox} --store {tmp_path}/store --settle-s 0 --report {report}"
+        monkeypatch.setattr(sys, "argv", shlex.split(words))
         with pytest.raises(SystemExit) as end:
             cli.main()
         said = json.loads(report.read_text())

@@ -196,13 +196,6 @@ def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
         assert again.archive("lab", 4) == maps.archive("lab", 4)
 
 
-def test_the_frame_of_a_site_stays(nights: Nights) -> None:
-    common = [nights.folder / "night2", "--site", "lab", "--store", nights.store]
-    error = invoke(app, "build", *common, "--frame-from-ground-truth").exception
-    assert isinstance(error, UsageError)
-    assert "frame stays" in str(error)
-
-
 def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp_path: Path) -> None:
     """Two rides past one wall become one map; a ride through another world is named, with the reason."""
     write_euroc(tmp_path / "foreign", make_sample(20))
@@ -249,8 +242,12 @@ def test_a_prior_alone_joins_nothing(nights: Nights, tmp_path: Path) -> None:
         assert "drive" in held.reason
 
 
-def test_a_site_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:
+def test_a_site_keeps_its_frame_and_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:
+    to_store = ["--site", "lab", "--store", nights.store]
+    error = invoke(app, "build", nights.folder / "night2", *to_store, "--frame-from-ground-truth").exception
+    assert isinstance(error, UsageError)
+    assert "frame stays" in str(error)
     write_euroc(tmp_path / "foreign", make_sample(20))
-    error = invoke(app, "build", tmp_path / "foreign", "--site", "lab", "--store", nights.store).exception
+    error = invoke(app, "build", tmp_path / "foreign", *to_store).exception
     assert isinstance(error, SurveyError)
     assert "nothing could be joined" in str(error)

@@ -18,7 +18,6 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.store.fleet_queries import FleetBatch
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-MAX_NOTEBOOK_BYTES = 60_000
 
 
 def run(name: str, folder: Path, *arguments: str | Path) -> str:
@@ -29,18 +28,15 @@ def run(name: str, folder: Path, *arguments: str | Path) -> str:
     return done.stdout
 
 
-def cells_of(name: str) -> list[dict[str, Any]]:
-    document = json.loads((EXAMPLES / f"{name}.ipynb").read_text("utf-8"))
-    return [cell for cell in document["cells"] if cell["cell_type"] == "code"]
-
-
 def run_notebook(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The names that a notebook's code cells leave, run in order in one namespace."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.chdir(folder)
     namespace: dict[str, Any] = {}
-    for number, cell in enumerate(cells_of(name), start=1):
-        exec(compile("".join(cell["source"]), f"{name}, code cell {number}", "exec"), namespace)
+    cells = json.loads((EXAMPLES / f"{name}.ipynb").read_text("utf-8"))["cells"]
+    for number, cell in enumerate(cells, start=1):
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"{name}, cell {number}", "exec"), namespace)
     return namespace
 
 
@@ -101,17 +97,3 @@ def test_first_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_reading_a_map(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(run_notebook("reading_a_map", site, monkeypatch)["seen"]) > 3
-
-
-@pytest.mark.parametrize("name", ["first_map", "reading_a_map"])
-def test_notebooks_are_small_and_show_their_output(name: str) -> None:
-    assert (EXAMPLES / f"{name}.ipynb").stat().st_size < MAX_NOTEBOOK_BYTES
-    outputs = [output for cell in cells_of(name) for output in cell["outputs"]]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
-
-
-def test_examples_are_short_and_each_is_run_here() -> None:
-    here = Path(__file__).read_text("utf-8")
-    for path in EXAMPLES.glob("*.py"):
-        assert len(path.read_text("utf-8").splitlines()) < 90, path.name
-        assert f'run("{path.stem}"' in here
