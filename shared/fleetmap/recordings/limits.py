@@ -45,7 +45,7 @@ def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_M
     """
     try:
         if compression == "":
-            unpacked = bytes(packed)
+            unpacked = packed if isinstance(packed, bytes) else bytes(packed)
         elif compression == "zstd":
             with zstandard.ZstdDecompressor(max_window_size=MAX_MESSAGE_BYTES).stream_reader(packed) as reader:
                 unpacked = bytes(reader.read(most_bytes + 1))

@@ -143,14 +143,6 @@ def test_other_videos_are_told_how_to_become_one(tmp_path: Path, rig: OpenOption
             open_recording(tmp_path / name, rig)
 
 
-def test_pictures_of_another_size_than_the_calibrations(tmp_path: Path, rig: OpenOptions) -> None:
-    small = [image[::2, ::2].copy() for image in SAMPLE.left]
-    with pytest.raises(
-        RecordingError, match=f"is {WIDTH // 2}x{HEIGHT // 2} px, the calibration says {WIDTH}x{HEIGHT}"
-    ):
-        open_recording(write_video(tmp_path / "a.mp4", small, list(range(0, 600, 50))), rig)
-
-
 def test_pictures_beyond_the_limit_are_not_decoded(
     tmp_path: Path, rig: OpenOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:

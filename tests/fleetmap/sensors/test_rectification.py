@@ -129,20 +129,17 @@ def test_depth_becomes_disparity_where_it_is_known() -> None:
     assert np.isnan(frame.disparity_px[120, 280])
 
 
-def test_swapped_cameras_are_refused() -> None:
-    swapped = RigCalibration(rig("equidistant").cameras[::-1])
-    with pytest.raises(CalibrationError, match="swapped"):
-        Rectifier(swapped)
-
-
-def test_cameras_without_baseline_are_refused() -> None:
-    with pytest.raises(CalibrationError, match="baseline"):
-        Rectifier(rig("equidistant", cam0_from_cam1=np.eye(4)))
-
-
-def test_no_camera_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="--calibration"):
-        Rectifier(RigCalibration(()))
+@pytest.mark.parametrize(
+    ("calibration", "says"),
+    [
+        (RigCalibration(rig("equidistant").cameras[::-1]), "swapped"),
+        (rig("equidistant", cam0_from_cam1=np.eye(4)), "baseline"),
+        (RigCalibration(()), "--calibration"),
+    ],
+)
+def test_rigs_that_cannot_be_rectified_are_refused(calibration: RigCalibration, says: str) -> None:
+    with pytest.raises(CalibrationError, match=says):
+        Rectifier(calibration)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -69,6 +69,8 @@ def test_topics_are_named_as_the_message_says(tmp_path: Path) -> None:
     assert topics == Topics(left="/a/image", right="/b/image", imu="", wheel="/w")
     with open_recording(bag, OpenOptions(topics=named_topics(["left=/a/image", "right=/b/image"]))) as recording:
         np.testing.assert_array_equal(recording.read_frame(0).right, SAMPLE.right[0])
+    with pytest.raises(RecordingError, match=r"has no topic /c/image.*/b/image"):
+        open_recording(bag, OpenOptions(topics=named_topics(["left=/c/image"])))
     for word in ("left", "lef=/a", "/a/image"):
         with pytest.raises(UsageError, match=rf"--topic {word}: write ROLE=NAME.*left, right, depth"):
             named_topics([word])

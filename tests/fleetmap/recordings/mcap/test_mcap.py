@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3, se3_exp, so3_exp
-from fleetmap.recordings import OpenOptions, Recording, Topics, open_recording
+from fleetmap.recordings import OpenOptions, Recording, open_recording
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.recordings.ros2 import messages as ros_messages
@@ -159,17 +159,6 @@ def test_topics_by_their_type_and_name(tmp_path: Path) -> None:
     messages = foreign_messages(left="/camera/left/image_raw", right="/camera/right/image_raw", imu="/sensors/imu")
     with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
         assert_is_the_sample(recording)
-
-
-def test_topics_that_leave_a_choice(tmp_path: Path) -> None:
-    messages = foreign_messages(left="/a/image", right="/b/image")
-    path = write_foreign(tmp_path / "a.mcap", messages)
-    with pytest.raises(RecordingError, match=r"no topic is clearly the left image.*/a/image"):
-        open_recording(path)
-    with open_recording(path, OpenOptions(topics=Topics(left="/a/image", right="/b/image"))) as recording:
-        assert_is_the_sample(recording)
-    with pytest.raises(RecordingError, match=r"has no topic /c/image.*/b/image"):
-        open_recording(path, OpenOptions(topics=Topics(left="/c/image")))
 
 
 def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
@@ -318,10 +307,3 @@ def test_a_rosbag2_folder(tmp_path: Path) -> None:
     write_foreign(bag / "bag_1.mcap", foreign_messages())
     with pytest.raises(RecordingError, match=r"holds 2 \.mcap files"):
         open_recording(bag)
-
-
-def test_a_closed_recording_says_so(tmp_path: Path) -> None:
-    recording = open_recording(write(tmp_path / "a.mcap"))
-    recording.close()
-    with pytest.raises(RecordingError, match="after the recording was closed"):
-        recording.read_frame(0)
