@@ -11,8 +11,8 @@ from fleetmap.recordings import Topics
 from fleetmap.sensors.source_settings import SourceSection
 from locclient.daemon.output_section import OutputSection
 from locclient.localization.settings import LocalizerSettings
+from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
-from locclient.maps.tile_selection import TileSelectionSettings
 from locclient.robot.version_trial import TrialSettings
 from locclient.vda5050.settings import Vda5050Section
 

@@ -24,7 +24,7 @@ from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox
-from locclient.delivery.replay_delivery import ReplayQueue
+from locclient.delivery.report_delivery import ReplayQueue
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
 from locclient.maps.map_client import MapClient

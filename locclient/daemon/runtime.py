@@ -7,7 +7,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,12 +22,10 @@ from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
-from locclient.delivery.replay_delivery import ReplayQueue
-from locclient.delivery.report_delivery import write_failure
-from locclient.maps.loaded_map import LoadedMap
+from locclient.delivery.report_delivery import ReplayQueue, write_failure
+from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import Cell, PositionBound, PositionBoundTracker
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
@@ -63,16 +61,6 @@ class RuntimeParts:
     fleet_manager: MqttLink | None = None
 
 
-@dataclass
-class _Shared:
-    """Values that threads exchange; deques and plain values, which need no lock."""
-
-    bound: PositionBound = field(default_factory=PositionBound)
-    held: list[WantedVersion] = field(default_factory=list)
-    loaded: deque[LoadedMap] = field(default_factory=deque)
-    failures: deque[tuple[FailureContext, int]] = field(default_factory=lambda: deque(maxlen=_MAX_PENDING))
-
-
 class Runtime:
     """Runs until `stop` is called, the source has ended, or a thread has died, whose error `run` raises."""
 
@@ -80,16 +68,22 @@ class Runtime:
         self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
-        self._stop = threading.Event()
-        self._sensors_stop = threading.Event()
-        self._shared = _Shared()
+        self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
+        self._stop, self._sensors_stop = threading.Event(), threading.Event()
+        # What threads exchange: deques and plain values, which need no lock.
+        self._bound = PositionBound()
+        self._held: list[WantedVersion] = []
+        self._loaded: deque[LoadedMap] = deque()
+        self._failures: deque[tuple[FailureContext, int]] = deque(maxlen=_MAX_PENDING)
+        # Of the thread that localizes.
         self._figures = HealthFigures()
         self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
-        self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._refusals, self._unreadable = LogLimit(_log), 0
         self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
+        # Of the thread of the disk.
+        self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._fetched_again: set[str] = set()
         self._shown_grid: WantedVersion | None = None
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
@@ -101,54 +95,54 @@ class Runtime:
     def run(self) -> None:
         """Localizes on the calling thread until it is over; threads are joined, and what they held is on the disk."""
         with ended_by_threads(self.stop):
-            self._run()
-
-    def _run(self) -> None:
-        works: dict[str, Callable[[], None]] = {"sensors": self._run_sensors, "disk": self._run_disk}
-        if self._parts.server is not None:
-            works["network"] = partial(self._run_network, self._parts.server)
-        threads = [threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()]
-        for thread in threads:
-            thread.start()
-        if self._parts.fleet_manager is not None:
-            self._parts.fleet_manager.start()
-        self._manager.ready()
-        self._last_frame_s = time.monotonic()
-        try:
-            while not self._stop.is_set() and not self._parts.intake.exhausted:
-                self._step()
-        finally:
-            self._manager.stopping()
-            self.stop()
+            works: dict[str, Callable[[], None]] = {"sensors": self._run_sensors, "disk": self._run_disk}
+            if self._server is not None:
+                works["network"] = partial(self._run_network, self._server)
+            threads = [threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()]
             for thread in threads:
-                thread.join(_DRAIN_S)
+                thread.start()
             if self._parts.fleet_manager is not None:
-                self._parts.fleet_manager.stop()
-            self._queue_failures()
-            if self._parts.replays is not None and self._parts.robot.ring is not None:
-                self._parts.robot.ring.finish()
-                self._parts.replays.work()
-            _log.info("stopped: %s", self._health(is_silent=False))
-            if words := self._figures.search.words:
-                _log.warning("stopped: %s", words)
+                self._parts.fleet_manager.start()
+            self._manager.ready()
+            self._last_frame_s = time.monotonic()
+            try:
+                while not self._stop.is_set() and not self._parts.intake.exhausted:
+                    self._step()
+            finally:
+                self._finish(threads)
+
+    def _finish(self, threads: list[threading.Thread]) -> None:
+        self._manager.stopping()
+        self.stop()
+        for thread in threads:
+            thread.join(_DRAIN_S)
+        if self._parts.fleet_manager is not None:
+            self._parts.fleet_manager.stop()
+        self._queue_failures()
+        if self._parts.replays is not None and self._robot.ring is not None:
+            self._robot.ring.finish()
+            self._parts.replays.work()
+        _log.info("stopped: %s", self._health(is_silent=False))
+        if words := self._figures.search.words:
+            _log.warning("stopped: %s", words)
 
     # --- the thread that localizes ------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        robot, shared = self._parts.robot, self._shared
-        bundle = self._parts.intake.take(_TAKE_S)
-        while shared.loaded:
-            robot.use(shared.loaded.popleft())
+        robot, server, intake = self._robot, self._server, self._parts.intake
+        bundle = intake.take(_TAKE_S)
+        while self._loaded:
+            robot.use(self._loaded.popleft())
             give_back_free_memory()  # of the version before, and of what reading this one took; half a millisecond
-        while self._parts.server is not None and self._parts.server.frames:
-            robot.align(self._parts.server.frames.popleft())
-        while self._parts.server is not None and self._parts.server.priors:
-            self._parts.intake.put_prior(self._parts.server.priors.popleft())
+        while server is not None and server.frames:
+            robot.align(server.frames.popleft())
+        while server is not None and server.priors:
+            intake.put_prior(server.priors.popleft())
         outcome = None
         try:
             outcome = robot.handle(bundle)
         except RecordingError as error:
-            self._parts.intake.count_unreadable(str(error))
+            intake.count_unreadable(str(error))
             _log.warning("a frame is skipped: %s", error)
         now_s = time.monotonic()
         if outcome is not None:
@@ -156,18 +150,18 @@ class Runtime:
             self._after_frame(outcome)
         elif self._last_frame_s is not None:
             self._note_failure(robot.handle_silence(now_s - self._last_frame_s), now_s - self._last_frame_s)
-        shared.held = [loaded.wanted for loaded in robot.held]
-        if self._parts.server is not None:
-            self._parts.server.changes.extend(robot.take_changes())
+        self._held = [loaded.wanted for loaded in robot.held]
+        if server is not None:
+            server.changes.extend(robot.take_changes())
         self._report(now_s)
 
     def _after_frame(self, outcome: Outcome) -> None:
-        parts, estimate = self._parts, outcome.estimate
-        if parts.publisher is not None:
-            _send(partial(parts.publisher.publish, estimate, outcome.published, parts.robot.base_from_body))
-        if parts.fleet_manager is not None:
-            held = frozenset(loaded.version for loaded in parts.robot.held)
-            parts.fleet_manager.adapter.after_frame(outcome, held)
+        estimate, fleet_manager = outcome.estimate, self._parts.fleet_manager
+        if self._publisher is not None:
+            _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
+        if fleet_manager is not None:
+            held = frozenset(loaded.version for loaded in self._robot.held)
+            fleet_manager.adapter.after_frame(outcome, held)
         was_lost = self._figures.search.is_long
         before = {} if self._figures.last is None else self._figures.last.left_out
         for flag in outcome.left_out.keys() - before.keys():
@@ -175,19 +169,19 @@ class Runtime:
         self._figures.handle(outcome)
         if self._figures.search.is_long != was_lost:
             _log.warning("%s", "localised again" if was_lost else self._figures.search.words)
-        self._shared.bound = self._bound_tracker.handle(estimate)
+        self._bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()
-        if parts.server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
+        if self._server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
             self._pose_ns = estimate.stamp_ns
-            _send(partial(parts.server.client.publish_pose, message))
+            _send(partial(self._server.client.publish_pose, message))
 
     def _note_failure(self, context: FailureContext | None, silent_s: float) -> None:
         if context is not None:
             failure = context.failure
             _log.warning("failure: %s, %s, %s", failure.kind, failure.cause, failure.estimate.status.value)
             self._figures.count_failure()
-            self._shared.failures.append((context, self._wall_ns() - int(max(failure.duration_s, silent_s) * 1e9)))
+            self._failures.append((context, self._wall_ns() - int(max(failure.duration_s, silent_s) * 1e9)))
 
     def _report(self, now_s: float) -> None:
         if now_s - self._health_s < _HEALTH_EVERY_S:
@@ -199,10 +193,10 @@ class Runtime:
         is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
         if is_silent and self._parts.fleet_manager is not None:
             self._parts.fleet_manager.adapter.silence()
-        if self._parts.server is not None:
-            self._parts.server.health.append(self._health(is_silent))
-        if self._parts.publisher is not None:
-            _send(partial(self._parts.publisher.alive, is_silent))
+        if self._server is not None:
+            self._server.health.append(self._health(is_silent))
+        if self._publisher is not None:
+            _send(partial(self._publisher.alive, is_silent))
         last = self._figures.last
         status = "no frame yet" if last is None else last.estimate.status.value
         self._manager.alive("no frames come" if is_silent else status)
@@ -211,22 +205,18 @@ class Runtime:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
         with suppress(StoreError):  # the thread of the disk or of the network says so
             self._outbox_counts = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
+        for fault in [fault for cache in self._parts.caches for fault in cache.take_faults()]:
+            _log.warning("tile cache: %s", fault)
+            self._cache_faults += 1
         tiles = {
-            "tiles_held": sum(len(loaded.tiles) for loaded in self._parts.robot.held),
+            "tiles_held": sum(len(loaded.tiles) for loaded in self._robot.held),
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
-            "cache_faults": self._count_cache_faults(),
+            "cache_faults": self._cache_faults,
         }
-        server = self._parts.server
-        word: dict[str, Figure] = {} if server is None else {"map_word_hours": server.client.word_hours}
-        profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles, **word}
+        if self._server is not None:
+            counts["map_word_hours"] = self._server.client.word_hours
+        profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles}
         return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, is_silent)
-
-    def _count_cache_faults(self) -> int:
-        for cache in self._parts.caches:
-            for fault in cache.take_faults():
-                _log.warning("tile cache: %s", fault)
-                self._cache_faults += 1
-        return self._cache_faults
 
     # --- the other threads --------------------------------------------------------------------------------------------
 
@@ -244,14 +234,13 @@ class Runtime:
                 self._parts.replays.work()
 
     def _load_maps(self) -> None:
-        loader, server, shared = self._parts.tile_loader, self._parts.server, self._shared
-        bound = shared.bound
+        loader, server, bound = self._parts.tile_loader, self._server, self._bound
         while server is not None and server.fetched:
             version = server.fetched.popleft()
             self._shown_grid = None if version == self._shown_grid else self._shown_grid
             self._offers[version.manifest_sha256 or ""] = version
             loader.retry_refused(version)
-        held = list(shared.held)
+        held = self._held
         for version in held:
             self._offers.pop(version.manifest_sha256 or "", None)
         wanted = [*held, *self._offers.values()]
@@ -262,7 +251,7 @@ class Runtime:
                 self._note_unusable(version, str(error))
                 continue
             if loaded is not None:
-                shared.loaded.append(replace(loaded, is_offer=version not in held))
+                self._loaded.append(replace(loaded, is_offer=version not in held))
             self._note_refused_tiles(version)
         if held:
             self._show_grid(held[0])
@@ -272,7 +261,7 @@ class Runtime:
 
     def _show_grid(self, version: WantedVersion) -> None:
         """Gives planners the grid of the confirmed version. What an older client did not fetch with it is fetched now, once."""
-        publisher = self._parts.publisher
+        publisher = self._publisher
         height_m = None if publisher is None else publisher.grid_height_m
         if publisher is None or height_m is None or version == self._shown_grid:
             return
@@ -282,9 +271,9 @@ class Runtime:
         except FleetmapError as error:
             why = str(error)
             key = f"grid {version.manifest_sha256}"
-            if isinstance(error, LinkError) and self._parts.server is not None and key not in self._fetched_again:
+            if isinstance(error, LinkError) and self._server is not None and key not in self._fetched_again:
                 self._fetched_again.add(key)
-                self._parts.server.refetch.append(version)
+                self._server.refetch.append(version)
                 return
         _send(partial(publisher.show_grid, version.version or 0, grid, why))
 
@@ -292,9 +281,9 @@ class Runtime:
         """A version without manifest or any tile is fetched again, once, and dropped where there is no server."""
         _log.warning("version %s cannot be loaded: %s", version.version, reason)
         self._offers.pop(version.manifest_sha256 or "", None)
-        if self._parts.server is not None and version.manifest_sha256 not in self._fetched_again:
+        if self._server is not None and version.manifest_sha256 not in self._fetched_again:
             self._fetched_again.add(version.manifest_sha256 or "")
-            self._parts.server.refetch.append(version)
+            self._server.refetch.append(version)
 
     def _note_refused_tiles(self, version: WantedVersion) -> None:
         """Logs refused tiles once, and has them fetched again."""
@@ -304,13 +293,13 @@ class Runtime:
         self._refused_tiles[sha256] = refused
         for cell, reason in refused.items():
             _log.warning("tile %s of version %s is refused: %s", cell, version.version, reason)
-        if refused and self._parts.server is not None:
-            self._parts.server.refetch.append(version)
+        if refused and self._server is not None:
+            self._server.refetch.append(version)
 
     def _queue_failures(self) -> None:
         parts = self._parts
-        while self._shared.failures:
-            context, wall_ns = self._shared.failures.popleft()
+        while self._failures:
+            context, wall_ns = self._failures.popleft()
             report = failure_report(context, parts.profile, report_id=uuid.uuid4().hex, wall_ns=wall_ns)
             try:
                 parts.outbox.put(QueuedReport(report.id, encode_message(report)))

@@ -11,8 +11,7 @@ from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.delivery.outbox import Outbox
-from locclient.delivery.replay_delivery import deliver_replay_part
-from locclient.delivery.report_delivery import deliver
+from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
 from locclient.robot.robot import Change, VersionChange

@@ -8,9 +8,8 @@ from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.version_grid import grid_of, occupancy
-from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, TileSelectionSettings, select_tiles
 from locclient.maps.map_source import MapSource
-from locclient.maps.tile_selection import Cell, PositionBound, TileSelectionSettings, select_tiles
 
 
 @dataclass

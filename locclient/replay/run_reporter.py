@@ -10,8 +10,7 @@ from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.messages import encode_message
 from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox, QueuedReport
-from locclient.delivery.replay_delivery import ReplayQueue, deliver_replay_part
-from locclient.delivery.report_delivery import deliver
+from locclient.delivery.report_delivery import ReplayQueue, deliver, deliver_replay_part
 from locclient.maps.connection import MapConnection, replay_outbox
 from locclient.maps.map_client import MapClient
 from locclient.replay.run_metrics import METRICS

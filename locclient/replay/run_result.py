@@ -14,7 +14,7 @@ from locclient.localization.estimate import Estimate
 from locclient.maps.map_source import FetchedTiles
 from locclient.replay.plots import RunPlot, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
-from locclient.robot.search_way import SearchWay
+from locclient.robot.health_report import SearchWay
 
 _MIN_ALIGNED = 3  # frames, below which a fit is not defined
 

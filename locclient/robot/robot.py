@@ -19,12 +19,17 @@ from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
-from locclient.robot.dock_check import DockCheck
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
-from locclient.robot.sensor_agreement import WHEELS_REFUSED, WheelAgreement, accelerometer_refused, imu_refused
-from locclient.robot.speed import SpeedGauge
+from locclient.robot.motion_checks import (
+    WHEELS_REFUSED,
+    DockCheck,
+    SpeedGauge,
+    WheelAgreement,
+    accelerometer_refused,
+    imu_refused,
+)
 from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
 
 Clock = Callable[[], float]  # seconds

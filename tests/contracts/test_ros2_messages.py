@@ -27,7 +27,7 @@ from fleetmap.recordings.ros2.navigation_messages import (
     encode_motion,
 )
 from fleetmap.sensors.samples import PositionPrior, WheelSample
-from locclient.daemon.lifecycle import (
+from locclient.daemon.ros2_localizer import (
     TRANSITIONS,
     LifecycleState,
     encode_events,

@@ -28,11 +28,11 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox
 from locclient.localization.estimate import Estimate
+from locclient.maps.loaded_map import PositionBound, TileSelectionSettings
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import PositionBound, TileSelectionSettings
 from locclient.robot.continuous_odom import PublishedPose
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot

@@ -12,7 +12,7 @@ from fleetmap.errors import LinkError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import PART_BYTES, FailureAck
 from locclient.delivery.outbox import Outbox, QueuedReport
-from locclient.delivery.replay_delivery import ReplayQueue, deliver_replay_part
+from locclient.delivery.report_delivery import ReplayQueue, deliver_replay_part
 
 DATA = bytes(range(256)) * (5 * PART_BYTES // 512)  # two parts and a half
 

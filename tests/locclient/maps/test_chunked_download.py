@@ -4,8 +4,8 @@ import pytest
 
 from fleetmap.errors import LinkError, UnreachableError
 from fleetmap.messages import PART_BYTES, ChunkRequest, Part, decode_message, encode_message, part_of
-from locclient.maps import chunked_download
-from locclient.maps.chunked_download import ChunkReader
+from locclient.maps import map_client
+from locclient.maps.map_client import ChunkReader
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 DATA = bytes(range(256)) * 3000  # three parts
@@ -69,7 +69,7 @@ def test_row_15_a_server_that_gives_bytes_one_by_one(monkeypatch: pytest.MonkeyP
     with pytest.raises(LinkError, match="1 bytes from byte 0 on of 500"):
         ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
     assert asked == [0]
-    monkeypatch.setattr(chunked_download, "PART_BYTES", 1)  # the control: without the rule it goes on
+    monkeypatch.setattr(map_client, "PART_BYTES", 1)  # the control: without the rule it goes on
     ChunkReader(MemoryBus(hub), timeout_s=0.01, patience_s=0).read("x", max_bytes=500)
     assert len(asked) == 501
 

@@ -9,9 +9,9 @@ import pytest
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import Status, WantedVersion
+from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import PositionBound, PositionBoundTracker, TileSelectionSettings
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
 from support.fleet.estimates import estimate

@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
-from locclient.robot.dock_check import DockCheck
+from locclient.robot.motion_checks import DockCheck
 from support.fleet.estimates import estimate
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.3, 0.0, 1.0]))

@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.geometry import se3
 from fleetmap.sensors.samples import WheelSample
-from locclient.robot.sensor_agreement import WheelAgreement, imu_refused
+from locclient.robot.motion_checks import WheelAgreement, imu_refused
 from support.fleet.estimates import estimate
 
 

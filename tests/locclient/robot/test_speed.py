@@ -8,7 +8,7 @@ import pytest
 from fleetmap.geometry import se3
 from fleetmap.odometry import OdometryStatus
 from fleetmap.sensors.samples import WheelSample
-from locclient.robot.speed import SpeedGauge
+from locclient.robot.motion_checks import SpeedGauge
 from support.fleet.estimates import estimate
 
 

@@ -27,7 +27,6 @@ from fleetmap.occupancy_grid import OccupancyGrid
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.maps.tile_selection import TileSelectionSettings
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
