@@ -50,7 +50,6 @@ class RobotIdentity:
         with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
             if not (folder / "robot.pem").is_file():
                 return None
-        with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
             data = (folder / "identity.json").read_bytes()
         try:
             return cls(folder, msgspec.json.decode(data, type=Identity))

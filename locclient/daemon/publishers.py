@@ -1,8 +1,8 @@
 """Publishers of estimates to the robot's own programs. To add one: a class and a line in PUBLISHERS."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
@@ -13,7 +13,6 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection, completed_for_ros2
-from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import PublishedPose
 
@@ -32,27 +31,27 @@ class PublisherInputs:
     wheel_topic: str = Topics().wheel
 
 
-class Publisher(Protocol):
+class Publisher(ABC):
     """Sends estimates. One that cannot be sent at once is dropped: the next one replaces it."""
 
+    grid_height_m: float | None = None
+    """Height of the robot for whose planners the version's grid is wanted; None where it is not."""
+
+    @abstractmethod
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """Sends this estimate."""
 
-    def alive(self, is_silent: bool) -> None:
+    def alive(self, is_silent: bool) -> None:  # noqa: B027
         """Says once a second that the robot localizes; is_silent: no frames come."""
 
-    @property
-    def grid_height_m(self) -> float | None:
-        """Height of the robot for whose planners the version's grid is wanted; None where it is not."""
-
-    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
+    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:  # noqa: B027
         """The grid of the version that the robot runs now, or why there is none; from any thread."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Takes back what was declared."""
 
 
-class MessagePackPublisher:
+class MessagePackPublisher(Publisher):
     """EstimateMessage under the robot's key `estimate`."""
 
     def __init__(self, inputs: PublisherInputs, _: OutputSection) -> None:
@@ -76,22 +75,10 @@ class MessagePackPublisher:
         )
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
-    def alive(self, is_silent: bool) -> None:
-        """See Publisher; the map server hears of the robot's health by other ways."""
-
-    @property
-    def grid_height_m(self) -> float | None:
-        """See Publisher; nobody listens."""
-        return None
-
-    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
-        """See Publisher; never called."""
-
-    def close(self) -> None:
-        """See Publisher."""
-
 
 def _ros2(inputs: PublisherInputs, section: OutputSection) -> Publisher:
+    from locclient.daemon.ros2_localizer import Ros2Localizer
+
     completed = completed_for_ros2(section, inputs.wheel_topic)
     return Ros2Localizer(inputs.bus, inputs.robot, completed, inputs.calibration, inputs.intake)
 

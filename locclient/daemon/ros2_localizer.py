@@ -49,6 +49,7 @@ from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.intake import Intake
 from locclient.daemon.driver_odometry import DriverOdometry
 from locclient.daemon.output_section import OF_VERSION, OutputSection
+from locclient.daemon.publishers import Publisher
 from locclient.localization.estimate import Estimate
 from locclient.localization.pose_covariance import transport_cov
 from locclient.robot.continuous_odom import PublishedPose
@@ -162,7 +163,7 @@ _MEASURED, _GUESSED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _log = logging.getLogger(__name__)
 
 
-class Ros2Localizer:
+class Ros2Localizer(Publisher):
     """A Publisher whose node shows in the graph from the start, and publishes while it is active.
 
     Localization goes on in every state: an active node has a pose at once. Commands reach the robot through its intake.
@@ -173,6 +174,8 @@ class Ros2Localizer:
     ) -> None:
         """section: from `completed_for_ros2`. Raises UsageError for names that are none, FleetmapError for a grid that cannot be read."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
+        # A file, also one that `load_map` named, stays in the place of the version's grid.
+        self.grid_height_m = section.robot_height_m if section.map == OF_VERSION else None
         is_file = section.map not in {OF_VERSION, ""}
         self._grid = read_grid(Path(section.map)) if is_file else None
         self._map_words = f"file {section.map}" if is_file else "none yet"
@@ -235,7 +238,7 @@ class Ros2Localizer:
     # --- called by the thread that localizes --------------------------------------------------------------------------
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """See Publisher. A pose is sent only with its covariance, and is that of the base in the map."""
+        """A pose is sent only with its covariance, and is that of the base in the map."""
         before, self._last = self._last, (estimate, published)
         if self._state is not LifecycleState.ACTIVE:
             return
@@ -320,13 +323,8 @@ class Ros2Localizer:
             _log.warning("%s", fault or "/tf is whole again")
         return fault
 
-    @property
-    def grid_height_m(self) -> float | None:
-        """See Publisher. A file, also one that `load_map` named, stays in the place of the version's grid."""
-        return self._section.robot_height_m if self._section.map == OF_VERSION else None
-
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
-        """See Publisher. Without a grid the last one stays on the topic: the map's frame is the same in every version."""
+        """Without a grid the last one stays on the topic: the map's frame is the same in every version."""
         if self._map_words.startswith("file "):
             return
         self._map_words = why if grid is None else f"grid of version {version}"

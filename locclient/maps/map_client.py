@@ -43,7 +43,6 @@ from locclient.maps.map_source import (
     address_of,
     checked_manifest,
     checked_tile,
-    collect_tiles,
 )
 from locclient.maps.tile_cache import TileCache
 
@@ -136,6 +135,7 @@ class MapClient(MapSource):
         self._chunks = ChunkReader(RobotQuestions(bus, robot), timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
         self.takes_grids = False  # of planners, where versions have them; a robot localizes without
+        self._away: UnreachableError | None = None  # while tiles are read
         self._begun = ""  # the manifest's address of the version that was admitted last
 
     def require(self, trust: TrustedMap | None) -> None:
@@ -260,23 +260,19 @@ class MapClient(MapSource):
         return self._blob(blob_key(self._site, sha256), sha256, max_bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of the version, from the cache or the server: all, or those of `cells` that it has.
+        """As of MapSource, from the cache or the server. Once nobody answers, only the cache is asked, so that a robot without a
+        network does not wait for every tile."""
+        self._away = None
+        return super().tiles(manifest, cells)
 
-        Never raises for a tile: one that is damaged or does not come is refused with its reason, the rest stays usable.
-        Once nobody answers, only the cache is asked, so that a robot without a network does not wait for every tile.
-        """
-        unreachable: list[UnreachableError] = []
-
-        def blob(entry: TileEntry) -> bytes:
-            if unreachable and entry.sha256 not in self._cache:
-                raise unreachable[0]
-            try:
-                return self.blob(entry.sha256, entry.bytes)
-            except UnreachableError as error:
-                unreachable.append(error)
-                raise
-
-        return collect_tiles(manifest, cells, blob)
+    def _tile_bytes(self, entry: TileEntry) -> bytes:
+        if self._away is not None and entry.sha256 not in self._cache:
+            raise self._away
+        try:
+            return super()._tile_bytes(entry)
+        except UnreachableError as error:
+            self._away = error
+            raise
 
     def _fetch_grid(self, manifest: Manifest) -> None:
         """A version without its grid is as good for the robot as any; what is missing is missing for planners."""

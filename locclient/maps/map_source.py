@@ -4,7 +4,7 @@ import os
 import shlex
 import sqlite3
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,7 +69,19 @@ class MapSource(ABC):
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """Tiles of the version: all, or those of `cells` that it has. One that cannot be used is refused with its reason."""
-        return collect_tiles(manifest, cells, lambda entry: self.blob(entry.sha256))
+        fetched = FetchedTiles()
+        asked = None if cells is None else set(cells)
+        for entry in manifest.tiles:
+            cell = (entry.x, entry.y)
+            if asked is None or cell in asked:
+                try:
+                    fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, self._tile_bytes(entry))
+                except FleetmapError as error:
+                    fetched.refused[cell] = str(error)
+        return fetched
+
+    def _tile_bytes(self, entry: TileEntry) -> bytes:
+        return self.blob(entry.sha256, entry.bytes)
 
 
 class CachedMap(MapSource):
@@ -170,22 +182,6 @@ def checked_manifest(data: bytes, wanted: WantedVersion) -> Manifest:
             f"the manifest is of {manifest.site} version {manifest.version}, wanted was {wanted.site} {wanted.version}"
         )
     return manifest
-
-
-def collect_tiles(
-    manifest: Manifest, cells: Iterable[tuple[int, int]] | None, blob: Callable[[TileEntry], bytes]
-) -> FetchedTiles:
-    """The version's tiles, all or those of `cells`. One that cannot be used is refused with its reason, the others are kept."""
-    fetched = FetchedTiles()
-    asked = None if cells is None else set(cells)
-    for entry in manifest.tiles:
-        cell = (entry.x, entry.y)
-        if asked is None or cell in asked:
-            try:
-                fetched.tiles[cell] = checked_tile(entry, manifest.tile_size_m, blob(entry))
-            except FleetmapError as error:
-                fetched.refused[cell] = str(error)
-    return fetched
 
 
 def checked_tile(entry: TileEntry, size_m: float, data: bytes) -> Tile:

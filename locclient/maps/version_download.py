@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import IO
 from urllib.parse import SplitResult, urlsplit
 
 from fleetmap.bus import is_loopback
@@ -20,13 +20,6 @@ _MIN_BYTES_PER_S = 20_000  # over the whole file, behind _STALL_S: nobody may ho
 
 class TooLargeError(LinkError):
     """A file that is larger than there is room for."""
-
-
-class Target(Protocol):
-    """Something to write into."""
-
-    def write(self, data: bytes, /) -> int:
-        """Writes all of it."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +57,7 @@ class Origins:
         return parts
 
 
-def download(link: str, origins: Origins, target: Target, *, max_bytes: int) -> str:
+def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) -> str:
     """Writes the bytes behind a link into `target` and returns their SHA-256. Redirections are not followed.
 
     Raises LinkError for a link or answer that is refused or longer than max_bytes, UnreachableError where the server does not answer or
@@ -88,7 +81,7 @@ def download(link: str, origins: Origins, target: Target, *, max_bytes: int) -> 
         connection.close()
 
 
-def _receive(answer: http.client.HTTPResponse, link: str, target: Target, max_bytes: int) -> str:
+def _receive(answer: http.client.HTTPResponse, link: str, target: IO[bytes], max_bytes: int) -> str:
     whole, received, begun_s = hashlib.sha256(), 0, time.monotonic()
     if answer.length is not None and answer.length > max_bytes:
         raise TooLargeError(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}")

@@ -9,7 +9,6 @@ from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.samples import PositionPrior
 from support.fleet.scripted_robot import MAP_FROM_ODOM, Robot, off
 
 TWIN = off(0.0, 5.0)
@@ -54,40 +53,28 @@ def test_a_twin_is_told_by_its_signs(sure_robot: Robot, monkeypatch: pytest.Monk
     assert np.linalg.norm(said[-1].map_from_body[:3, 3] - truth) < 0.05
 
 
-def test_signs_of_neither_twin_leave_it_open(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The robot's own aisle is a third one, which is not in the map."""
-    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, None).fix)
-    assert {e.status for e in sure_robot.ride(30, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
-
-
-def test_signs_from_a_standing_robot_are_seen_once(sure_robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same look again and again is no more evidence."""
-    monkeypatch.setattr(sure_robot, "_fix", Signs(sure_robot, 0).fix)
-    said = [sure_robot.go(0.0, [off(0.0), TWIN], turn_rad=0.0) for _ in range(30)]
-    assert {e.status for e in said} == {Status.AMBIGUOUS}
-
-
-def test_signs_tell_nothing_where_the_own_aisle_may_not_be_in_the_map(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("is_whole", "seen", "step_m", "turn_rad"),
+    [
+        (True, None, 0.4, 0.02),  # the robot's own aisle is a third one, which is not in the map
+        (True, 0, 0.0, 0.0),  # a robot that stands: the same look again and again is no more evidence
+        (False, 0, 0.4, 0.02),  # its own aisle may not be in the map
+    ],
+)
+def test_signs_that_leave_it_open(
+    monkeypatch: pytest.MonkeyPatch, is_whole: bool, seen: int | None, step_m: float, turn_rad: float
 ) -> None:
-    robot = Robot(monkeypatch).load()
-    monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
-    assert {e.status for e in robot.ride(20, 0.4, [off(0.0), TWIN])} == {Status.AMBIGUOUS}
-
-
-def told(robot: Robot, place: Array, *, is_revisable: bool) -> None:
-    """A place to half a metre, the robot's own displaced."""
-    map_from_base = robot.map_from_body.copy()
-    map_from_base[:3, 3] += place
-    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, 0.4**2, 0.4**2, 0.25**2])
-    robot.localizer.handle_prior(PositionPrior(0, map_from_base, covariance, is_revisable))
+    robot = Robot(monkeypatch, is_whole_site_mapped=is_whole).load()
+    monkeypatch.setattr(robot, "_fix", Signs(robot, seen).fix)
+    said = [robot.go(step_m, [off(0.0), TWIN], turn_rad) for _ in range(30)]
+    assert {e.status for e in said} == {Status.AMBIGUOUS}
 
 
 @pytest.mark.parametrize("is_whole", [False, True])
 def test_a_person_who_names_the_twin_is_not_believed_at_once(monkeypatch: pytest.MonkeyPatch, is_whole: bool) -> None:
     robot = Robot(monkeypatch, is_whole_site_mapped=is_whole).load()
     monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
-    told(robot, TWIN, is_revisable=True)
+    robot.told(0.4, TWIN, is_whole=True, is_revisable=True)
     said = robot.ride(30, 0.4, [TWIN, off(0.0)])
     assert said[0].status is Status.AMBIGUOUS
     known = [e for e in said if e.status is Status.TRACKING and e.map_from_body is not None]
@@ -105,17 +92,14 @@ def test_a_persons_right_word_needs_fewer_signs(monkeypatch: pytest.MonkeyPatch)
         robot = Robot(monkeypatch, is_whole_site_mapped=True).load()
         monkeypatch.setattr(robot, "_fix", Signs(robot, 0).fix)
         if is_told:
-            told(robot, off(0.0), is_revisable=True)
+            robot.told(0.4, is_whole=True, is_revisable=True)
         said = robot.ride(30, 0.4, [off(0.0), TWIN])
         frames.append(next(n for n, e in enumerate(said) if e.status is Status.TRACKING))
     assert frames[1] < frames[0]
 
 
-def test_a_person_is_believed_where_no_other_place_looks_like_it(sure_robot: Robot) -> None:
-    told(sure_robot, off(0.0), is_revisable=True)
-    assert sure_robot.ride(3, 0.4, [off(0.0)])[0].status is Status.TRACKING
-
-
-def test_a_dock_is_believed_beside_its_twin(sure_robot: Robot) -> None:
-    told(sure_robot, off(0.0), is_revisable=False)
-    assert sure_robot.ride(3, 0.4, [off(0.0), TWIN])[0].status is Status.TRACKING
+@pytest.mark.parametrize(("is_revisable", "places"), [(True, [off(0.0)]), (False, [off(0.0), TWIN])])
+def test_who_is_believed_at_once(sure_robot: Robot, is_revisable: bool, places: list[Array]) -> None:
+    """A person where no other place looks like the one that was named, a dock beside its twin, too."""
+    sure_robot.told(0.4, is_whole=True, is_revisable=is_revisable)
+    assert sure_robot.ride(3, 0.4, places)[0].status is Status.TRACKING

@@ -1,16 +1,12 @@
 """Starts in a map whose places look alike: a robot may be where nothing is mapped. Scripted odometry and fixes."""
 
 from collections.abc import Generator
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
-from fleetmap.geometry import Array
 from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.samples import PositionPrior
 from support.fleet import scripted_robot
 from support.fleet.scripted_robot import NO_FIX, TRUE, Robot, off
 
@@ -25,13 +21,6 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
     return found
 
 
-def prior(robot: Robot, sigma_m: float, offset: Array) -> PositionPrior:
-    map_from_base = robot.map_from_body.copy()
-    map_from_base[:3, 3] += offset
-    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
-    return PositionPrior(0, map_from_base, covariance)
-
-
 def test_what_looks_no_better_than_a_look_alike_is_never_tracked(robot: Robot) -> None:
     """The only place that agrees, metre after metre: as a robot at the end of a hall of which the other end is mapped."""
     said = robot.ride(40, 0.4)
@@ -40,9 +29,16 @@ def test_what_looks_no_better_than_a_look_alike_is_never_tracked(robot: Robot) -
     assert "not in the map" in said[-1].refused
 
 
-def test_what_looks_better_than_any_look_alike_is_tracked(robot: Robot) -> None:
-    robot.landmark_recall = 0.5
-    assert robot.go(0.0).status is Status.TRACKING
+@pytest.mark.parametrize(
+    ("recall", "lookalikes", "is_whole"), [(0.5, LOOK_ALIKES, False), (0.14, None, False), (0.3, LOOK_ALIKES, True)]
+)
+def test_what_no_look_alike_shows_is_tracked(
+    monkeypatch: pytest.MonkeyPatch, recall: float, lookalikes: LookAlikes | None, is_whole: bool
+) -> None:
+    """By more landmarks than any look-alike has, in a map without them, and where the whole site is mapped."""
+    robot = Robot(monkeypatch, is_whole_site_mapped=is_whole).load(lookalikes=lookalikes)
+    robot.landmark_recall = recall
+    assert robot.ride(4, 0.5)[-1].status is Status.TRACKING
 
 
 def test_a_single_good_look_is_not_enough(robot: Robot) -> None:
@@ -53,38 +49,23 @@ def test_a_single_good_look_is_not_enough(robot: Robot) -> None:
         assert robot.go(0.4).status is not Status.TRACKING
 
 
-def test_a_map_without_look_alikes_takes_no_more_than_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot(monkeypatch).load()
-    robot.landmark_recall = 0.14
-    assert robot.ride(4, 0.5)[-1].status is Status.TRACKING
-
-
-def test_where_the_whole_site_is_mapped_there_is_no_unmapped_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    robot = Robot(monkeypatch, is_whole_site_mapped=True).load(lookalikes=LOOK_ALIKES)
-    robot.landmark_recall = 0.3
-    assert robot.ride(4, 0.5)[-1].status is Status.TRACKING
-
-
 @pytest.mark.parametrize(
     ("sigma_m", "status"), [(0.5, Status.TRACKING), (1.0, Status.TRACKING), (5.0, Status.AMBIGUOUS)]
 )
 def test_a_position_resolves_it(robot: Robot, sigma_m: float, status: Status) -> None:
     """A dock or a zone; not one so coarse that a look-alike lies within it."""
-    robot.localizer.handle_prior(prior(robot, sigma_m, off(0.1)))
+    robot.told(sigma_m, off(0.1))
     assert robot.ride(4, 0.5)[-1].status is status
 
 
 def test_a_zone_that_is_passed_later_resolves_it(robot: Robot) -> None:
     assert {e.status for e in robot.ride(10, 0.4)} == {Status.AMBIGUOUS}
-    stamp_ns = robot.frames * 200_000_000
-    robot.localizer.handle_prior(replace(prior(robot, 1.0, off(0.5)), stamp_ns=stamp_ns))
-    said = robot.ride(4, 0.4)[-1]
-    assert said.status is Status.TRACKING
-    assert robot.error_m(said) < 1e-6
+    robot.told(1.0, off(0.5))
+    assert robot.knows(robot.ride(4, 0.4)[-1])
 
 
 def test_a_robot_that_was_carried_away_is_not_believed_at_a_look_alike(robot: Robot) -> None:
-    robot.localizer.handle_prior(prior(robot, 0.3, off(0.0)))
+    robot.told(0.3)
     assert robot.ride(6, 0.4)[-1].status is Status.TRACKING
     robot.map_from_body[:3, 3] += off(-12.0)
     after = robot.ride(20, 0.3, TRUE)

@@ -1,6 +1,6 @@
 """When the localizer says that it knows where it is: scripted odometry and scripted fixes, every status by its cause."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +10,6 @@ import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
-from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import assemble
 from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.settings import TrackSettings
@@ -30,29 +29,32 @@ def tracking(robot: Robot) -> Robot:
     return robot
 
 
-def prior(robot: Robot, sigma_m: float, offset: Array | None = None) -> PositionPrior:
-    map_from_base = robot.map_from_body.copy()
-    map_from_base[:3, 3] += np.zeros(3) if offset is None else offset
-    covariance = np.diag([np.inf, np.inf, np.inf, sigma_m**2, sigma_m**2, np.inf])
-    return PositionPrior(0, map_from_base, covariance)
-
-
 def test_without_a_map_there_is_nothing_to_say(monkeypatch: pytest.MonkeyPatch) -> None:
     estimate = Robot(monkeypatch).go(0.1)
     assert estimate.status is Status.INITIALISING
     assert estimate.map_from_body is estimate.cov_rot_trans is estimate.map_version is estimate.fix is None
 
 
-def test_tracking_takes_three_fixes_however_far_the_way(robot: Robot) -> None:
-    said = [e.status for e in robot.ride(3, 3.0)]
-    assert said == [Status.INITIALISING, Status.INITIALISING, Status.TRACKING]
+I, T, A = Status.INITIALISING, Status.TRACKING, Status.AMBIGUOUS  # noqa: E741
 
 
-def test_tracking_takes_a_metre_however_many_the_fixes(robot: Robot) -> None:
-    said = robot.ride(12, 0.13)  # the first frame stands; 8 steps are 1.04 m
-    assert [e.status for e in said] == [Status.INITIALISING] * 8 + [Status.TRACKING] * 4
-    assert all(e.fix is not None for e in said[:10])
-    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
+@pytest.mark.parametrize(
+    ("step_m", "inliers", "alias_ratio", "places", "said"),
+    [
+        (3.0, 40, 0.1, TRUE, [I, I, T]),  # three fixes, however far the way
+        (0.13, 40, 0.1, TRUE, [I] * 8 + [T] * 4),  # a metre, however many the fixes: the first frame stands
+        (0.0, 100, 0.1, TRUE, [T]),  # one strong fix alone
+        (0.6, 100, 0.55, TRUE, [I, I, T]),  # where the map has a twin of its place it must be confirmed
+        (0.0, 100, 0.1, (off(0.0), off(0.0, 5.0)), [A] * 8),  # a rival is seen beside it
+    ],
+)
+def test_what_tracking_takes(
+    robot: Robot, step_m: float, inliers: int, alias_ratio: float, places: Sequence[Array], said: list[Status]
+) -> None:
+    robot.inliers, robot.relocalizer.alias_ratio = inliers, alias_ratio
+    estimates = robot.ride(len(said), step_m, places)
+    assert [estimate.status for estimate in estimates] == said
+    assert said[-1] is not T or robot.knows(estimates[-1])
 
 
 def test_fixes_that_do_not_agree_never_confirm(robot: Robot) -> None:
@@ -64,59 +66,49 @@ def test_fixes_that_do_not_agree_never_confirm(robot: Robot) -> None:
 
 
 def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
-    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.told(0.5)
     estimate = robot.go(0.0)
-    assert estimate.status is Status.TRACKING
-    assert robot.error_m(estimate) < 1e-6
+    assert robot.knows(estimate)
 
 
 def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
     """Aliased places 12 m apart: the one outside the prior is never believed, the other must still be confirmed."""
-    robot.localizer.handle_prior(prior(robot, 2.0))
+    robot.told(2.0)
     said = [robot.go(0.4, [off(12.0), off(0.0)]) for _ in range(4)]
     assert said[0].status is Status.INITIALISING
-    assert said[-1].status is Status.TRACKING
-    assert robot.error_m(said[-1]) < 1e-6
+    assert robot.knows(said[-1])
 
 
 def test_a_fix_that_a_tight_prior_denies_is_not_believed_before_a_long_way(robot: Robot) -> None:
     """3 m off with 0.3 m of doubt: never while standing; after metres of way the prior is doubted more."""
-    robot.localizer.handle_prior(prior(robot, 0.3, off(3.0)))
+    robot.told(0.3, off(3.0))
     assert {e.status for e in robot.ride(8, 0.0)} == {Status.INITIALISING}
     said = robot.ride(24, 0.4)
     assert {e.status for e in said[:8]} == {Status.INITIALISING}
-    assert said[-1].status is Status.TRACKING
-    assert robot.error_m(said[-1]) < 1e-6
+    assert robot.knows(said[-1])
 
 
 def test_the_way_leads_back_to_the_prior_and_not_to_its_twin(robot: Robot) -> None:
     """Nothing was to be seen for metres, then two places 5 m apart: the robot's own way decides which of them it was."""
-    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.told(0.5)
     robot.ride(8, 0.5, NO_FIX)
     said = [robot.go(0.4, [off(5.0), off(0.0)]) for _ in range(4)]
     assert {e.status for e in said[:2]} == {Status.INITIALISING}
-    assert said[-1].status is Status.TRACKING
-    assert robot.error_m(said[-1]) < 1e-6
+    assert robot.knows(said[-1])
 
 
 def test_a_prior_is_no_longer_tight_after_some_way(robot: Robot) -> None:
     """Two metres without a fix: the next ones must be confirmed as anywhere else."""
-    robot.localizer.handle_prior(prior(robot, 0.5))
+    robot.told(0.5)
     robot.ride(6, 0.4, NO_FIX)
     said = [e.status for e in robot.ride(4, 0.6)]
     assert said == [Status.INITIALISING] * 2 + [Status.TRACKING] * 2
 
 
-def whole_prior(robot: Robot, sigma_m: float, offset: Array) -> PositionPrior:
-    """As a dock tells it: with a heading and a height."""
-    known = prior(robot, sigma_m, offset)
-    return replace(known, cov_rot_trans=np.diag([0.02**2] * 3 + [sigma_m**2] * 3))
-
-
 def test_where_the_map_shows_nothing_a_dock_is_a_place_with_a_covariance(robot: Robot) -> None:
     """An aisle that was surveyed the other way only: never tracking, never silent about what is known."""
     robot.odometry.drift_share = 0.1
-    robot.localizer.handle_prior(whole_prior(robot, 0.1, off(0.1)))
+    robot.told(0.1, off(0.1), is_whole=True)
     for _ in range(6):
         estimate = robot.go(0.5, NO_FIX)
         assert (estimate.status, estimate.cause) == (Status.DEGRADED, Cause.UNMATCHED)
@@ -129,12 +121,11 @@ def test_where_the_map_shows_nothing_a_dock_is_a_place_with_a_covariance(robot: 
 
 
 def test_a_kidnapped_robot_does_not_trust_the_dock_that_it_was_carried_from(tracking: Robot) -> None:
-    tracking.localizer.handle_prior(whole_prior(tracking, 0.1, off(0.0)))
+    tracking.told(0.1, is_whole=True)
     tracking.map_from_body[:3, 3] += off(-8.0)
     after = tracking.ride(9, 0.25)
     assert Status.DEGRADED not in {estimate.status for estimate in after}
-    assert after[-1].status is Status.TRACKING
-    assert tracking.error_m(after[-1]) < 1e-6
+    assert tracking.knows(after[-1])
 
 
 def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) -> None:
@@ -148,8 +139,7 @@ def test_two_places_that_fit_are_ambiguous_until_motion_decides(robot: Robot) ->
     found = sorted(float(np.linalg.norm(h.map_from_body[:3, 3] - robot.map_from_body[:3, 3])) for h in last.hypotheses)
     assert found == pytest.approx([0.0, 5.0], abs=1e-6)
     after = [robot.go(0.4, places[:1]) for _ in range(10)]
-    assert after[-1].status is Status.TRACKING
-    assert robot.error_m(after[-1]) < 1e-6
+    assert robot.knows(after[-1])
 
 
 def test_a_wrong_fix_is_refused_and_said(tracking: Robot) -> None:
@@ -171,8 +161,7 @@ def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(tracking: Rob
     assert said[:2] == [Status.TRACKING] * 2
     assert said[2] is not Status.TRACKING
     after = tracking.ride(6, 0.25)
-    assert after[-1].status is Status.TRACKING
-    assert tracking.error_m(after[-1]) < 1e-6
+    assert tracking.knows(after[-1])
     moved = [estimate.moved_m for estimate in after if estimate.moved_m is not None]
     assert moved == pytest.approx([float(np.linalg.norm(off(-8.0)))], abs=0.1), "told once, when it was sure"
 
@@ -301,26 +290,7 @@ def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.Mo
     """The fixes are those of the frame that was looked at; the robot has turned and moved since."""
     robot = Robot(monkeypatch, fix_interval_s=0.6).load()
     said = [robot.go(0.4, turn_rad=0.2) for _ in range(30)]
-    assert said[-1].status is Status.TRACKING
-    assert all(robot.error_m(e) < 1e-6 for e in said[-1:])
-
-
-def test_one_strong_fix_alone_is_believed(robot: Robot) -> None:
-    robot.inliers = 100
-    estimate = robot.go(0.0)
-    assert estimate.status is Status.TRACKING
-    assert robot.error_m(estimate) < 1e-6
-
-
-def test_a_strong_fix_where_the_map_has_a_twin_must_be_confirmed(robot: Robot) -> None:
-    robot.inliers, robot.relocalizer.alias_ratio = 100, 0.55
-    assert [e.status for e in robot.ride(3, 0.6)] == [Status.INITIALISING] * 2 + [Status.TRACKING]
-
-
-def test_a_strong_fix_with_a_rival_is_not_believed(robot: Robot) -> None:
-    robot.inliers = 100
-    said = robot.ride(8, 0.0, [off(0.0), off(0.0, 5.0)])
-    assert {e.status for e in said} == {Status.AMBIGUOUS}
+    assert robot.knows(said[-1])
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:

@@ -103,60 +103,52 @@ def test_nothing_recorded_is_nothing_claimed() -> None:
             assert metric([]) in (None, 0, {}), name
 
 
-def test_good_tracking_has_no_failures() -> None:
-    assert counts(sequence((20, GOOD))) == (0, 0)
+HALF: dict[str, object] = {"status": D, "fix": False, "sigma_m": 0.05}
+# 0.20 m off; the 99.9 % bound of three dimensions is 4.033 sigmas.
+INSIDE: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.0501}
+OUTSIDE: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.049}
+BOTH: dict[str, object] = {"error_m": 0.5, "sigma_m": 0.01}
+SEARCH = LOST | {"status": I}
+FAILURES: dict[str, tuple[list[tuple[float, dict[str, object]]], object, object]] = {
+    # what happens, for how many seconds each: silent failures, and all failures
+    "good tracking": ([(20, GOOD)], 0, 0),
+    # a stretch lasts to the first good frame: eleven frames at 10 Hz last 1.1 s
+    "wrong for 1.0 s": ([(2, GOOD), (1.0, WRONG), (8, GOOD)], 0, 0),
+    "wrong for 1.1 s": ([(2, GOOD), (1.1, WRONG), (8, GOOD)], 1, 1),
+    "wrong for 4 s": ([(2, GOOD), (4.0, WRONG), (8, GOOD)], 1, 1),
+    "wrong by less than the limit": ([(2, GOOD), (3, {"error_m": 0.29, "sigma_m": 0.5}), (2, GOOD)], 0, 0),
+    "turned by 5.1 degrees": ([(2, GOOD), (3, {"error_deg": 5.1, "sigma_m": 0.5}), (2, GOOD)], 1, 1),
+    "turned by 4.9 degrees": ([(2, GOOD), (3, {"error_deg": 4.9, "sigma_m": 0.5}), (2, GOOD)], 0, 0),
+    "wrong and DEGRADED": ([(2, GOOD), (3, {"error_m": 5.0, "sigma_m": 5.0, "status": D}), (2, GOOD)], 0, 1),
+    "wrong and INITIALISING": ([(2, GOOD), (3, {"error_m": 5.0, "sigma_m": 5.0, "status": I}), (2, GOOD)], 0, 0),
+    "no truth for a while": ([(2, GOOD), (3, {"error_m": None}), (2, GOOD)], 0, 0),
+    "no truth at all": ([(3, {"error_m": None})], None, 0),
+    "four good seconds between": ([(1, GOOD), (2, WRONG), (4, GOOD), (2, WRONG), (1, GOOD)], 1, 1),
+    "six good seconds between": ([(1, GOOD), (2, WRONG), (6, GOOD), (2, WRONG), (1, GOOD)], 2, 2),
+    "lost for 2.0 s": ([(1, GOOD), (2.0, LOST), (2, GOOD)], 0, 0),
+    "lost for 2.2 s": ([(1, GOOD), (2.2, LOST), (2, GOOD)], 0, 1),
+    "ambiguous for 2.2 s": ([(1, GOOD), (2.2, LOST | {"status": A}), (2, GOOD)], 0, 1),
+    "a radius of 0.336 m": ([(1, GOOD), (2.2, HALF | {"sigma_m": 0.12}), (2, GOOD)], 0, 1),  # 2.796 sigmas
+    "a radius of 0.280 m": ([(1, GOOD), (5.0, HALF | {"sigma_m": 0.10}), (2, GOOD)], 0, 0),
+    "searching for 5 s": ([(1, GOOD), (5.0, SEARCH), (2, GOOD)], 0, 0),
+    "lost before the first fix": ([(9, LOST), (2, GOOD)], 0, 0),
+    "a search after blindness": ([(1, GOOD), (60, LOST), (6, GOOD)], 0, 1),
+    "a search, and another soon": ([(25, SEARCH), (3, GOOD), (25, LOST), (6, GOOD)], 0, 1),
+    "a search, and another later": ([(25, SEARCH), (6, GOOD), (25, LOST), (6, GOOD)], 0, 2),
+    "within the bound": ([(1, GOOD), (3, INSIDE), (1, GOOD)], 0, 0),
+    "beyond the bound": ([(1, GOOD), (3, OUTSIDE), (1, GOOD)], 0, 1),
+    "beyond the bound for 0.9 s": ([(1, GOOD), (0.9, OUTSIDE), (1, GOOD)], 0, 0),
+    "two kinds at once": ([(1, GOOD), (3, BOTH), (8, GOOD)], 1, 1),
+    "two kinds in a row": ([(1, GOOD), (3, LOST), (3, WRONG), (8, GOOD)], 1, 1),
+    "two kinds apart": ([(1, GOOD), (3, LOST), (8, GOOD), (3, WRONG)], 1, 2),
+    "half-trust between": ([(2, GOOD), (3, LOST), (6, HALF), (3, LOST), (6, GOOD)], 0, 1),
+}
 
 
-@pytest.mark.parametrize(("seconds", "failures"), [(0.9, 0), (1.0, 0), (1.1, 1), (4.0, 1)])
-def test_wrong_tracking_is_silent_after_a_second(seconds: float, failures: int) -> None:
-    """A stretch lasts to the first good frame: eleven frames at 10 Hz last 1.1 s."""
-    assert counts(sequence((2, GOOD), (seconds, WRONG), (8, GOOD))) == (failures, failures)
-
-
-@pytest.mark.parametrize(
-    ("kind", "failures"),
-    [
-        ({"error_m": 0.29, "sigma_m": 0.5}, 0),
-        ({"error_m": 0.0, "error_deg": 5.1, "sigma_m": 0.5}, 1),
-        ({"error_m": 0.0, "error_deg": 4.9, "sigma_m": 0.5}, 0),
-        ({"error_m": 5.0, "sigma_m": 5.0, "status": D}, 0),
-        ({"error_m": 5.0, "sigma_m": 5.0, "status": I}, 0),
-        ({"error_m": None}, 0),
-    ],
-)
-def test_only_wrong_tracking_is_silent(kind: dict[str, object], failures: int) -> None:
-    assert counts(sequence((2, GOOD), (3, kind), (2, GOOD)))[0] == failures
-
-
-def test_without_any_truth_silence_is_unknown() -> None:
-    frames = sequence((3, {"error_m": None}))
-    assert counts(frames) == (None, 0)
-
-
-def test_a_failure_ends_after_five_good_seconds() -> None:
-    near = sequence((1, GOOD), (2, WRONG), (4, GOOD), (2, WRONG), (1, GOOD))
-    far = sequence((1, GOOD), (2, WRONG), (6, GOOD), (2, WRONG), (1, GOOD))
-    assert counts(near) == (1, 1)
-    assert counts(far) == (2, 2)
-
-
-@pytest.mark.parametrize(
-    ("kind", "seconds", "failures"),
-    [
-        (LOST, 2.0, 0),
-        (LOST, 2.2, 1),
-        (LOST | {"status": A}, 2.2, 1),
-        ({"status": D, "fix": False, "sigma_m": 0.12}, 2.2, 1),  # 95 % within 2.796 sigmas: 0.336 m
-        ({"status": D, "fix": False, "sigma_m": 0.10}, 5.0, 0),  # 0.280 m
-        (LOST | {"status": I}, 5.0, 0),
-    ],
-)
-def test_blindness_is_a_failure_after_two_seconds(kind: dict[str, object], seconds: float, failures: int) -> None:
-    assert counts(sequence((1, GOOD), (seconds, kind), (2, GOOD))) == (0, failures)
-
-
-def test_blindness_counts_from_the_first_fix_only() -> None:
-    assert counts(sequence((9, LOST), (2, GOOD)))[1] == 0
+@pytest.mark.parametrize("what", FAILURES)
+def test_failures(what: str) -> None:
+    stretches, silent, failures = FAILURES[what]
+    assert counts(sequence(*stretches)) == (silent, failures)
 
 
 @pytest.mark.parametrize(
@@ -180,12 +172,6 @@ def test_a_robot_that_never_finds_itself_fails(kind: dict[str, object], seconds:
     assert METRICS["not_localised_share"](frames) in ({None} if kind.get("speed_mps") == 0.0 else {1.0})
 
 
-def test_a_search_that_lasts_is_one_failure_with_the_blindness_before() -> None:
-    assert counts(sequence((1, GOOD), (60, LOST), (6, GOOD)))[1] == 1
-    assert counts(sequence((25, LOST | {"status": I}), (3, GOOD), (25, LOST), (6, GOOD)))[1] == 1
-    assert counts(sequence((25, LOST | {"status": I}), (6, GOOD), (25, LOST), (6, GOOD)))[1] == 2
-
-
 @pytest.mark.parametrize("share", [0.809, 0.336, 0.0])
 def test_the_share_that_leads_is_of_all_frames(share: float) -> None:
     """Seen: 99.6 %, 100 % and nothing at all for runs in which 80.9 %, 33.6 % and none of the frames were localised."""
@@ -204,22 +190,6 @@ def test_time_not_localised_is_a_share_of_the_driving() -> None:
     assert METRICS["not_localised_share"](frames) == pytest.approx(0.5, abs=0.01)
 
 
-def test_overconfidence_is_a_failure_though_not_silent() -> None:
-    """0.20 m off; the 99.9 % bound of three dimensions is 4.033 sigmas."""
-    inside: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.0501}
-    outside: dict[str, object] = {"error_m": 0.2, "sigma_m": 0.049}
-    assert counts(sequence((1, GOOD), (3, inside), (1, GOOD))) == (0, 0)
-    assert counts(sequence((1, GOOD), (3, outside), (1, GOOD))) == (0, 1)
-    assert counts(sequence((1, GOOD), (0.9, outside), (1, GOOD))) == (0, 0)
-
-
-def test_different_failures_at_once_count_once() -> None:
-    both: dict[str, object] = {"error_m": 0.5, "sigma_m": 0.01}
-    assert counts(sequence((1, GOOD), (3, both), (8, GOOD))) == (1, 1)
-    assert counts(sequence((1, GOOD), (3, LOST), (3, WRONG), (8, GOOD))) == (1, 1)
-    assert counts(sequence((1, GOOD), (3, LOST), (8, GOOD), (3, WRONG))) == (1, 2)
-
-
 def test_between_sparse_frames_nothing_better_is_known() -> None:
     """2.5 s apart: one lost frame is 2.5 s without a place, one wrong fix 2.5 s in the wrong place."""
     kinds: list[dict[str, object]] = [{"status": L}, {"status": L}, LOST, {"status": L}, {"status": L}]
@@ -236,15 +206,6 @@ def test_the_radius_holds_95_percent() -> None:
     inside = np.linalg.norm(samples, axis=1) < radius_95_m(frame(0, sigma_m=0.05).cov_rot_trans)
     assert inside.mean() == pytest.approx(0.95, abs=0.005)
     assert radius_95_m(None) == np.inf
-
-
-def test_a_failure_ends_only_after_five_seconds_of_good_tracking() -> None:
-    """Lost, then six seconds of half-trust, then lost again is one failure; with six good seconds between, two."""
-    half: dict[str, object] = {"status": D, "fix": False, "sigma_m": 0.05}
-    one = sequence((2, GOOD), (3, LOST), (6, half), (3, LOST), (6, GOOD))
-    two = sequence((2, GOOD), (3, LOST), (6, GOOD), (3, LOST), (6, GOOD))
-    assert counts(one)[1] == 1
-    assert counts(two)[1] == 2
 
 
 def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: float = 1.0) -> ReplayResult:

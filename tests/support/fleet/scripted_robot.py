@@ -10,11 +10,13 @@ import pytest
 
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.messages import Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import PositionPrior
 from locclient.localization import localizer as module
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
@@ -149,6 +151,21 @@ class Robot:
             alias_ratio=self.relocalizer.alias_ratio,
             landmark_recall=self.landmark_recall,
         )
+
+    def knows(self, estimate: Estimate) -> bool:
+        """Whether it is tracking, and where it truly is."""
+        return estimate.status is Status.TRACKING and self.error_m(estimate) < 1e-6
+
+    def told(
+        self, sigma_m: float, offset: Array = TRUE[0], *, is_whole: bool = False, is_revisable: bool = False
+    ) -> None:
+        """A prior at its own place displaced: of the position alone, or with heading and height."""
+        map_from_base = self.map_from_body.copy()
+        map_from_base[:3, 3] += offset
+        unknown = 0.02**2 if is_whole else np.inf
+        covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, sigma_m**2 if is_whole else np.inf])
+        prior = PositionPrior(self.frames * FRAME_NS, map_from_base, covariance, is_revisable)
+        self.localizer.handle_prior(prior)
 
     def error_m(self, estimate: Estimate) -> float:
         assert estimate.map_from_body is not None
