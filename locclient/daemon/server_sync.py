@@ -14,7 +14,7 @@ from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
-from locclient.robot.robot import Change, VersionChange
+from locclient.robot.version_trial import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
 _UPKEEP_EVERY_S = 3600.0

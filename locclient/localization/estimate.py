@@ -84,7 +84,7 @@ def assemble(
     prior: the pose by the prior and the motion since. has_failed: the last map query found no fix.
     """
     if confirmed is not None:
-        return _of_confirmed(estimate, confirmed, has_failed, settings)
+        return _of_confirmed(estimate, confirmed, candidates.hypotheses, has_failed, settings)
     ranking, competitors = candidates.ranking()
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
     status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
@@ -100,7 +100,13 @@ def assemble(
     return _with_pose(estimate, prior, settings)
 
 
-def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: bool, settings: TrackSettings) -> Estimate:
+def _of_confirmed(
+    estimate: Estimate,
+    confirmed: PoseHypothesis,
+    elsewhere: Sequence[PoseHypothesis],
+    has_failed: bool,
+    settings: TrackSettings,
+) -> Estimate:
     is_known = not np.isnan(confirmed.now_map_from_body).any()
     radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
@@ -121,9 +127,9 @@ def _of_confirmed(estimate: Estimate, confirmed: PoseHypothesis, has_failed: boo
     else:
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
-    is_told = any(h.speaks_against_others(settings) for h in confirmed.kidnap_hypotheses)
+    is_told = any(h.speaks_against_others(settings) for h in elsewhere)
     if status is not Status.TRACKING and is_told:  # it may be at either
-        places = _published([confirmed, *confirmed.kidnap_hypotheses])
+        places = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     return _with_pose(estimate, confirmed, settings)
 

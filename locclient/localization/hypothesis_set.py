@@ -150,7 +150,9 @@ _MAX_WRONG_SHARE = 0.05  # of unmapped places that may be believed by weak fixes
 
 
 class HypothesisSet:
-    """Competing pose hypotheses, and the pose that was abandoned for them. hypotheses: in the order of their first fixes.
+    """Competing pose hypotheses: candidates while no pose is confirmed, else the places that refused fixes name.
+
+    hypotheses: in the order of their first fixes. abandoned: the confirmed pose that was given up for them.
 
     Source: multiple hypothesis tracking (Reid 1979), of a single target and without branching.
     """
@@ -159,31 +161,31 @@ class HypothesisSet:
         self._settings = settings
         self.hypotheses: list[PoseHypothesis] = []
         self._disambiguated: PoseHypothesis | None = None
-        self._abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
+        self.abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
         self.lookalikes: LookAlikes | None = None  # None where nobody measured them
 
     def tracked(self) -> list[PoseHypothesis]:
-        return [*self.hypotheses, *([self._abandoned] if self._abandoned else [])]
+        return [*self.hypotheses, *([self.abandoned] if self.abandoned else [])]
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
         self._viewpoint_gate.redefine_odom(new_odom_from_old_odom)
 
-    def reset(self, abandoned: PoseHypothesis | None = None, hypotheses: Sequence[PoseHypothesis] = ()) -> None:
-        """Starts over with these hypotheses, for which the confirmed pose was abandoned; with none after one is confirmed."""
-        self._abandoned, self.hypotheses, self._disambiguated = abandoned, list(hypotheses), None
+    def reset(self) -> None:
+        """Starts over without any."""
+        self.hypotheses, self.abandoned, self._disambiguated = [], None, None
 
-    def observe(self, observations: Observations, hypotheses: list[PoseHypothesis], odom_from_body: Array) -> None:
-        """One query: every fix votes for one of `hypotheses`, or founds one."""
+    def observe(self, observations: Observations, odom_from_body: Array) -> None:
+        """One query: every fix votes for a hypothesis, or founds one; those without votes for long are dropped."""
         is_new = self._viewpoint_gate.is_new(odom_from_body)
-        begin_query(hypotheses, self._settings, is_new_viewpoint=is_new)
+        begin_query(self.hypotheses, self._settings, is_new_viewpoint=is_new)
         for fix, fresh in observations:
-            vote(hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
+            vote(self.hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
+        self.hypotheses = recent(self.hypotheses, self._settings)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
-        """Votes, pruning and disambiguation by one query; in time slices."""
-        self.observe(observations, self.hypotheses, odom_from_body)
-        self.hypotheses = recent(self.hypotheses, self._settings)
+        """As `observe`, and disambiguation; in time slices."""
+        self.observe(observations, odom_from_body)
         self._disambiguated = yield from disambiguated(self.hypotheses, self._settings)
 
     def ranking(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
@@ -209,9 +211,9 @@ class HypothesisSet:
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
         """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""
-        if self._abandoned is None:
+        if self.abandoned is None:
             return None
-        error = boxminus(hypothesis.now_map_from_body, self._abandoned.now_map_from_body)
-        covariance = hypothesis.now_cov + self._abandoned.now_cov
+        error = boxminus(hypothesis.now_map_from_body, self.abandoned.now_map_from_body)
+        covariance = hypothesis.now_cov + self.abandoned.now_cov
         is_beyond = error @ np.linalg.solve(covariance, error) > self._settings.innovation_limit
         return float(np.linalg.norm(error[3:])) if is_beyond else None

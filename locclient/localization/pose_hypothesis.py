@@ -35,8 +35,7 @@ class PoseHypothesis:
     fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: that a person who named its
-    place is right, 0 where nobody did. has_broken: tracks broke since the last fix. kidnap_hypotheses: places that rejected fixes
-    name instead.
+    place is right, 0 where nobody did. has_broken: tracks broke since the last fix.
     """
 
     frame_index: int
@@ -59,7 +58,6 @@ class PoseHypothesis:
     travelled_m: float = 0.0
     told_log_odds: float = 0.0
     has_broken: bool = False
-    kidnap_hypotheses: list["PoseHypothesis"] = field(default_factory=list)
     history: ObservationHistory = field(default_factory=ObservationHistory)
 
     @classmethod

@@ -12,7 +12,7 @@ from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix, is_reliable
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import QueryResult
-from locclient.localization.hypothesis_set import HypothesisSet, Observations, recent
+from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
 from locclient.localization.pose_covariance import innovation_of, kalman_update, transport_cov
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
@@ -64,7 +64,7 @@ class PoseTracker:
         self.body_from_cam, self._base_from_body = body_from_cam, base_from_body
         self._cam_from_body = se3_inverse(body_from_cam)
         self.prior: InitialPosePrior | None = None
-        self.candidates = HypothesisSet(settings.track)  # while none is confirmed
+        self.candidates = HypothesisSet(settings.track)
         self.confirmed: PoseHypothesis | None = None
         self.was_tracking = False
         self.lookalikes: LookAlikes | None = None
@@ -156,7 +156,7 @@ class PoseTracker:
     def _tracked(self) -> list[PoseHypothesis]:
         found = [*self.candidates.tracked(), *([] if self.prior is None else self.prior.tracked())]
         if self.confirmed is not None:
-            found += [self.confirmed, *self.confirmed.kidnap_hypotheses]
+            found.append(self.confirmed)
         return found if self._query_frame is None else [*found, self._query_frame]
 
     # --- fixes of a map query -----------------------------------------------------------------------------------------
@@ -225,16 +225,16 @@ class PoseTracker:
         updated = kalman_update(map_from_body, covariance, error, cov_fix)
         self.confirmed = PoseHypothesis.at_query(self._query_frame, *updated)
         self.confirmed.support = confirmed.support + 1
+        self.candidates.reset()
         return QueryResult(fix, "", innovation, off_m)
 
     def _detect_kidnapping(self, fixes: list[Fix], confirmed: PoseHypothesis) -> None:
         """Abandons the confirmed pose when refused fixes agree with each other query after query; theirs must be confirmed anew."""
         assert self.odom_from_body is not None
-        self.candidates.observe(self.observations(fixes), confirmed.kidnap_hypotheses, self.odom_from_body)
-        hypotheses = confirmed.kidnap_hypotheses = recent(confirmed.kidnap_hypotheses, self._track)
-        telling = [h.support for h in hypotheses if h.speaks_against_others(self._track)]
+        self.candidates.observe(self.observations(fixes), self.odom_from_body)
+        telling = [h.support for h in self.candidates.hypotheses if h.speaks_against_others(self._track)]
         if max(telling, default=0) >= self._track.kidnap_fixes:
-            self.candidates.reset(confirmed, hypotheses)
+            self.candidates.abandoned = confirmed
             self.confirmed = None
             self.prior = None  # it led to that pose
 

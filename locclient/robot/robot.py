@@ -1,15 +1,13 @@
 """One robot, frame by frame: localization, detection of failures, trials of new map versions. Pure."""
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.manifest import building_frame
-from fleetmap.messages import Cause, Flag, PoseMessage, Status, WantedVersion
+from fleetmap.messages import Cause, Flag, PoseMessage, Status
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -30,26 +28,9 @@ from locclient.robot.motion_checks import (
     accelerometer_refused,
     imu_refused,
 )
-from locclient.robot.version_trial import TrialSettings, TrialVerdict, VersionTrial
+from locclient.robot.version_trial import TrialSettings, VersionChange, VersionTrials
 
 Clock = Callable[[], float]  # seconds
-
-
-class Change(StrEnum):
-    """Result of a version's trial."""
-
-    ADOPTED = "adopted"
-    REFUSED = "refused"
-    POSTPONED = "postponed"
-
-
-@dataclass(frozen=True, slots=True)
-class VersionChange:
-    """A version that was adopted, refused for good, or postponed because nothing could be seen; reason in words."""
-
-    wanted: WantedVersion
-    change: Change
-    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,21 +76,6 @@ class Outcome:
         return PoseMessage.of(estimate.stamp_ns, map_from_base, cov, estimate.status, estimate.map_version)
 
 
-@dataclass
-class _Versions:
-    """good: the version whose fixes were confirmed; candidate: the one on trial.
-
-    is_recheck: the candidate failed for candidate_reason, and the good version is tried again at the same place.
-    """
-
-    good: LoadedMap | None = None
-    candidate: LoadedMap | None = None
-    trial: VersionTrial | None = None
-    is_recheck: bool = False
-    candidate_reason: str = ""
-    changes: deque[VersionChange] = field(default_factory=deque)
-
-
 class Robot:
     """Feeds sensor bundles and maps to the localizer and keeps two versions while one of them is on trial."""
 
@@ -129,8 +95,7 @@ class Robot:
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
         self.localizer = Localizer(calibration, *mounting, settings, clock_s)
         self.ring = FailureRing() if keeps_replay else None
-        self._trial_settings = trial
-        self._versions = _Versions()
+        self._versions = VersionTrials(trial, self._show)
         self._odom = ContinuousOdom(calibration.base_from_body)
         self.monitor = FailureMonitor()
         self._docks = DockCheck(calibration.base_from_body)
@@ -146,37 +111,20 @@ class Robot:
     @property
     def held(self) -> list[LoadedMap]:
         """The versions in memory, the confirmed one first."""
-        return [loaded for loaded in (self._versions.good, self._versions.candidate) if loaded is not None]
+        return self._versions.held
 
     @property
     def running(self) -> LoadedMap | None:
-        versions = self._versions
-        return versions.good if versions.candidate is None or versions.is_recheck else versions.candidate
+        return self._versions.running
 
     def take_changes(self) -> list[VersionChange]:
         """Changes of versions since the last call."""
-        taken = list(self._versions.changes)
-        self._versions.changes.clear()
+        taken, self._versions.changes = self._versions.changes, []
         return taken
 
     def use(self, loaded: LoadedMap) -> None:
         """Takes other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
-        versions = self._versions
-        for name in ("good", "candidate"):
-            held = getattr(versions, name)
-            if held is not None and held.wanted == loaded.wanted:
-                setattr(versions, name, loaded)
-                if self.running is loaded:
-                    self._show(loaded)
-                return
-        if not loaded.is_offer:
-            return  # the version was given up while its tiles were read
-        if versions.good is None:
-            versions.good = loaded
-            versions.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))
-        else:
-            versions.candidate, versions.trial, versions.is_recheck = loaded, self._new_trial(), False
-        self._show(loaded)
+        self._versions.use(loaded)
 
     def align(self, frame: BuildingFrame | None) -> None:
         """Where the site's map lies in its building, whatever versions say of it; None: each version says it."""
@@ -206,7 +154,8 @@ class Robot:
         estimate = self.localizer.handle_stereo(frame)
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
-        self._try(estimate, frame)
+        self._last = (frame, estimate)
+        self._versions.handle(estimate)
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
@@ -270,43 +219,3 @@ class Robot:
     def _place_in_building(self) -> None:
         frame = self._aligned or self._of_version
         self._building_from_map = None if frame is None else frame.building_from_map
-
-    def _new_trial(self) -> VersionTrial | None:
-        """Begins at the last frame of the version before; None without one, then at the next frame."""
-        return None if self._last is None else VersionTrial(self._trial_settings, self._last[1])
-
-    def _try(self, estimate: Estimate, frame: RectifiedFrame) -> None:
-        """Counts the frame for the running trial, if any."""
-        self._last = (frame, estimate)
-        versions = self._versions
-        if versions.candidate is None:
-            return
-        if versions.trial is None:
-            versions.trial = VersionTrial(self._trial_settings, estimate)
-        verdict = versions.trial.handle(estimate)
-        if verdict is TrialVerdict.UNDECIDED:
-            return
-        if versions.is_recheck:
-            self._end_recheck(verdict)
-        elif verdict is TrialVerdict.CONFIRMED:
-            versions.changes.append(VersionChange(versions.candidate.wanted, Change.ADOPTED))
-            self._versions = replace(versions, good=versions.candidate, candidate=None, trial=None)
-        else:
-            assert versions.good is not None
-            self._show(versions.good)
-            reason, trial = versions.trial.reason, self._new_trial()
-            self._versions = replace(versions, trial=trial, is_recheck=True, candidate_reason=reason)
-
-    def _end_recheck(self, verdict: TrialVerdict) -> None:
-        """The candidate is refused where the good version gives fixes, else postponed: nothing could be seen."""
-        versions = self._versions
-        assert versions.candidate is not None
-        assert versions.good is not None
-        failed = f"of version {versions.candidate.version} {versions.candidate_reason}"
-        if verdict is TrialVerdict.CONFIRMED:
-            change, reason = Change.REFUSED, f"{failed}, where version {versions.good.version} gives fixes"
-        else:
-            change = Change.POSTPONED
-            reason = f"{failed}, and version {versions.good.version} gives no fixes either; it is tried again later"
-        versions.changes.append(VersionChange(versions.candidate.wanted, change, reason))
-        self._versions = replace(versions, candidate=None, trial=None, is_recheck=False)

@@ -1,13 +1,16 @@
 """Trial of a new map version before it replaces the one that a robot runs. Pure."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from fleetmap.config import Section
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.messages import Status
+from fleetmap.messages import Status, WantedVersion
 from locclient.localization.estimate import Estimate
+from locclient.maps.loaded_map import LoadedMap
 
 _DRIFT_SHARE = 0.02  # of the distance travelled, several times the odometry's drift
 
@@ -20,6 +23,23 @@ class TrialSettings(Section, frozen=True):
     agreement_m: float = 0.3
     patience_s: float = 20.0
     retry_s: float = 600.0
+
+
+class Change(StrEnum):
+    """Result of a version's trial."""
+
+    ADOPTED = "adopted"
+    REFUSED = "refused"
+    POSTPONED = "postponed"
+
+
+@dataclass(frozen=True, slots=True)
+class VersionChange:
+    """A version that was adopted, refused for good, or postponed because nothing could be seen; reason in words."""
+
+    wanted: WantedVersion
+    change: Change
+    reason: str = ""
 
 
 class TrialVerdict(StrEnum):
@@ -81,3 +101,79 @@ class VersionTrial:
             return 0.0
         predicted = self._map_from_odom @ odometry.odom_from_body
         return float(np.linalg.norm(estimate.map_from_body[:3, 3] - predicted[:3, 3]))
+
+
+class VersionTrials:
+    """Two versions while one of them is on trial.
+
+    good: the version whose fixes were confirmed; candidate: the one on trial. Where the candidate fails, the good version is tried again at
+    the same place: the candidate is refused where that gives fixes, else postponed, because nothing could be seen.
+    """
+
+    def __init__(self, settings: TrialSettings, show: Callable[[LoadedMap], None]) -> None:
+        """show: gives a version to the localizer."""
+        self._settings, self._show = settings, show
+        self._good: LoadedMap | None = None
+        self._candidate: LoadedMap | None = None
+        self._trial: VersionTrial | None = None
+        self._failed_reason: str | None = None  # of the candidate, while the good version is tried again
+        self._last: Estimate | None = None
+        self.changes: list[VersionChange] = []
+
+    @property
+    def held(self) -> list[LoadedMap]:
+        return [loaded for loaded in (self._good, self._candidate) if loaded is not None]
+
+    @property
+    def running(self) -> LoadedMap | None:
+        return self._good if self._candidate is None or self._failed_reason is not None else self._candidate
+
+    def use(self, loaded: LoadedMap) -> None:
+        """Takes other tiles of a held version, or a new version."""
+        if self._good is not None and self._good.wanted == loaded.wanted:
+            self._good = loaded
+        elif self._candidate is not None and self._candidate.wanted == loaded.wanted:
+            self._candidate = loaded
+        elif not loaded.is_offer:
+            return  # the version was given up while its tiles were read
+        elif self._good is None:
+            self._good = loaded
+            self.changes.append(VersionChange(loaded.wanted, Change.ADOPTED))
+        else:
+            self._candidate, self._failed_reason = loaded, None
+            self._begin_trial()
+        if self.running is loaded:
+            self._show(loaded)
+
+    def handle(self, estimate: Estimate) -> None:
+        """Counts a frame for the trial, if there is one."""
+        self._last = estimate
+        if self._candidate is None or self._good is None:
+            return
+        if self._trial is None:
+            self._begin_trial()
+        assert self._trial is not None
+        verdict = self._trial.handle(estimate)
+        if verdict is TrialVerdict.UNDECIDED:
+            return
+        is_confirmed = verdict is TrialVerdict.CONFIRMED
+        if self._failed_reason is not None:
+            failed = f"of version {self._candidate.version} {self._failed_reason}"
+            good = f"version {self._good.version}"
+            change = Change.REFUSED if is_confirmed else Change.POSTPONED
+            none = f"{failed}, and {good} gives no fixes either; it is tried again later"
+            reason = f"{failed}, where {good} gives fixes" if is_confirmed else none
+            self.changes.append(VersionChange(self._candidate.wanted, change, reason))
+        elif is_confirmed:
+            self.changes.append(VersionChange(self._candidate.wanted, Change.ADOPTED))
+            self._good = self._candidate
+        else:
+            self._failed_reason = self._trial.reason
+            self._show(self._good)
+            self._begin_trial()
+            return
+        self._candidate = self._trial = self._failed_reason = None
+
+    def _begin_trial(self) -> None:
+        """At the last frame of the version before; without one, at the next frame."""
+        self._trial = None if self._last is None else VersionTrial(self._settings, self._last)

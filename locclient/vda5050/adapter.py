@@ -15,7 +15,8 @@ from fleetmap.failure_definition import is_driving
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
-from locclient.robot.robot import Change, Outcome, VersionChange
+from locclient.robot.robot import Outcome
+from locclient.robot.version_trial import Change, VersionChange
 from locclient.vda5050.actions import MAP_ACTIONS, PARAMETERS, ActionBook, parameters
 from locclient.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
 from locclient.vda5050.localization import Localization, Position

@@ -334,7 +334,6 @@ def test_a_pose_of_nan_is_none(broken: str) -> None:
         "now_map_from_body": np.eye(4),
         "stamp_ns": 0,
         "has_broken": False,
-        "kidnap_hypotheses": [],
     }
     values[broken] = values[broken] * np.nan
     hypothesis: Any = SimpleNamespace(**values)

@@ -29,7 +29,7 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
-from locclient.robot.robot import Change, VersionChange
+from locclient.robot.version_trial import Change, VersionChange
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment

@@ -11,7 +11,8 @@ import pytest
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import Status
-from locclient.robot.robot import Change, Robot
+from locclient.robot.robot import Robot
+from locclient.robot.version_trial import Change
 from mapserver.store import MapStore
 from support.worlds import robot_world
 

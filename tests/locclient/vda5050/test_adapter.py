@@ -262,7 +262,7 @@ def test_others_actions_repeated_actions_and_floods() -> None:
 
 
 def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
-    from locclient.robot.robot import Change, VersionChange
+    from locclient.robot.version_trial import Change, VersionChange
 
     adapter = Adapter()
     assert adapter.ask(name="a", mapId="hall", mapVersion="1")["actionStatus"] == "FINISHED", "it is enabled already"
