@@ -25,7 +25,7 @@ from benchmarks.fleet.server_process import SITE, measured, serving
 from fleetmap.bus import Bus
 from fleetmap.mapformat import Manifest, Tile, decode_manifest, decode_tile, verified
 from fleetmap.messages import WantedVersion, blob_key, decode_message, manifest_key, robot_key
-from locclient.maps.chunked_download import ChunkReader
+from locclient.maps.map_client import ChunkReader
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
 from support.storage.map_samples import draft_details, random_tile

@@ -7,6 +7,8 @@ Run with NUMBA_BOUNDSCHECK=1, so that a kernel that reads beside an array raises
 
 import copy
 import sys
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +39,6 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Any:
     else:
         for key in value if isinstance(value, dict) else range(len(value)):
             yield from leaves(value[key], (*path, key))
-
-
-def at(value: Any, path: tuple[Any, ...]) -> Any:
-    """What lies at a path."""
-    for key in path:
-        value = value[key]
-    return value
 
 
 def spoiled(draw: st.DrawFn, value: Any) -> Any:
@@ -98,7 +93,9 @@ def main(failure: Path, store: Path) -> None:
     def arbitrary(data: st.DataObject) -> None:
         changed = copy.deepcopy(state)
         path = data.draw(st.sampled_from(data.draw(st.sampled_from(list(by_name.values())))))
-        at(changed, path[:-1])[path[-1]] = data.draw(st.composite(lambda draw: spoiled(draw, at(changed, path)))())
+        reduce(getitem, path[:-1], changed)[path[-1]] = data.draw(
+            st.composite(lambda draw: spoiled(draw, reduce(getitem, path, changed)))()
+        )
         play(changed)
 
     arbitrary()

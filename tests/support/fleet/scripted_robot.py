@@ -89,14 +89,7 @@ class ScriptedRelocalizer:
         close = [f for f in seen if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
         return close[0] if close else None
 
-    def anywhere(
-        self,
-        seen: list[Fix],
-        allowed: object = None,
-        rotation: object = None,
-        found: object = (),
-        failed: object = None,
-    ) -> Generator[None, None, list[Fix]]:
+    def anywhere(self, seen: list[Fix], *_: object) -> Generator[None, None, list[Fix]]:
         yield
         return list(seen)
 
@@ -108,9 +101,8 @@ class Robot:
         self.relocalizer = ScriptedRelocalizer()
         monkeypatch.setattr(module, "MapView", lambda *_: None)
         monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
-        lens = CameraCalibration(
-            "radial-tangential", 640, 480, np.array([400, 400, 320, 240.0]), np.zeros(4), BODY_FROM_CAM
-        )
+        focal = np.array([400, 400, 320, 240.0])
+        lens = CameraCalibration("radial-tangential", 640, 480, focal, np.zeros(4), BODY_FROM_CAM)
         camera = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
         settings = LocalizerSettings(track=TrackSettings(**track))
         self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
@@ -143,14 +135,9 @@ class Robot:
     def _fix(self, offset: Array) -> Fix:
         moved = self.map_from_body.copy()
         moved[:3, 3] += offset
-        return Fix(
-            moved @ BODY_FROM_CAM,
-            np.diag([0.002**2] * 3 + [0.01**2] * 3),
-            self.inliers,
-            20,
-            alias_ratio=self.relocalizer.alias_ratio,
-            landmark_recall=self.landmark_recall,
-        )
+        covariance = np.diag([0.002**2] * 3 + [0.01**2] * 3)
+        about = {"alias_ratio": self.relocalizer.alias_ratio, "landmark_recall": self.landmark_recall}
+        return Fix(moved @ BODY_FROM_CAM, covariance, self.inliers, 20, **about)
 
     def knows(self, estimate: Estimate) -> bool:
         """Whether it is tracking, and where it truly is."""
@@ -164,8 +151,7 @@ class Robot:
         map_from_base[:3, 3] += offset
         unknown = 0.02**2 if is_whole else np.inf
         covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, sigma_m**2 if is_whole else np.inf])
-        prior = PositionPrior(self.frames * FRAME_NS, map_from_base, covariance, is_revisable)
-        self.localizer.handle_prior(prior)
+        self.localizer.handle_prior(PositionPrior(self.frames * FRAME_NS, map_from_base, covariance, is_revisable))
 
     def error_m(self, estimate: Estimate) -> float:
         assert estimate.map_from_body is not None
