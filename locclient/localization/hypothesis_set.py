@@ -1,4 +1,4 @@
-"""Pose hypotheses from the first fix until one is confirmed. Pure."""
+"""Competing pose hypotheses: voted for by fixes, ranked, told apart, confirmed. Pure."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -15,144 +15,17 @@ from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 _PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
-
-
-def begin_query(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, *, is_new_viewpoint: bool) -> None:
-    """Begins a map query: so far no fix supports any of them."""
-    for hypothesis in hypotheses:
-        hypothesis.misses += 1
-        hypothesis.decay(settings.evidence_kept_share)
-        if is_new_viewpoint:
-            hypothesis.history.begin_view()
-
-
-def vote(
-    hypotheses: list[PoseHypothesis],
-    fix: Fix,
-    fresh: PoseHypothesis,
-    odom_from_body: Array | None,
-    settings: TrackSettings,
-) -> None:
-    """A fix votes for the hypothesis at its pose, which takes that over, or founds one. fresh: the fix's pose at present.
-
-    odom_from_body: at present, None where the viewpoint is not new and its landmarks are not counted.
-    """
-    for hypothesis in hypotheses:
-        if _is_same_pose(fresh, hypothesis, settings):
-            if hypothesis.misses:  # at most one vote a query
-                hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
-                _count(hypothesis, fix, fresh, odom_from_body, settings)
-            hypothesis.take_pose(fresh)
-            return
-    fresh.decay(0.0)
-    _count(fresh, fix, fresh, odom_from_body, settings)
-    hypotheses.append(fresh)
-
-
-def recent(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> list[PoseHypothesis]:
-    """Those that some recent query supported."""
-    return [h for h in hypotheses if h.misses < settings.max_misses]
-
-
-def ranked(hypotheses: Sequence[PoseHypothesis]) -> list[PoseHypothesis]:
-    """The one with most inliers first."""
-    return sorted(hypotheses, key=lambda h: -h.inlier_sum)
-
-
-def competitors(
-    hypotheses: Sequence[PoseHypothesis], settings: TrackSettings, best: PoseHypothesis | None = None
-) -> list[PoseHypothesis]:
-    """Hypotheses besides the best with nearly its support, per query since they were founded or in this query alone: by inliers, or by
-    landmark recall, since a place where the map is thin is no less likely than its alias. A robot that turns into its aisle sees more of
-    the next one at first: what it saw then must not outweigh that both look alike now.
-    """
-    if not hypotheses:
-        return []
-    best = best or ranked(hypotheses)[0]
-
-    def is_near(inliers: float, recall: float, best_inliers: float, best_recall: float) -> bool:
-        if inliers >= settings.competitor_share * best_inliers:
-            return True
-        has_recall = recall >= settings.competitor_recall_share * best_recall
-        return has_recall and inliers >= settings.competitor_least_share * best_inliers
-
-    def competes(other: PoseHypothesis) -> bool:
-        if is_near(other.mean_inliers, other.mean_recall, best.mean_inliers, best.mean_recall):
-            return True
-        is_seen = other.query_inliers > 0
-        return is_seen and is_near(other.query_inliers, other.query_recall, best.query_inliers, best.query_recall)
-
-    return [h for h in hypotheses if h is not best and competes(h)]
-
-
-def disambiguated(hypotheses: Sequence[PoseHypothesis], settings: TrackSettings) -> TimeSliced[PoseHypothesis | None]:
-    """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
-
-    It need not rank first: a sign is little beside all that aliases share. What a person said counts as a sign, too. Only where the
-    whole site is mapped: of the aliases of a place that the map does not hold, one is always the least unlike it. The test is repeated
-    with every query, as in a sequential test (Wald 1945); it never rejects.
-    """
-    if not settings.is_whole_site_mapped or not competitors(hypotheses, settings):
-        return None
-    order = ranked(hypotheses)
-    shared = [np.zeros(len(h.history.ids), bool) for h in order]
-    for number, (i, j) in enumerate(combinations(range(len(order)), 2)):
-        if number and number % _PAIRS_AT_ONCE == 0:
-            yield
-        mark_shared(order[i].history, order[j].history, shared[i], shared[j])
-    known = {id(h): (h.history, flags) for h, flags in zip(order, shared, strict=True)}
-
-    def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
-        (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
-        told = one.told_log_odds - other.told_log_odds
-        return log_odds(history, other_history, flags, other_flags) + told
-
-    yield
-    best = max(order[1:], key=lambda other: lead(other, order[0]))
-    if lead(best, order[0]) < settings.telling_evidence:
-        best = order[0]
-    for number, other in enumerate(competitors(hypotheses, settings, best)):
-        if number and number % _PAIRS_AT_ONCE == 0:
-            yield
-        if lead(best, other) < settings.telling_evidence:
-            return None
-    return best
-
-
-def is_supported(hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
-    """Whether enough fixes agreed over enough distance."""
-    return hypothesis.support >= settings.confirming_fixes and hypothesis.travelled_m >= settings.confirming_distance_m
-
-
-def is_unambiguous(fix: Fix, settings: TrackSettings) -> bool:
-    """Whether a fix, the only one of its query, agrees so well that no other place of this map can be meant."""
-    return fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share
-
-
-def _count(
-    hypothesis: PoseHypothesis, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None, settings: TrackSettings
-) -> None:
-    hypothesis.add_fix(fix.inliers, fix.landmark_recall)
-    if settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
-        hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
-
-
-def _is_same_pose(fresh: PoseHypothesis, hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
-    error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
-    far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
-    far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
-    return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
-
+_MAX_WRONG_SHARE = 0.05  # of unmapped places that may be believed by weak fixes of a robot that stands
 
 # The fixes of one query, and each one's pose, propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
-_MAX_WRONG_SHARE = 0.05  # of unmapped places that may be believed by weak fixes of a robot that stands
 
 
 class HypothesisSet:
-    """Competing pose hypotheses: candidates while no pose is confirmed, else the places that refused fixes name.
+    """Candidates while no pose is confirmed, else the places that refused fixes name; or those that contradict a prior.
 
-    hypotheses: in the order of their first fixes. abandoned: the confirmed pose that was given up for them.
+    hypotheses: in the order of their first fixes. abandoned: the confirmed pose that was given up for them, which was published as the
+    robot's until fixes named another. lookalikes: what unmapped places have in common with the map, None where nobody measured it.
 
     Source: multiple hypothesis tracking (Reid 1979), of a single target and without branching.
     """
@@ -160,10 +33,10 @@ class HypothesisSet:
     def __init__(self, settings: TrackSettings) -> None:
         self._settings = settings
         self.hypotheses: list[PoseHypothesis] = []
+        self.abandoned: PoseHypothesis | None = None
+        self.lookalikes: LookAlikes | None = None
         self._disambiguated: PoseHypothesis | None = None
-        self.abandoned: PoseHypothesis | None = None  # published as the robot's pose until fixes named another
         self._viewpoint_gate = ViewpointGate()
-        self.lookalikes: LookAlikes | None = None  # None where nobody measured them
 
     def tracked(self) -> list[PoseHypothesis]:
         return [*self.hypotheses, *([self.abandoned] if self.abandoned else [])]
@@ -175,39 +48,144 @@ class HypothesisSet:
         """Starts over without any."""
         self.hypotheses, self.abandoned, self._disambiguated = [], None, None
 
-    def observe(self, observations: Observations, odom_from_body: Array) -> None:
-        """One query: every fix votes for a hypothesis, or founds one; those without votes for long are dropped."""
-        is_new = self._viewpoint_gate.is_new(odom_from_body)
-        begin_query(self.hypotheses, self._settings, is_new_viewpoint=is_new)
+    # --- one query ----------------------------------------------------------------------------------------------------
+
+    def observe(self, observations: Observations, odom_from_body: Array | None) -> None:
+        """One query: every fix votes for a hypothesis, or founds one; those without votes for long are dropped.
+
+        odom_from_body: at present; None keeps no history of landmarks.
+        """
+        is_new_viewpoint = odom_from_body is not None and self._viewpoint_gate.is_new(odom_from_body)
+        for hypothesis in self.hypotheses:
+            hypothesis.misses += 1
+            hypothesis.decay(self._settings.evidence_kept_share)
+            if is_new_viewpoint:
+                hypothesis.history.begin_view()
         for fix, fresh in observations:
-            vote(self.hypotheses, fix, fresh, odom_from_body if is_new else None, self._settings)
-        self.hypotheses = recent(self.hypotheses, self._settings)
+            self._vote(fix, fresh, odom_from_body if is_new_viewpoint else None)
+        self.hypotheses = [h for h in self.hypotheses if h.misses < self._settings.max_misses]
+
+    def _vote(self, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None) -> None:
+        """A fix votes for the hypothesis at its pose, which takes that over, or founds one. fresh: the fix's pose at present."""
+        for hypothesis in self.hypotheses:
+            if self._is_same_pose(fresh, hypothesis):
+                if hypothesis.misses:  # at most one vote a query
+                    hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
+                    self._count(hypothesis, fix, fresh, odom_from_body)
+                hypothesis.take_pose(fresh)
+                return
+        fresh.decay(0.0)
+        self._count(fresh, fix, fresh, odom_from_body)
+        self.hypotheses.append(fresh)
+
+    def _count(self, hypothesis: PoseHypothesis, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None) -> None:
+        hypothesis.add_fix(fix.inliers, fix.landmark_recall)
+        if self._settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
+            hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
+
+    def _is_same_pose(self, fresh: PoseHypothesis, hypothesis: PoseHypothesis) -> bool:
+        error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
+        far_m = self._settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
+        far_rad = np.radians(self._settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
+        return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """As `observe`, and disambiguation; in time slices."""
         self.observe(observations, odom_from_body)
-        self._disambiguated = yield from disambiguated(self.hypotheses, self._settings)
+        self._disambiguated = yield from self._tell_apart()
+
+    # --- ranking ------------------------------------------------------------------------------------------------------
 
     def ranking(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
         """The hypotheses, the most likely first, and the competitors of that one."""
-        order, best = ranked(self.hypotheses), self._disambiguated
+        order, best = self._ranked(), self._disambiguated
         if not any(h is best for h in order):  # it may have been pruned in a query that goes on
-            return order, competitors(self.hypotheses, self._settings)
+            return order, self._competitors(order[0]) if order else []
         return sorted(order, key=lambda h: h is not best), []
+
+    def _ranked(self) -> list[PoseHypothesis]:
+        """The one with most inliers first."""
+        return sorted(self.hypotheses, key=lambda h: -h.inlier_sum)
+
+    def _competitors(self, best: PoseHypothesis) -> list[PoseHypothesis]:
+        """Hypotheses with nearly the support of `best`, per query since they were founded or in this query alone: by inliers, or by
+        landmark recall, since a place where the map is thin is no less likely than its alias. A robot that turns into its aisle sees more
+        of the next one at first: what it saw then must not outweigh that both look alike now.
+        """
+        settings = self._settings
+
+        def is_near(inliers: float, recall: float, best_inliers: float, best_recall: float) -> bool:
+            if inliers >= settings.competitor_share * best_inliers:
+                return True
+            has_recall = recall >= settings.competitor_recall_share * best_recall
+            return has_recall and inliers >= settings.competitor_least_share * best_inliers
+
+        def competes(other: PoseHypothesis) -> bool:
+            if is_near(other.mean_inliers, other.mean_recall, best.mean_inliers, best.mean_recall):
+                return True
+            is_seen = other.query_inliers > 0
+            return is_seen and is_near(other.query_inliers, other.query_recall, best.query_inliers, best.query_recall)
+
+        return [h for h in self.hypotheses if h is not best and competes(h)]
+
+    def _tell_apart(self) -> TimeSliced[PoseHypothesis | None]:
+        """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
+
+        It need not rank first: a sign is little beside all that aliases share. What a person said counts as a sign, too. Only where the
+        whole site is mapped: of the aliases of a place that the map does not hold, one is always the least unlike it. The test is repeated
+        with every query, as in a sequential test (Wald 1945); it never rejects.
+        """
+        order, threshold = self._ranked(), self._settings.telling_evidence
+        if not self._settings.is_whole_site_mapped or not order or not self._competitors(order[0]):
+            return None
+        shared = [np.zeros(len(h.history.ids), bool) for h in order]
+        for number, (i, j) in enumerate(combinations(range(len(order)), 2)):
+            if number and number % _PAIRS_AT_ONCE == 0:
+                yield
+            mark_shared(order[i].history, order[j].history, shared[i], shared[j])
+        known = {id(h): (h.history, flags) for h, flags in zip(order, shared, strict=True)}
+
+        def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
+            (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
+            told = one.told_log_odds - other.told_log_odds
+            return log_odds(history, other_history, flags, other_flags) + told
+
+        yield
+        best = max(order[1:], key=lambda other: lead(other, order[0]))
+        if lead(best, order[0]) < threshold:
+            best = order[0]
+        for number, other in enumerate(self._competitors(best)):
+            if number and number % _PAIRS_AT_ONCE == 0:
+                yield
+            if lead(best, other) < threshold:
+                return None
+        return best
+
+    # --- confirmation -------------------------------------------------------------------------------------------------
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
         """Whether a place that is not in the map could look as much like the hypothesis: by its recall in all queries so far."""
         return self.lookalikes is not None and 0.0 < self.lookalikes.recall >= hypothesis.recall
 
+    def is_supported(self, hypothesis: PoseHypothesis) -> bool:
+        """Whether enough fixes agreed over enough distance."""
+        settings = self._settings
+        has_enough = hypothesis.support >= settings.confirming_fixes
+        return has_enough and hypothesis.travelled_m >= settings.confirming_distance_m
+
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
         """By enough fixes over enough distance, or as the only hypothesis by an unambiguous fix: a strong one, or one of enough that
         agree where the map's look-alikes were measured well enough, so that no distance needs to exclude them."""
-        if len(self.hypotheses) == len(fixes) == 1 and is_unambiguous(fixes[0], self._settings):
-            has_enough = hypothesis.support >= self._settings.confirming_fixes
+        settings = self._settings
+        if len(self.hypotheses) == len(fixes) == 1:
+            fix = fixes[0]
+            # It agrees so well that no other place of this map can be meant.
+            is_unambiguous = fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share
+            has_enough = hypothesis.support >= settings.confirming_fixes
             is_measured = self.lookalikes is not None and self.lookalikes.max_wrong_share <= _MAX_WRONG_SHARE
-            if fixes[0].inliers >= self._settings.strong_inliers or (has_enough and is_measured):
+            if is_unambiguous and (fix.inliers >= settings.strong_inliers or (has_enough and is_measured)):
                 return True
-        return is_supported(hypothesis, self._settings)
+        return self.is_supported(hypothesis)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
         """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""

@@ -7,15 +7,7 @@ from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.hypothesis_set import (
-    Observations,
-    begin_query,
-    competitors,
-    is_supported,
-    ranked,
-    recent,
-    vote,
-)
+from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -48,20 +40,22 @@ class InitialPosePrior:
     that fixes name instead of those within a revisable prior.
     """
 
-    def __init__(self, prior: PositionPrior, base_from_body: Array) -> None:
-        self._prior, self._base_from_body = prior, base_from_body
+    def __init__(self, prior: PositionPrior, base_from_body: Array, settings: TrackSettings) -> None:
+        self._prior, self._base_from_body, self._settings = prior, base_from_body, settings
         self.travelled_m = 0.0
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
-        self.contradictions: list[PoseHypothesis] = []
+        self.contradictions = HypothesisSet(settings)
         self.is_revisable = prior.is_revisable
 
     @classmethod
-    def at(cls, known: PoseHypothesis, base_from_body: Array, *, is_revisable: bool) -> "InitialPosePrior":
+    def at(
+        cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, *, is_revisable: bool
+    ) -> "InitialPosePrior":
         """A pose at a frame of the odometry as a prior."""
         map_from_base = known.map_from_body @ se3_inverse(base_from_body)
         covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
-        made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body)
+        made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body, settings)
         identity = np.eye(4), np.zeros((6, 6))
         made.hypothesis, made._since = known, PoseHypothesis(known.frame_index, known.stamp_ns, *identity, *identity)
         return made
@@ -83,7 +77,7 @@ class InitialPosePrior:
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance)
 
     def tracked(self) -> list[PoseHypothesis]:
-        return [*filter(None, (self.hypothesis, self._since)), *self.contradictions]
+        return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
         """Whether the robot's motion leads back from a present pose to within the bound of the prior's position."""
@@ -95,41 +89,39 @@ class InitialPosePrior:
         off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
         return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + covariance[3:5, 3:5], off_m) < _CHI2_999)
 
-    def is_contradicted(
-        self, observations: Observations, settings: TrackSettings, lookalikes: LookAlikes | None
-    ) -> bool:
+    def is_contradicted(self, observations: Observations, lookalikes: LookAlikes | None) -> bool:
         """Whether the fixes of a query without any within the prior, and those before, outweigh it.
 
         It counts as much as what confirms a pose: more fixes than that must agree, over as much distance, on one place without
         competitors that no unmapped place resembles. A robot that stands sees the same thing again, which is no more evidence.
         """
-        begin_query(self.contradictions, settings, is_new_viewpoint=False)
-        for fix, fresh in observations:
-            vote(self.contradictions, fix, fresh, None, settings)
-        self.contradictions = recent(self.contradictions, settings)
-        if not self.contradictions or competitors(self.contradictions, settings):
+        found = self.contradictions
+        found.lookalikes = lookalikes
+        found.observe(observations, None)
+        order, competitors = found.ranking()
+        if not order or competitors:
             return False
-        best = ranked(self.contradictions)[0]
-        is_lookalike = lookalikes is not None and 0.0 < lookalikes.recall >= best.recall
-        return is_supported(best, settings) and best.support > settings.confirming_fixes and not is_lookalike
+        has_more = order[0].support > self._settings.confirming_fixes
+        return has_more and found.is_supported(order[0]) and not found.may_be_lookalike(order[0])
 
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
         """(N,) which positions (N, 3) may show what the robot sees now."""
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 
-    def weighed(self, observations: Observations, settings: TrackSettings) -> Observations:
+    def weighed(self, observations: Observations) -> Observations:
         """The fixes of a query, with what a person's word for its place is worth to each: 0 for places that were not named. Exact sources
         exclude the others instead."""
         for _, hypothesis in observations if self.is_revisable else ():
             if self.is_compatible(hypothesis):
-                share = settings.wrong_prior_share
+                share = self._settings.wrong_prior_share
                 hypothesis.told_log_odds = float(np.log1p(-share) - np.log(share))
         return observations
 
-    def confirms(self, hypothesis: PoseHypothesis, settings: TrackSettings) -> bool:
+    def confirms(self, hypothesis: PoseHypothesis) -> bool:
         """Whether it is so tight that one fix at its place confirms that; of a person's, at the place that was named."""
-        return self.is_tight(settings.tight_prior_sigma_m) and (not self.is_revisable or hypothesis.told_log_odds > 0.0)
+        is_named = not self.is_revisable or hypothesis.told_log_odds > 0.0
+        return is_named and self.is_tight(self._settings.tight_prior_sigma_m)
 
     def is_tight(self, sigma_m: float) -> bool:
         """Whether its horizontal sigma is at most that, now."""

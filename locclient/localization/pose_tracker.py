@@ -76,7 +76,7 @@ class PoseTracker:
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """A prior at this moment, in the place of any before."""
-        self.prior = InitialPosePrior(prior, self._base_from_body)
+        self.prior = InitialPosePrior(prior, self._base_from_body, self._track)
 
     def is_contradicted_by(self, prior: PositionPrior) -> bool:
         """Whether a confirmed pose lies outside the bound of a prior."""
@@ -122,7 +122,7 @@ class PoseTracker:
         if start.is_confirmed:
             self.confirmed = known
         else:
-            self.prior = InitialPosePrior.at(known, self._base_from_body, is_revisable=start.is_revisable)
+            self.prior = InitialPosePrior.at(known, self._base_from_body, self._track, is_revisable=start.is_revisable)
             self.prior.travelled_m = start.travelled_m
 
     # --- propagation --------------------------------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class PoseTracker:
         """The fixes of the query that goes on, with their poses at the present."""
         assert self._query_frame is not None
         found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
-        return found if self.prior is None else self.prior.weighed(found, self._track)
+        return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
@@ -193,7 +193,7 @@ class PoseTracker:
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
         """Whether fixes without any within the prior contradict it by now; it is dropped then, and what they name must be confirmed."""
         assert self.prior is not None
-        if not self.prior.is_contradicted(self.observations(fixes), self._track, self.lookalikes):
+        if not self.prior.is_contradicted(self.observations(fixes), self.lookalikes):
             return False
         self.prior = None
         self.candidates.reset()
@@ -253,7 +253,7 @@ class PoseTracker:
         if competitors:
             return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
         moved_m = None
-        has_prior = self.prior is not None and self.prior.confirms(best, self._track)
+        has_prior = self.prior is not None and self.prior.confirms(best)
         if not has_prior and candidates.may_be_lookalike(best):
             return QueryResult(None, "a place that is not in the map may look as much like this one")
         if has_prior or candidates.is_confirmed(best, fixes):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from locclient.localization.hypothesis_set import competitors
+from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
@@ -18,6 +18,12 @@ def hypothesis(inliers: list[int], recall: list[float]) -> PoseHypothesis:
         if count:
             made.add_fix(count, share)
     return made
+
+
+def competitors(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
+    found = HypothesisSet(SETTINGS)
+    found.hypotheses = hypotheses
+    return found.ranking()[1]
 
 
 BEST = ([161, 217, 253], [0.29, 0.35, 0.42])
@@ -39,9 +45,9 @@ def test_another_place_competes_in_the_mean_or_in_the_present_query(
     inliers: list[int], recall: list[float], competes: bool
 ) -> None:
     best, other = hypothesis(*BEST), hypothesis(inliers, recall)
-    assert competitors([other, best], SETTINGS) == ([other] if competes else [])
+    assert competitors([other, best]) == ([other] if competes else [])
 
 
 def test_a_place_that_is_seen_competes_with_the_best_that_is_not() -> None:
     best, other = hypothesis([161, 217, 0], [0.29, 0.35, 0.0]), hypothesis([0, 0, 60], [0.0, 0.0, 0.1])
-    assert competitors([other, best], SETTINGS) == [other]
+    assert competitors([other, best]) == [other]

@@ -24,7 +24,7 @@ class Ride:
         map_from_base[1, 3] += off_m
         unknown = 0.01**2 if whole else np.inf
         covariance = np.diag([unknown] * 3 + [sigma_m**2, sigma_m**2, unknown])
-        self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY)
+        self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY, SETTINGS)
         self.frame = 0
         self.prior.propagate(self._estimate(), np.eye(4))
 
