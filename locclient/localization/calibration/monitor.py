@@ -13,7 +13,7 @@ from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
 from locclient.localization.calibration.parameters import CalibrationState
-from locclient.localization.calibration.watch import CalibrationWatch, MapLook, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch, Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.map_query import FinishedQuery
 
@@ -71,8 +71,7 @@ class CalibrationMonitor:
         return CalibrationState(text=REVERSED_TEXT) if self._order is PairOrder.REVERSED else self.watch.state
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:
-        assert query.fix is not None
-        self.watch.handle(MapLook(query.frame, query.odometry, query.fix, query.relocalizer.view, query.is_confirmed))
+        self.watch.handle(query)
         yield
 
     def _search(self, query: FinishedQuery) -> TimeSliced[None]:
@@ -80,7 +79,7 @@ class CalibrationMonitor:
         fixes = yield from query.relocalizer.anywhere(query.features.without_depth())
         if fixes and is_reliable(fixes[0], self._settings.fix):
             yield
-            self.watch.handle_unmatched(MapLook(query.frame, query.odometry, fixes[0], query.relocalizer.view))
+            self.watch.handle_unmatched(replace(query, fix=fixes[0], is_confirmed=False))
 
 
 def with_calibration(

@@ -11,9 +11,6 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
-from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
 from locclient.localization.calibration import mounting
 from locclient.localization.calibration.camera_view import camera_view, pair_offsets
@@ -32,6 +29,7 @@ from locclient.localization.calibration.parameters import (
     CalibrationState,
     Drift,
 )
+from locclient.localization.map_query import FinishedQuery
 from locclient.localization.pose_covariance import transport_cov
 
 _STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and while they are few
@@ -69,17 +67,6 @@ class _View:
     ids: frozenset[int]
 
 
-@dataclass(frozen=True)
-class MapLook:
-    """A look at the map that found a fix: the frame, the odometry there, the fix, and the map; whether the fix is of a confirmed pose."""
-
-    frame: RectifiedFrame
-    odometry: OdometryEstimate
-    fix: Fix
-    view: MapView
-    is_confirmed: bool = False
-
-
 class CalibrationWatch:
     """Compares what the robot sees with the map in which it is localized. It observes: no estimate changes until something has drifted.
 
@@ -105,9 +92,11 @@ class CalibrationWatch:
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self._wheels.handle(samples)
 
-    def handle(self, query: MapLook) -> None:
+    def handle(self, query: FinishedQuery) -> None:
         """Takes a look at the map, where it is a new view."""
-        fix, matched, frame = query.fix, query.fix.matched, query.frame
+        fix, frame = query.fix, query.frame
+        assert fix is not None
+        matched = fix.matched
         self._look_for_a_stand(query.odometry.stamp_ns, fix.map_from_cam[:3, 3])
         is_first = query.is_confirmed and not self.has_confirmed
         if matched is None or not (is_first or self._is_new(fix.map_from_cam)):
@@ -120,7 +109,9 @@ class CalibrationWatch:
             seen = camera_view(_with_depth(matched, offsets[:, 0]), fix.map_from_cam, offsets[:, 1])
         information, score = np.zeros((COUNT + 2, COUNT + 2)), np.zeros(COUNT + 2)
         ids = (
-            frozenset[int]() if fix.matches is None else frozenset(query.view.landmark_ids[fix.matches[:, 1]].tolist())
+            frozenset[int]()
+            if fix.matches is None
+            else frozenset(query.relocalizer.view.landmark_ids[fix.matches[:, 1]].tolist())
         )
         if seen is not None:
             share = self._new_share(ids)
@@ -131,10 +122,10 @@ class CalibrationWatch:
         state = self._judged(_MIN_CONFIRMED_VIEWS if query.is_confirmed else _MIN_VIEWS)
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
-    def handle_unmatched(self, query: MapLook) -> None:
+    def handle_unmatched(self, query: FinishedQuery) -> None:
         """As `handle`, for a frame that agrees with the map only without its depth: that is measured here for what was matched."""
-        matched = query.fix.matched
-        if matched is None:
+        matched = None if query.fix is None else query.fix.matched
+        if query.fix is None or matched is None:
             return
         found = stereo.disparities(query.frame, matched.camera, matched.pixels[:, :2], self._stereo)
         pixels = np.column_stack([matched.pixels[:, :2], matched.pixels[:, 0] - found[:, 0]])
@@ -160,8 +151,9 @@ class CalibrationWatch:
         known = frozenset[int]().union(*(ids & view.ids for view in self._views))
         return max(1.0 - len(known) / len(ids), _MIN_NEW_SHARE) if ids else 1.0
 
-    def _add_mounting(self, query: MapLook, information: Array, score: Array) -> None:
+    def _add_mounting(self, query: FinishedQuery, information: Array, score: Array) -> None:
         fix, odometry = query.fix, query.odometry
+        assert fix is not None
         if odometry.inertial and self._has_stood:
             jacobian, measured = mounting.tilt(fix, self._rig.cam_from_body, odometry)
             at = np.r_[TILT, COUNT : COUNT + 2]
@@ -173,7 +165,10 @@ class CalibrationWatch:
         covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
         base = BasePose(map_from_base, covariance, self._wheels.at(odometry.stamp_ns))
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
-        for at_one, measurement in ((HEADING, turned), (HEIGHT, mounting.height(base, query.view.points_map))):
+        for at_one, measurement in (
+            (HEADING, turned),
+            (HEIGHT, mounting.height(base, query.relocalizer.view.points_map)),
+        ):
             if measurement is not None:
                 value, sigma = measurement
                 information[at_one, at_one] += sigma**-2

@@ -11,13 +11,12 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.parameters import BASELINE, FOCAL, IMAGE, TILT, YAW
-from locclient.localization.calibration.watch import CalibrationWatch, MapLook, Mounting
+from locclient.localization.calibration.watch import CalibrationWatch, Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.map_query import FinishedQuery
 from support.fleet.estimates import estimate
@@ -28,7 +27,7 @@ NO_IMAGE = np.zeros((480, 640), np.uint8)
 LEVEL = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # map_from_cam of a camera that looks along the map's x
 
 
-def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: float = 0.2) -> MapLook:
+def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: float = 0.2) -> FinishedQuery:
     """The fix of one frame, a metre after the one before, by cameras whose true parameters differ so much from the calibration."""
     matched, map_from_cam, _ = seen_with(parameters, 1000 + number)
     level = se3(so3_exp(np.array([0, 0, yaw_rad * number])) @ LEVEL, np.array([1.1 * number, 0.0, 0.4]))
@@ -40,8 +39,9 @@ def look(number: int, parameters: Array, turn: Array | None = None, yaw_rad: flo
     odometry = replace(
         estimate(float(number)).odometry, odom_from_body=se3(body, np.zeros(3)), inertial=turn is not None
     )
-    view = cast(MapView, SimpleNamespace(landmark_ids=ids, points_map=points_map))
-    return MapLook(RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), odometry, fix, view)
+    view = SimpleNamespace(landmark_ids=ids, points_map=points_map)
+    frame, relocalizer = RectifiedFrame(number, NO_IMAGE, NO_IMAGE, None), cast(Relocalizer, SimpleNamespace(view=view))
+    return FinishedQuery(frame, odometry, cast(FrameFeatures, None), fix, relocalizer, is_confirmed=False)
 
 
 def parameters(**sizes: float) -> Array:
@@ -149,7 +149,7 @@ def published(watch: CalibrationMonitor, before: Estimate, last_fix_ns: int | No
     return with_calibration(before, watch.state, RIG, last_fix_ns, was_localized=True)
 
 
-def first_look(parameters: Array) -> MapLook:
+def first_look(parameters: Array) -> FinishedQuery:
     return replace(look(0, parameters), is_confirmed=True)
 
 
@@ -184,10 +184,7 @@ def test_the_covariance_of_good_cameras_is_what_it_was_once_they_are_known() -> 
 
 def test_the_first_confirmed_pose_is_judged_before_it_is_published() -> None:
     monitor = CalibrationMonitor(RIG, RelocalizerSettings())
-    query = first_look(parameters(focal=-0.05))
-    relocalizer = cast(Relocalizer, SimpleNamespace(view=query.view))
-    nothing = cast(FrameFeatures, None)
-    monitor.add(FinishedQuery(query.frame, query.odometry, nothing, query.fix, relocalizer, is_confirmed=True))
+    monitor.add(first_look(parameters(focal=-0.05)))
     tracking = estimate(0.0)
     assert published(monitor, tracking, tracking.stamp_ns).status is Status.DEGRADED
 
