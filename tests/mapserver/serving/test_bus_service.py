@@ -24,6 +24,7 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.occupancy_grid import OccupancyGrid
+from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
