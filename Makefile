@@ -1,4 +1,4 @@
-# Verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv) and make.
+# Verbs. Each makes .venv itself; all that is needed is Python >= 3.11 (with venv and headers), make and, better than what the index has, g++.
 #
 #   make demo                  survey a simulated warehouse, serve its map, localize the robots of the next day in it
 #   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
@@ -7,6 +7,7 @@
 #   make test-ci               make test, and of the long tests one drive, one fault sweep and one browser walk
 #   make check                 format, lint, types, import contracts
 #   make docs                  write the tables of docs/command_line.md and docs/settings.md anew
+#   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
 #   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
@@ -23,6 +24,9 @@ BIN := $(VENV)/bin
 # pip compiles libraries, COMPILE the sources here, also where PYTHONDONTWRITEBYTECODE forbids programs to do it as they go.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -q shared mapserver locclient
+# What the compiled core is built with, beside a C++ compiler.
+CORE_TOOLS := cmake ninja nanobind cmeel-eigen scikit-build-core
+BUILD_CORE := shared/core/build.sh $(VENV)
 # Stamps: the time of the last install. Installing for development covers what the demo runs.
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
@@ -30,12 +34,16 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-recording test test-ci test-all check docs kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
+.PHONY: help core demo demo-recording test test-ci test-all check docs kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
+core: $(DEV_STAMP)
+	@$(BUILD_CORE)
+
 demo: demo-recording $(RUN_STAMP)
+	@$(BUILD_CORE)
 	@$(COMPILE)
 	@BIN=$(BIN) deploy/demo.sh "$(RECORDING)"
 
@@ -46,15 +54,15 @@ demo-recording:
 # Tests write to folders of their own; of one file they run in one process, so that they share what it made.
 RUN_TESTS = $(BIN)/python -m pytest $(TESTS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-test: $(DEV_STAMP)
+test: core
 	@$(COMPILE) tests
 	$(RUN_TESTS) -m "not long"
 
-test-ci: $(DEV_STAMP)
+test-ci: core
 	@$(COMPILE) tests
 	$(RUN_TESTS) -m "not long or ci"
 
-test-all: $(DEV_STAMP)
+test-all: core
 	@$(COMPILE) tests
 	$(RUN_TESTS)
 
@@ -64,35 +72,35 @@ check: $(DEV_STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(DEV_STAMP)
+docs: core
 	$(BIN)/python docs/generate.py
 
 # With --jobs=2 side by side: most of what robots share with the server is there when they get to it.
 kernels: kernels-server kernels-robot kernels-simulator
 
-kernels-server: $(DEV_STAMP)
+kernels-server: core
 	$(BIN)/mapserver prepare
 
-kernels-robot: $(DEV_STAMP)
+kernels-robot: core
 	$(BIN)/locclient prepare
 
 # All kernels of pictures: through a lens, blurred, spoiled by a camera.
-kernels-simulator: $(DEV_STAMP)
+kernels-simulator: core
 	folder=$$(mktemp -d) && $(BIN)/fleetsim record clip --robot tote-1 --lens equidistant --camera-pipeline phone --frames 20 \
 		--size 160x120 --out $$folder/clip.mcap; status=$$?; rm -r $$folder; exit $$status
 
-bench: $(DEV_STAMP)
+bench: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py --all $(NAMES)
 
-acceptance: $(DEV_STAMP)
+acceptance: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
 
-study: $(DEV_STAMP)
+study: core
 	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=square"; exit 2; }
 	PYTHONPATH=tests $(BIN)/python -m studies.$(NAME)
 
 clean:
-	rm -rf $(VENV) out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) shared/fleetmap/_core.*.so out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -105,12 +113,12 @@ $(BIN)/python:
 
 $(DEV_STAMP): $(INPUTS) | $(BIN)/python
 	@echo "installing fleetmap with everything that tests need into $(VENV)"
-	@$(INSTALL) -e ".[dev]"
+	@$(INSTALL) -e ".[dev]" $(CORE_TOOLS)
 	@$(COMPILE)
 	@touch $(RUN_STAMP) $(DEV_STAMP)
 
 $(RUN_STAMP): $(INPUTS) | $(BIN)/python
 	@echo "installing fleetmap, server, client and simulator, into $(VENV)"
-	@$(INSTALL) -e ".[server,client,sim]"
+	@$(INSTALL) -e ".[server,client,sim]" $(CORE_TOOLS)
 	@$(COMPILE)
 	@touch $(RUN_STAMP)

@@ -2,7 +2,7 @@
 # Installs the wheel of this source folder with an extra into a new virtual environment: every library by its hash, without what only
 # its makers need (tests, debug symbols, pip itself). docs/install.md says what that saves.
 #   python3 -m pip wheel --no-deps --wheel-dir dist .
-#   deploy/install.sh dist/fleetmap-0.1.0-py3-none-any.whl server /opt/fleetmap
+#   deploy/install.sh dist/fleetmap-0.1.0-*.whl server /opt/fleetmap
 # LOCK: the list of libraries with their hashes, made by lock.sh where it does not exist (default: deploy/EXTRA.lock); keep it.
 # WHEELS: folder with wheels of your own, such as that of opencv.sh, which are taken before those of the index (default: dist/wheels).
 set -eu

@@ -2,9 +2,9 @@
 # Writes requirements.lock: every library of an installation with the hashes of the files that this machine's package index gave out now.
 # An index that later gives other bytes under the same version is then refused. Made by the deployer, because platforms and indexes
 # differ; keep the file, and install every machine of that platform from it:
-#   deploy/lock.sh dist/fleetmap-0.1.0-py3-none-any.whl server requirements.lock
+#   deploy/lock.sh dist/fleetmap-0.1.0-*.whl server requirements.lock
 #   pip install --require-hashes --only-binary :all: -r requirements.lock
-#   pip install --no-deps dist/fleetmap-0.1.0-py3-none-any.whl
+#   pip install --no-deps dist/fleetmap-0.1.0-*.whl
 set -eu
 [ $# -ge 3 ] && [ -f "$1" ] || { echo "usage: deploy/lock.sh WHEEL server|client LOCK [OWN WHEEL...]; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
 here=$(dirname "$0")

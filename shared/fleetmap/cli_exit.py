@@ -72,9 +72,11 @@ def require_extra(extra: str, program: str) -> None:
     names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in marked]
     missing = [name for name in names if not _is_installed(name)]
     if missing:
+        tag = re.search(r"^Tag: (\S+)$", project.read_text("WHEEL") or "", re.MULTILINE)
+        wheel = f"./fleetmap-{project.version}-{tag[1] if tag else '*'}.whl"
         raise UsageError(
             f"{program} needs the extra `{extra}`, of which {', '.join(missing)} are not installed; install it with "
-            f"pip install './fleetmap-{project.version}-py3-none-any.whl[{extra}]', or '.[{extra}]' in fleetmap's source folder"
+            f"pip install '{wheel}[{extra}]', or '.[{extra}]' in fleetmap's source folder"
         )
 
 

@@ -53,7 +53,7 @@ def test_commands_in_an_error_run_as_printed(arguments: str, told: str) -> None:
 
 
 def distribution(*requires: str) -> SimpleNamespace:
-    return SimpleNamespace(requires=list(requires), version="9.9")
+    return SimpleNamespace(requires=list(requires), version="9.9", read_text={"WHEEL": "Tag: cp399-any\n"}.get)
 
 
 def test_a_program_whose_extra_is_missing_says_what_to_install(
@@ -70,7 +70,7 @@ def test_a_program_whose_extra_is_missing_says_what_to_install(
     assert end.value.code == 2
     said = capsys.readouterr().err
     assert "extra `server`, of which no_such.one are not installed" in said
-    assert "'./fleetmap-9.9-py3-none-any.whl[server]'" in said
+    assert "'./fleetmap-9.9-cp399-any.whl[server]'" in said
     require_extra("client", "locclient")
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import vocabulary_kernels
+from fleetmap import core
 from fleetmap.features.matching import Descriptors, packed
 from fleetmap.features.matching_kernels import Packed
 
@@ -44,14 +44,12 @@ class Vocabulary:
     def words(self, descriptors: Descriptors) -> WordIds:
         """(N,) word of each descriptor (N, 32). Ties go to the lower node. Source: Nister and Stewenius 2006."""
         word_of_node = (np.cumsum(self.child_count == 0) - 1).astype(np.int32)
-        return vocabulary_kernels.descend(
-            packed(descriptors), self.centres, self.first_child, self.child_count, word_of_node
-        )
+        return core.descend(packed(descriptors), self.centres, self.first_child, self.child_count, word_of_node)
 
     def branches(self, descriptors: Descriptors) -> NDArray[np.int32]:
         """(N, 2) the two children of the root that are nearest to each descriptor (N, 32), by their number; 0 without children."""
         children = self.centres[1 : 1 + int(self.child_count[0])]
-        return vocabulary_kernels.two_nearest(packed(descriptors), children)
+        return core.two_nearest(packed(descriptors), children)
 
     def bow_vector(self, words: WordIds) -> BowVector:
         """The tf-idf vector of a place's words (N,), L1-normalised. Source: Galvez-Lopez and Tardos 2012 (DBoW2)."""

@@ -3,9 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import fast_kernels
-from fleetmap.features.corner_kernels import clear_discs, min_eigenvalue_scores, select_spread
-from fleetmap.features.fast_kernels import LANES, RADIUS_PX
+from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
@@ -15,16 +13,9 @@ Pixels = NDArray[np.float32]
 def fast_corners(image: Image, threshold: int, border_px: int = 3, free: NDArray[np.uint8] | None = None) -> Pixels:
     """(N, 2) whole-pixel FAST corners of `image`, non-maximum suppressed, at least border_px from its edges.
 
-    free (H, W): 0 where none is wanted.
+    free (H, W): 0 where none is wanted. Source: Rosten and Drummond 2006, nine of sixteen pixels.
     """
-    height, width = image.shape
-    border_px, short = max(border_px, RADIUS_PX), LANES + 2 * RADIUS_PX - width
-    if min(height, width) <= 2 * border_px:
-        return np.zeros((0, 2), np.float32)
-    if short > 0:
-        image = np.pad(image, ((0, 0), (0, short)))
-    where = np.zeros((0, 0), np.uint8) if free is None else free
-    return fast_kernels.fast_corners(np.ascontiguousarray(image), width, threshold, border_px, where)
+    return core.fast_corners(np.ascontiguousarray(image), threshold, max(border_px, 3), free)
 
 
 def corner_candidates(
@@ -50,13 +41,13 @@ def spread_corners(
 
     The threshold is lowered once where the image is too plain to give them.
     """
-    height, width = image.shape
+    image, (height, width) = np.ascontiguousarray(image), image.shape
     held, free = np.zeros((0, 2), np.float32), None
     if taken is not None and len(taken):
-        held, free = taken.astype(np.float32), np.full(image.shape, 255, np.uint8)
-        clear_discs(free, held, min_distance_px)
+        held, free = np.ascontiguousarray(taken, np.float32), np.full(image.shape, 255, np.uint8)
+        core.clear_discs(free, held, min_distance_px)
     candidates = corner_candidates(image, 2 * count, threshold, border_px, free)
-    scores = min_eigenvalue_scores(image, candidates)
+    scores = core.min_eigenvalue_scores(image, candidates)
     shown = scores > 0
     return select_best(candidates[shown], scores[shown], held, min_distance_px, count, (width, height))
 
@@ -74,7 +65,7 @@ def select_best(
         else:
             better = np.arange(len(scores))
         order = better[np.argsort(-scores[better], kind="stable")]
-        chosen = select_spread(candidates, order, taken, min_distance_px, count, *size_px)
+        chosen = core.select_spread(candidates, order, taken, min_distance_px, count, *size_px)
         if len(chosen) == count or len(better) == len(scores):
             break
     return np.asarray(candidates[chosen])

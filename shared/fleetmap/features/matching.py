@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features import matching_kernels
 from fleetmap.features.matching_kernels import FAR, Distances, Indices, Packed
 from fleetmap.features.orb import Features
@@ -29,10 +30,7 @@ def hamming_knn2(descriptors_a: Descriptors, descriptors_b: Descriptors) -> tupl
 
     Index -1 and distance FAR where b holds too few. Ties go to the lower index.
     """
-    count = len(descriptors_a)
-    index, first, second = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count, np.int32)
-    matching_kernels.knn2(packed(descriptors_a), packed(descriptors_b), index, first, second)
-    return index, first, second
+    return core.nearest_two(packed(descriptors_a), packed(descriptors_b))
 
 
 def match_mutual(
@@ -49,10 +47,9 @@ def match_mutual(
     which misses few matches. Source: direct index, Galvez-Lopez and Tardos 2012, section III-B.
     """
     if nodes is not None:
-        ours, theirs = (np.require(each, np.int32, ["C", "A", "W"]) for each in nodes)
-        words_a, words_b = packed(descriptors_a), packed(descriptors_b)
-        return matching_kernels.mutual_within(words_a, ours, words_b, theirs, max_distance, float(ratio))
-    return matching_kernels.mutual(packed(descriptors_a), packed(descriptors_b), max_distance, float(ratio))
+        ours, theirs = (np.ascontiguousarray(each, np.int32) for each in nodes)
+        return core.mutual_within(packed(descriptors_a), ours, packed(descriptors_b), theirs, max_distance, ratio)
+    return core.mutual(packed(descriptors_a), packed(descriptors_b), max_distance, ratio)
 
 
 class Projected(NamedTuple):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features.corner_kernels import centroid_angles_deg, min_eigenvalue_scores
+from fleetmap import core
 from fleetmap.features.corners import corner_candidates, select_best
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
@@ -55,6 +55,7 @@ def detect(image: Image, settings: OrbSettings) -> Features:
 
 def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
     """As `detect`, in slices of about equal work: corners, descriptors, and what the caller makes of them."""
+    image = np.ascontiguousarray(image)
     levels = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
     yield
     octaves = np.repeat(np.arange(len(levels), dtype=np.int8), [len(pixels) for pixels, _ in levels])
@@ -100,6 +101,8 @@ def _detect_level(
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
     candidates = corner_candidates(scaled, 2 * quota, settings.fast_threshold, _BORDER_PX)
-    scores, nothing = min_eigenvalue_scores(scaled, candidates), np.zeros((0, 2), np.float32)
+    scores, nothing = core.min_eigenvalue_scores(scaled, candidates), np.zeros((0, 2), np.float32)
     chosen = select_best(candidates, scores, nothing, settings.min_distance_px, quota, (width, height))
-    return (scale * chosen.astype(np.float64)).astype(np.float32), centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)
+    return (scale * chosen.astype(np.float64)).astype(np.float32), core.centroid_angles_deg(
+        scaled, chosen, _PATCH_RADIUS
+    )

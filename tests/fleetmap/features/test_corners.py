@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleetmap.features.corner_kernels import centroid_angles_deg, clear_discs, min_eigenvalue_scores, select_spread
+from fleetmap.core import centroid_angles_deg, clear_discs, min_eigenvalue_scores, select_spread
 from fleetmap.features.corners import fast_corners, spread_corners
 from fleetmap.geometry import Array
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture

@@ -1,0 +1,34 @@
+// numpy arrays in and out of the core. Arguments are views that nobody converts; results own what they hold.
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <initializer_list>
+#include <utility>
+#include <vector>
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+template <typename T, int64_t... kShape>
+using Array = nb::ndarray<const T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;
+template <typename T, int64_t... kShape>
+using MutableArray = nb::ndarray<T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;
+
+// A numpy array that owns the vector's numbers. Element: what the vector's hold, such as float for pixels.
+template <typename Element, int kDimensions, typename T>
+nb::ndarray<nb::numpy, Element, nb::ndim<kDimensions>> as_numpy(std::vector<T>&& values, std::initializer_list<size_t> shape) {
+  auto* kept = new std::vector<T>(std::move(values));
+  nb::capsule owner(kept, [](void* held) noexcept { delete static_cast<std::vector<T>*>(held); });
+  return {reinterpret_cast<Element*>(kept->data()), shape, owner};
+}
+
+// The result of a computation that needs no Python, done without its lock.
+template <typename Compute>
+auto unlocked(Compute&& compute) {
+  nb::gil_scoped_release release;
+  return compute();
+}

@@ -1,0 +1,36 @@
+// The module. This file is compiled for any processor of its kind, so that one that is too old gets to read why it is refused.
+#include <nanobind/nanobind.h>
+
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
+
+namespace nb = nanobind;
+
+void bind_corners(nb::module_&);
+void bind_matching(nb::module_&);
+void bind_vocabulary(nb::module_&);
+
+#if defined(__x86_64__)
+// Asked of the processor itself: not every compiler's library knows what __builtin_cpu_supports asks it.
+static bool has_avx2_and_fma() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE)) return false;
+  unsigned saved_low = 0, saved_high = 0;  // registers that the system saves: those of AVX are bits 1 and 2
+  __asm__ volatile("xgetbv" : "=a"(saved_low), "=d"(saved_high) : "c"(0));
+  if ((saved_low & 6) != 6) return false;
+  return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2) && (b & bit_BMI2);
+}
+#endif
+
+NB_MODULE(_core, module) {
+#if defined(__x86_64__)
+  if (!has_avx2_and_fma())
+    throw nb::import_error(
+        "fleetmap needs a processor with AVX2 and FMA (x86-64-v3: Intel since Haswell, 2013; AMD since Excavator, 2015), which this one "
+        "is not; in a virtual machine let it see the host's processor");
+#endif
+  bind_corners(module);
+  bind_matching(module);
+  bind_vocabulary(module);
+}

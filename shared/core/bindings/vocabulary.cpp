@@ -1,0 +1,48 @@
+#include "arrays.h"  // first: Python's header comes before the system's
+
+#include "vocabulary.h"
+
+using namespace fleetmap;
+
+namespace {
+
+using Packed = Array<uint64_t, -1, 4>;
+using Numbers = Array<int32_t, -1>;
+
+// Children come after their parent and before the end: every descent ends in a leaf.
+void check_tree(const Packed& centres, const Numbers& first_child, const Numbers& child_count, const Numbers& word_of_node) {
+  const int64_t nodes = int64_t(centres.shape(0));
+  for (const Numbers* column : {&first_child, &child_count, &word_of_node})
+    if (int64_t(column->shape(0)) != nodes) throw nb::value_error("a vocabulary's columns have one number for each node");
+  if (nodes == 0) throw nb::value_error("a vocabulary has a root");
+  for (int64_t node = 0; node < nodes; ++node) {
+    const int64_t first = first_child(node), last = first + child_count(node);
+    if (child_count(node) > 0 && (first <= node || last > nodes)) throw nb::value_error("a vocabulary's children follow their parents");
+  }
+}
+
+auto descend_of(const Packed& descriptors, const Packed& centres, const Numbers& first_child, const Numbers& child_count,
+                const Numbers& word_of_node) {
+  check_tree(centres, first_child, child_count, word_of_node);
+  const size_t count = descriptors.shape(0);
+  std::vector<int32_t> words(count);
+  const Tree tree{{centres.data(), centres.shape(0)}, first_child.data(), child_count.data(), word_of_node.data()};
+  unlocked([&] { descend({descriptors.data(), count}, tree, words.data()); });
+  return as_numpy<int32_t, 1>(std::move(words), {count});
+}
+
+auto two_nearest_of(const Packed& descriptors, const Packed& centres) {
+  const size_t count = descriptors.shape(0);
+  std::vector<int32_t> found(2 * count);
+  unlocked([&] { two_nearest({descriptors.data(), count}, {centres.data(), centres.shape(0)}, found.data()); });
+  return as_numpy<int32_t, 2>(std::move(found), {count, 2});
+}
+
+}  // namespace
+
+void bind_vocabulary(nb::module_& module) {
+  const auto descriptors = "descriptors"_a.noconvert(), centres = "centres"_a.noconvert();
+  module.def("descend", &descend_of, descriptors, centres, "first_child"_a.noconvert(), "child_count"_a.noconvert(),
+             "word_of_node"_a.noconvert());
+  module.def("two_nearest", &two_nearest_of, descriptors, centres);
+}

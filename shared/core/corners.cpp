@@ -1,0 +1,235 @@
+#include "corners.h"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <cstring>
+#include <numbers>
+
+namespace fleetmap {
+namespace {
+
+constexpr ptrdiff_t kCircleRadius = 3;
+
+// The whole pixel towards zero; far outside for what is not finite.
+inline ptrdiff_t whole(double coordinate) {
+  return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000;
+}
+
+template <bool kHighest>
+inline uint8_t extreme(uint8_t a, uint8_t b) {
+  return (kHighest ? a > b : a < b) ? a : b;
+}
+
+// Of all nine pixels in a row of the circle their highest, and of those the lowest; or the other way round. Rows of nine share rows
+// of eight. All loops are unrolled, so that the caller's loop over pixels becomes one over wide registers.
+template <bool kHighest>
+inline uint8_t best_arc(const uint8_t (&circle)[16]) {
+  uint8_t twos[8], fours[8], eights[8];
+#pragma GCC unroll 8
+  for (int k = 0; k < 8; ++k) twos[k] = extreme<kHighest>(circle[2 * k + 1], circle[(2 * k + 2) % 16]);
+#pragma GCC unroll 8
+  for (int k = 0; k < 8; ++k) fours[k] = extreme<kHighest>(twos[k], twos[(k + 1) % 8]);
+#pragma GCC unroll 8
+  for (int k = 0; k < 8; ++k) eights[k] = extreme<kHighest>(fours[k], fours[(k + 2) % 8]);
+  uint8_t best = extreme<kHighest>(eights[0], extreme<!kHighest>(circle[0], circle[9]));
+#pragma GCC unroll 8
+  for (int k = 1; k < 8; ++k)
+    best = extreme<!kHighest>(best, extreme<kHighest>(eights[k], extreme<!kHighest>(circle[2 * k], circle[(2 * k + 9) % 16])));
+  return best;
+}
+
+// Scores of pixels of a row, 0 for no corner.
+[[gnu::always_inline]] inline void score_pixels(const uint8_t* __restrict at, ptrdiff_t stride, ptrdiff_t count, uint8_t threshold,
+                                                uint8_t* __restrict score) {
+  const uint8_t *up3 = at - 3 * stride, *up2 = at - 2 * stride, *up1 = at - stride;
+  const uint8_t *down1 = at + stride, *down2 = at + 2 * stride, *down3 = at + 3 * stride;
+  for (ptrdiff_t x = 0; x < count; ++x) {
+    const uint8_t circle[16] = {up3[x],   up3[x + 1],   up2[x + 2],   up1[x + 3],   at[x + 3], down1[x + 3], down2[x + 2], down3[x + 1],
+                                down3[x], down3[x - 1], down2[x - 2], down1[x - 3], at[x - 3], up1[x - 3],   up2[x - 2],   up3[x - 1]};
+    const uint8_t centre = at[x], arc_low = best_arc<false>(circle), arc_high = best_arc<true>(circle);
+    const uint8_t brighter = arc_low > centre ? arc_low - centre : 0, darker = centre > arc_high ? centre - arc_high : 0;
+    const uint8_t found = brighter > darker ? brighter : darker;
+    score[x] = found > threshold ? found : 0;
+  }
+}
+
+// As score_pixels, in blocks of one wide register, of which the last overlaps the one before. `at`: the first pixel of the row that is
+// three from the image's edges.
+void score_row(const uint8_t* at, ptrdiff_t stride, ptrdiff_t count, uint8_t threshold, uint8_t* score) {
+  constexpr ptrdiff_t kBlock = 32;
+  if (count < kBlock) return score_pixels(at, stride, count, threshold, score);
+  for (ptrdiff_t x = 0; x < count; x += kBlock) {
+    const ptrdiff_t begin = std::min(x, count - kBlock);
+    score_pixels(at + begin, stride, kBlock, threshold, score + begin);
+  }
+}
+
+// Calls visit(x) for each x from first to last whose byte of the row is not 0.
+template <typename Visit>
+inline void for_each_set(const uint8_t* row, ptrdiff_t first, ptrdiff_t last, const Visit& visit) {
+  ptrdiff_t x = first;
+  for (; x + 8 <= last; x += 8) {
+    uint64_t bytes;
+    std::memcpy(&bytes, row + x, sizeof bytes);
+    while (bytes != 0) {
+      const int k = std::countr_zero(bytes) / 8;
+      bytes &= ~(uint64_t(0xFF) << (8 * k));
+      visit(x + k);
+    }
+  }
+  for (; x < last; ++x)
+    if (row[x] != 0) visit(x);
+}
+
+}  // namespace
+
+std::vector<Pixel> fast_corners(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free) {
+  std::vector<Pixel> corners;
+  const ptrdiff_t width = image.width, height = image.height;
+  if (std::min(width, height) <= 2 * border) return corners;
+  // Scores of three rows: that which is looked through, the one above and the one below.
+  std::vector<uint8_t> scores(3 * size_t(width), 0);
+  auto scores_of = [&](ptrdiff_t y) { return scores.data() + (y % 3) * width; };
+  auto score = [&](ptrdiff_t y) {
+    if (y < kCircleRadius || y >= height - kCircleRadius)
+      std::fill_n(scores_of(y), width, uint8_t(0));
+    else
+      score_row(image.row(y) + kCircleRadius, width, width - 2 * kCircleRadius, uint8_t(threshold), scores_of(y) + kCircleRadius);
+  };
+  score(border - 1);
+  score(border);
+  for (ptrdiff_t y = border; y < height - border; ++y) {
+    score(y + 1);
+    const uint8_t *above = scores_of(y - 1), *here = scores_of(y), *below = scores_of(y + 1);
+    for_each_set(here, border, width - border, [&](ptrdiff_t x) {
+      const uint8_t s = here[x];
+      if (free != nullptr && free[y * width + x] == 0) return;
+      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] &&
+          s > below[x] && s > below[x + 1])
+        corners.push_back({float(x), float(y)});
+    });
+  }
+  return corners;
+}
+
+void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double* scores) {
+  constexpr ptrdiff_t kHalf = 3, kRim = kHalf + 1;
+  for (size_t n = 0; n < count; ++n) {
+    scores[n] = 0.0;
+    const ptrdiff_t x = whole(pixels[n].x), y = whole(pixels[n].y);
+    if (x < kRim || y < kRim || x >= image.width - kRim || y >= image.height - kRim) continue;
+    // The window as rows of eight pixels, of which the eighth is not counted: in the last row that is used it may be the first of the
+    // next row of the image.
+    constexpr int kCells = 8 * 7;
+    uint8_t left[kCells], right[kCells], middle[kCells + 16];
+    const uint8_t* corner = image.row(y - kHalf) + x - kHalf;
+    for (ptrdiff_t v = 0; v < 7; ++v) {
+      std::memcpy(left + 8 * v, corner + v * image.width - 1, 8);
+      std::memcpy(right + 8 * v, corner + v * image.width + 1, 8);
+    }
+    for (ptrdiff_t v = 0; v < 9; ++v) std::memcpy(middle + 8 * v, corner + (v - 1) * image.width, 8);
+    int16_t along[kCells], down[kCells];
+    for (int k = 0; k < kCells; ++k) {
+      along[k] = k % 8 < 7 ? int16_t(right[k] - left[k]) : int16_t(0);
+      down[k] = k % 8 < 7 ? int16_t(middle[k + 16] - middle[k]) : int16_t(0);
+    }
+    int32_t sum_xx = 0, sum_xy = 0, sum_yy = 0;
+    for (int k = 0; k < kCells; ++k) {
+      sum_xx += along[k] * along[k];
+      sum_xy += along[k] * down[k];
+      sum_yy += down[k] * down[k];
+    }
+    const double xx = sum_xx, xy = sum_xy, yy = sum_yy;
+    const double mean = 0.5 * (xx + yy);
+    scores[n] = mean - std::sqrt(std::max(mean * mean - (xx * yy - xy * xy), 0.0));
+  }
+}
+
+std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
+                                   size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
+  const ptrdiff_t columns = ptrdiff_t(double(width) / distance) + 1, rows = ptrdiff_t(double(height) / distance) + 1;
+  struct Held {
+    double x, y;
+    int64_t earlier;  // in the same cell
+  };
+  std::vector<Held> held;
+  held.reserve(taken_count + std::min(count, candidates));
+  std::vector<int64_t> newest(size_t(rows * columns), -1);
+  auto hold = [&](double x, double y, ptrdiff_t column, ptrdiff_t row) {
+    int64_t& cell = newest[size_t(row * columns + column)];
+    held.push_back({x, y, cell});
+    cell = int64_t(held.size()) - 1;
+  };
+  for (size_t n = 0; n < taken_count; ++n) {
+    const double column = std::floor(taken[n].x / distance), row = std::floor(taken[n].y / distance);
+    if (column >= 0.0 && column < double(columns) && row >= 0.0 && row < double(rows))
+      hold(taken[n].x, taken[n].y, ptrdiff_t(column), ptrdiff_t(row));
+  }
+  std::vector<int64_t> chosen;
+  for (size_t k = 0; k < candidates && chosen.size() < count; ++k) {
+    const double x = pixels[order[k]].x, y = pixels[order[k]].y;
+    const ptrdiff_t column = ptrdiff_t(x / distance), row = ptrdiff_t(y / distance);
+    bool is_free = true;
+    for (ptrdiff_t r = std::max<ptrdiff_t>(row - 1, 0); r < std::min(row + 2, rows); ++r)
+      for (ptrdiff_t c = std::max<ptrdiff_t>(column - 1, 0); c < std::min(column + 2, columns); ++c)
+        for (int64_t n = newest[size_t(r * columns + c)]; is_free && n >= 0; n = held[size_t(n)].earlier) {
+          const double dx = held[size_t(n)].x - x, dy = held[size_t(n)].y - y;
+          is_free = dx * dx + dy * dy >= distance * distance;
+        }
+    if (!is_free) continue;
+    hold(x, y, column, row);
+    chosen.push_back(order[k]);
+  }
+  return chosen;
+}
+
+void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius) {
+  const double reach = radius - 0.75;  // from the nearest whole pixel
+  const ptrdiff_t size = ptrdiff_t(reach);
+  for (size_t n = 0; n < count; ++n) {
+    const double nearest_x = std::floor(double(taken[n].x) + 0.5), nearest_y = std::floor(double(taken[n].y) + 0.5);
+    if (!(nearest_x >= 0.0 && nearest_y >= 0.0 && nearest_x < double(free.width) && nearest_y < double(free.height))) continue;
+    const ptrdiff_t x = ptrdiff_t(nearest_x), y = ptrdiff_t(nearest_y);
+    for (ptrdiff_t v = -std::min(size, y); v <= std::min(size, free.height - 1 - y); ++v) {
+      const ptrdiff_t half = ptrdiff_t(std::sqrt(reach * reach - double(v * v)));
+      const ptrdiff_t first = std::max<ptrdiff_t>(x - half, 0), last = std::min(x + half + 1, free.width);
+      std::fill(free.row(y + v) + first, free.row(y + v) + last, uint8_t(0));
+    }
+  }
+}
+
+void centroid_angles(GreyImage image, const Pixel* pixels, size_t count, int radius, float* degrees) {
+  std::vector<ptrdiff_t> reach(size_t(radius) + 1);
+  for (int v = 0; v <= radius; ++v) reach[size_t(v)] = ptrdiff_t(std::sqrt(double(radius * radius - v * v)));
+  for (size_t n = 0; n < count; ++n) {
+    const ptrdiff_t x = whole(pixels[n].x + 0.5), y = whole(pixels[n].y + 0.5);
+    const bool is_inside = x >= radius && y >= radius && x < image.width - radius && y < image.height - radius;
+    int64_t moment_x = 0, moment_y = 0;
+    for (ptrdiff_t v = -radius; v <= radius; ++v) {
+      const uint8_t* row = image.row(std::clamp<ptrdiff_t>(y + v, 0, image.height - 1));
+      const ptrdiff_t r = reach[size_t(std::abs(v))];
+      int32_t along = 0, total = 0;
+      if (is_inside) {
+        for (ptrdiff_t u = 0; u <= 2 * r; ++u) {
+          const int32_t value = row[x - r + u];
+          along += int32_t(u) * value;
+          total += value;
+        }
+        along -= int32_t(r) * total;
+      } else {
+        for (ptrdiff_t u = -r; u <= r; ++u) {
+          const int32_t value = row[std::clamp<ptrdiff_t>(x + u, 0, image.width - 1)];
+          along += int32_t(u) * value;
+          total += value;
+        }
+      }
+      moment_x += along;
+      moment_y += v * total;
+    }
+    const double angle = std::fmod(std::atan2(double(moment_y), double(moment_x)) * (180.0 / std::numbers::pi), 360.0);
+    degrees[n] = float(angle < 0.0 ? angle + 360.0 : angle);
+  }
+}
+
+}  // namespace fleetmap

@@ -1,0 +1,54 @@
+"""The compiled core, of shared/core. Arrays are taken as they are, C-contiguous and of the type named here, and never converted.
+
+Headers there say what each function does. Images (H, W) uint8 grey, descriptors (N, 4) uint64 of 256 bits, pixels (N, 2) float32.
+ValueError for sizes and numbers that cannot be, TypeError for another kind of array; what is not finite gives values.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+_Descriptors = NDArray[np.uint64]
+_Grey = NDArray[np.uint8]
+_Numbers = NDArray[np.int32]
+_Indices = NDArray[np.int64]
+_Pixels = NDArray[np.float32]
+
+def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
+    """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
+
+def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) -> _Indices:
+    """(P, 2) pairs that are each other's nearest."""
+
+def mutual_within(
+    a: _Descriptors, nodes_a: _Numbers, b: _Descriptors, nodes_b: _Numbers, max_distance: int, ratio: float
+) -> _Indices:
+    """(P, 2) pairs that are each other's nearest, of nodes_a (A, 2) and nodes_b (B,) that share one."""
+
+def descend(
+    descriptors: _Descriptors,
+    centres: _Descriptors,
+    first_child: _Numbers,
+    child_count: _Numbers,
+    word_of_node: _Numbers,
+) -> _Numbers:
+    """(N,) words of a vocabulary's tree, whose arrays have a row for each node."""
+
+def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
+    """(N, 2) numbers of the nearest and the second nearest centre."""
+
+def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
+    """(N, 2) whole-pixel corners, row by row."""
+
+def min_eigenvalue_scores(image: _Grey, pixels: _Pixels) -> NDArray[np.float64]:
+    """(N,) smaller eigenvalue of the gradient matrix around each pixel."""
+
+def select_spread(
+    pixels: _Pixels, order: _Indices, taken: _Pixels, distance_px: float, count: int, width: int, height: int
+) -> _Indices:
+    """Indices of up to `count` pixels, no two within distance_px."""
+
+def clear_discs(free: _Grey, taken: _Pixels, radius_px: float) -> None:
+    """Sets what is near to one of `taken` to 0."""
+
+def centroid_angles_deg(image: _Grey, pixels: _Pixels, radius: int) -> NDArray[np.float32]:
+    """(N,) direction from each pixel to the intensity centroid of its disc."""

@@ -1,0 +1,110 @@
+"""The compiled core is what its types say: same functions, arguments and results; other arrays are refused by the argument's name."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from fleetmap import _core, core  # type: ignore[attr-defined]
+from support.fleet.contracts_documents import text
+
+STUB = {
+    node.name: node for node in ast.parse(text("shared/fleetmap/_core.pyi")).body if isinstance(node, ast.FunctionDef)
+}
+# What nanobind calls the types of the stub's names.
+DTYPES = {"_Descriptors": "uint64", "_Grey": "uint8", "_Numbers": "int32", "_Indices": "int64", "_Pixels": "float32"}
+
+
+def named(annotation: ast.expr | None) -> str:
+    """A stub's type in nanobind's words."""
+    written = ast.unparse(annotation) if annotation is not None else "?"
+    for name, dtype in DTYPES.items():
+        written = re.sub(rf"\b{name}\b", f"dtype={dtype}", written)
+    return re.sub(r"NDArray\[np\.(\w+)\]", r"dtype=\1", written)
+
+
+def compiled(name: str) -> tuple[list[tuple[str, str]], str]:
+    """Arguments with their types, and the result's type, of a function of the module, as its signature says."""
+    signature = re.sub(r"(?:numpy\.)?ndarray\[(dtype=\w+)[^\]]*\]", r"\1", inspect.getdoc(getattr(_core, name)) or "")
+    found = re.fullmatch(rf"{name}\((.*)\) -> (.*)", signature.splitlines()[0])
+    assert found, signature
+    arguments = [part.split(": ", 1) for part in re.split(r", (?=\w+: )", found[1])]
+    return [(argument, kind) for argument, kind in arguments], found[2]
+
+
+def test_the_stub_names_every_function() -> None:
+    assert set(STUB) == {name for name in dir(_core) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("name", STUB)
+def test_arguments_and_results_are_those_of_the_stub(name: str) -> None:
+    wanted = [(argument.arg, named(argument.annotation)) for argument in STUB[name].args.args]
+    assert compiled(name) == (wanted, named(STUB[name].returns))
+
+
+@pytest.mark.parametrize("name", STUB)
+def test_an_array_of_another_type_is_refused(name: str) -> None:
+    """Not converted, which would cost a copy in each frame without a word."""
+    strange = np.zeros((2, 2, 2), np.complex128)
+    with pytest.raises(TypeError, match=rf"{name}\(\): incompatible function arguments"):
+        getattr(_core, name)(*[strange] * len(STUB[name].args.args))
+
+
+WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
+IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
+OUTSIDE = np.full((3, 2), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: core.mutual_within(WORDS, np.full((3, 2), -1, np.int32), WORDS, NUMBERS, 64, 0.8), "nodes"),
+        (lambda: core.mutual_within(WORDS, np.zeros((2, 2), np.int32), WORDS, NUMBERS, 64, 0.8), "node for each"),
+        (lambda: core.descend(WORDS, WORDS, NUMBERS, NUMBERS + 5, NUMBERS), "children"),
+        (lambda: core.descend(WORDS, WORDS[:0], NUMBERS[:0], NUMBERS[:0], NUMBERS[:0]), "root"),
+        (lambda: core.descend(WORDS, WORDS, NUMBERS[:2], NUMBERS, NUMBERS), "one number for each node"),
+        (lambda: core.fast_corners(IMAGE, 300, 3, None), "threshold"),
+        (lambda: core.fast_corners(IMAGE, 20, 2, None), "border_px"),
+        (lambda: core.fast_corners(IMAGE, 20, 3, IMAGE[:5]), "free"),
+        (lambda: core.select_spread(PIXELS, np.array([3]), PIXELS, 5.0, 9, 30, 20), "order"),
+        (lambda: core.select_spread(OUTSIDE, np.array([1]), PIXELS, 5.0, 9, 30, 20), "pixels"),
+        (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, float("nan"), 9, 30, 20), "distance_px"),
+        (lambda: core.clear_discs(IMAGE.copy(), PIXELS, float("nan")), "radius_px"),
+        (lambda: core.centroid_angles_deg(IMAGE[:0], PIXELS, 15), "image"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(call: object, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        call()  # type: ignore[operator]
+
+
+def test_what_is_not_finite_or_outside_gives_values() -> None:
+    free = np.full((20, 30), 255, np.uint8)
+    core.clear_discs(free, OUTSIDE, 5.0)
+    assert free.all()
+    assert (core.min_eigenvalue_scores(IMAGE, OUTSIDE) == 0).all()
+    assert len(core.centroid_angles_deg(IMAGE, OUTSIDE, 15)) == 3
+    assert len(core.select_spread(PIXELS, np.arange(3), OUTSIDE, 5.0, 9, 30, 20)) == 1
+    assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])
+def test_a_core_that_is_missing_or_cannot_run_says_what_to_do(error: str, told: str) -> None:
+    script = f"""
+import sys
+class Finder:
+    def find_spec(name, path, target=None):
+        if name == "fleetmap._core": raise {error}("needs AVX2")
+sys.meta_path.insert(0, Finder)
+from fleetmap.cli_exit import run_cli
+def start():
+    import fleetmap.features.orb
+run_cli(start)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1), done.stderr
+    assert told in done.stderr
