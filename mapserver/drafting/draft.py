@@ -31,6 +31,7 @@ from mapserver.drafting.report import (
     Accuracy,
     BuildReport,
     accuracy,
+    estimated_trajectory,
     library_versions,
     loop_places,
     make_report,
@@ -53,6 +54,7 @@ from mapserver.drafting.survey_recordings import (
 )
 from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
+from mapserver.evaluation.trajectory_error import truth_from_estimate
 from mapserver.floor_plan.survey_requests import open_requests
 from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
@@ -265,14 +267,17 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         joined = joining.finish()
     run.times.begin("storing")
     say_left_out(run.console, run.request.site, surveyed, joined)
-    found = accuracy(joined.map, joined_truth(surveyed, joined))
+    truth = joined_truth(surveyed, joined)
+    found = accuracy(joined.map, truth)
     if options.frame_from_ground_truth:
-        if found.rigid is None:
+        if truth is None or found.rigid is None:
             raise RecordingError(
                 f"{run.request.recordings[0]}: too few estimated frames have a ground truth; build without "
                 "--frame-from-ground-truth"
             )
-        joined = replace(joined, map=transform_map(joined.map, found.rigid.frame_from_estimate))
+        joined = replace(
+            joined, map=transform_map(joined.map, truth_from_estimate(estimated_trajectory(joined.map), truth))
+        )
     return Built(surveyed, joined, found, is_first=base is None)
 
 

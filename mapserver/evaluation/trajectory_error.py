@@ -79,6 +79,20 @@ def absolute_trajectory_error(
     )
 
 
+def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
+    """(4, 4) least-squares alignment of whole poses: positions, and points 0.1 m along either side of each axis of the body.
+
+    Positions of a straight drive leave the turn about it open; where they spread over metres the points beside them weigh nothing.
+    """
+    mine, true = paired(estimate, truth)
+    beside = 0.1 * np.hstack([np.eye(3), -np.eye(3)])
+    corners = [
+        (poses.positions_m[:, :, None] + poses.frame_from_body[:, :3, :3] @ beside).transpose(0, 2, 1).reshape(-1, 3)
+        for poses in (true, mine)
+    ]
+    return align_points(*corners)[0]
+
+
 def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, float] | None:
     """How many seconds later, within 0.05, the truth has to be read to fit best, and the rigid ATE that is left then.
 
