@@ -16,6 +16,16 @@ inline ptrdiff_t whole(double coordinate) {
   return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000;
 }
 
+// Eight numbers in one wide register, by the compilers' vector types: loops over bytes come out half as fast.
+template <typename Number>
+using Eight [[gnu::vector_size(8 * sizeof(Number))]] = Number;
+
+inline Eight<int16_t> eight(const uint8_t* pixels) {
+  Eight<uint8_t> bytes;
+  std::memcpy(&bytes, pixels, sizeof bytes);
+  return __builtin_convertvector(bytes, Eight<int16_t>);
+}
+
 template <bool kHighest>
 inline uint8_t extreme(uint8_t a, uint8_t b) {
   return (kHighest ? a > b : a < b) ? a : b;
@@ -119,26 +129,23 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
     scores[n] = 0.0;
     const ptrdiff_t x = whole(pixels[n].x), y = whole(pixels[n].y);
     if (x < kRim || y < kRim || x >= image.width - kRim || y >= image.height - kRim) continue;
-    // The window as rows of eight pixels, of which the eighth is not counted: in the last row that is used it may be the first of the
-    // next row of the image.
-    constexpr int kCells = 8 * 7;
-    uint8_t left[kCells], right[kCells], middle[kCells + 16];
+    // Rows of eight pixels, of which the eighth is not counted: in the last row that is used it may be the first of the next row of the
+    // image.
     const uint8_t* corner = image.row(y - kHalf) + x - kHalf;
+    Eight<int32_t> column_xx = {}, column_xy = {}, column_yy = {};
     for (ptrdiff_t v = 0; v < 7; ++v) {
-      std::memcpy(left + 8 * v, corner + v * image.width - 1, 8);
-      std::memcpy(right + 8 * v, corner + v * image.width + 1, 8);
-    }
-    for (ptrdiff_t v = 0; v < 9; ++v) std::memcpy(middle + 8 * v, corner + (v - 1) * image.width, 8);
-    int16_t along[kCells], down[kCells];
-    for (int k = 0; k < kCells; ++k) {
-      along[k] = k % 8 < 7 ? int16_t(right[k] - left[k]) : int16_t(0);
-      down[k] = k % 8 < 7 ? int16_t(middle[k + 16] - middle[k]) : int16_t(0);
+      const uint8_t* row = corner + v * image.width;
+      const auto along = __builtin_convertvector(eight(row + 1) - eight(row - 1), Eight<int32_t>);
+      const auto down = __builtin_convertvector(eight(row + image.width) - eight(row - image.width), Eight<int32_t>);
+      column_xx += along * along;
+      column_xy += along * down;
+      column_yy += down * down;
     }
     int32_t sum_xx = 0, sum_xy = 0, sum_yy = 0;
-    for (int k = 0; k < kCells; ++k) {
-      sum_xx += along[k] * along[k];
-      sum_xy += along[k] * down[k];
-      sum_yy += down[k] * down[k];
+    for (int u = 0; u < 7; ++u) {
+      sum_xx += column_xx[u];
+      sum_xy += column_xy[u];
+      sum_yy += column_yy[u];
     }
     const double xx = sum_xx, xy = sum_xy, yy = sum_yy;
     const double mean = 0.5 * (xx + yy);
