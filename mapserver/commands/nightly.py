@@ -30,7 +30,6 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     Status 0 also with an empty inbox, 4 if the gate refuses, 5 if another run is at work.
     """
     options.check()
-
     from fleetmap.console import plain_console
     from fleetmap.recordings import FrameSelection
     from mapserver.nightly import NightRequest, run_night

@@ -48,7 +48,8 @@ def changes(
 
     with open_store(store, read_only=True) as maps:
         found = SurfelChanges(maps).between(site, before, after)
-    data = changes_png(found) if file.suffix == ".png" else to_json(changes_geojson(found))
+    is_picture = file.suffix.lower() == ".png"
+    data = changes_png(found) if is_picture else to_json(changes_geojson(found))
     write_output(file, data)
     x, y = found.corner_m
     said = ", ".join(
@@ -57,7 +58,7 @@ def changes(
     )
     typer.echo(
         f"site {site}, version {before} to {after}: {said}; {file} has them"
-        + (f", its lower left corner at ({x:.2f}, {y:.2f}) m, {CELL_M} m a pixel" if file.suffix == ".png" else "")
+        + (f", its lower left corner at ({x:.2f}, {y:.2f}) m, {CELL_M} m a pixel" if is_picture else "")
     )
 
 

@@ -45,7 +45,8 @@ def test_what_changed_is_written_as_a_plan_and_as_geojson(run, site, tmp_path: P
     said = run("map", "changes", *site, 3, 4, tmp_path / "c.png")
     assert "1 patches appeared" in said
     assert "0 patches vanished" in said
-    assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
+    run("map", "changes", *site, 3, 4, tmp_path / "C.PNG")
+    assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("c.png", "C.PNG"))
     run("map", "changes", *site, 4, 3, tmp_path / "c.geojson")
     found = json.loads((tmp_path / "c.geojson").read_text())
     assert [feature["properties"]["change"] for feature in found["features"]] == ["vanished"]
