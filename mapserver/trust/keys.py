@@ -38,9 +38,9 @@ def make_key(path: Path, passphrase: str | None) -> "CryptoSigner":
     from securesystemslib.signer import CryptoSigner
 
     key = Ed25519PrivateKey.generate()
-    if path.exists():
-        raise StoreError(f"{path} is a key already, and a key is never overwritten; name another folder")
     with disk_errors(f"the key {path} cannot be written", "check the folder"):
+        if path.exists():
+            raise StoreError(f"{path} is a key already, and a key is never overwritten; name another folder")
         if not path.parent.is_dir():
             make_folder(path.parent)
         write_atomically(path, [key_pem(key, passphrase)])

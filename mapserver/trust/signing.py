@@ -109,17 +109,17 @@ def init_here(store: MapStore) -> None:
 
     Errors as of `update_lists`; StateError where there are lists already.
     """
-    repository = _repository(store)
-    repository.init(repository.keys.signer("root") or repository.keys.make("root"))
+    with _held(store) as repository:
+        repository.init(repository.keys.signer("root") or repository.keys.make("root"))
     update_lists(store)
 
 
 def init_offline(store: MapStore, folder: Path) -> tuple[Path, str]:
     """Signed lists whose root key lies in `folder`, encrypted; its file and passphrase. Errors as of `init_here`."""
-    repository = _repository(store)
-    repository.check_empty()
-    key, made = _offline_key(folder, 1)
-    repository.init(key)
+    with _held(store) as repository:
+        repository.check_empty()
+        key, made = _offline_key(folder, 1)
+        repository.init(key)
     update_lists(store)
     return made
 
@@ -169,18 +169,26 @@ def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None)
 @contextmanager
 def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["ListRepository"]:
     """The lists for one change, checked before it; afterwards `words` stand in the log, and the server signs what follows from it."""
-    repository = _repository(store)
-    if not repository.lists.are_there:
+    lists = SignedLists(store.folder)
+    if not lists.are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
-    if retired := [words for role, words in repository.lists.retired().items() if role in ("root", "targets")]:
+    if retired := [words for role, words in lists.retired().items() if role in ("root", "targets")]:
         raise UsageError(retired[0])
+    with _held(store) as repository:
+        repository.check_root_key(root_key)
+        yield repository
+    store.audit("trust changed", words)
+    update_lists(store, all_anew=True)
+
+
+@contextmanager
+def _held(store: MapStore) -> Iterator["ListRepository"]:
+    """The lists, which nobody else begins or changes meanwhile: of two that make a key, one would replace that of the other."""
+    repository = _repository(store)
     with disk_errors(f"{repository.lists.folder} cannot be changed", "check its rights"):
         make_folder(repository.lists.folder)
         with locked(repository.lists.folder / "lock", shared=False):
-            repository.check_root_key(root_key)
             yield repository
-    store.audit("trust changed", words)
-    update_lists(store, all_anew=True)
 
 
 def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":

@@ -1,5 +1,6 @@
 """What a store signs: after each release, before something expires, never what robots would refuse; and what the server tells robots."""
 
+import fcntl
 import json
 import os
 import re
@@ -99,6 +100,26 @@ def test_nothing_is_told_before_the_first_list(tmp_path: Path, clock: Clock) -> 
         assert trust_status(store).faults == ["site lab: no key may sign its maps; `mapserver trust admit lab`"]
         signing.admit_site(store, "lab", load_key(path, words))
         assert (told(store, 1), trust_status(store).faults) == (1, [])
+
+
+def test_two_servers_do_not_make_the_keys_of_a_store_at_once(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def make(keys: KeyFolder, name: str) -> CryptoSigner:
+        with (lists / "lock").open() as lock, pytest.raises(BlockingIOError):
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        made.append(name)
+        return make_key(keys.path(name), None)
+
+    monkeypatch.setattr(KeyFolder, "make", make)
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
+        lists = SignedLists(store.folder).folder
+        init_here(store)
+        with pytest.raises(StateError, match="has signed lists already"):
+            init_here(store)
+    assert made == ["root", "online"]
 
 
 def test_lists_are_signed_anew_before_they_end(store: MapStore, clock: Clock) -> None:
@@ -293,8 +314,9 @@ def test_keys_are_for_their_owner_and_encrypted(tmp_path: Path, monkeypatch: pyt
     for wrong in (None, make_passphrase()):
         with pytest.raises(UsageError, match="passphrase"):
             load_key(path, wrong)
-    with pytest.raises(StoreError, match="never overwritten"):
-        make_key(path, words)
+    for place, reason in ((path, "never overwritten"), (tmp_path / ("k" * 300), "cannot be written")):
+        with pytest.raises(StoreError, match=reason):
+            make_key(place, words)
     (tmp_path / "credentials").mkdir()
     (tmp_path / "credentials" / "fleetmap-online").write_text(words + "\n")
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
