@@ -82,10 +82,10 @@ def samples(late_s: float = 0.0, axes_rad: Array | float = 0.0, bias_radps: floa
 
 
 def found(
-    imu: ImuSamples, *, seen_sigma_rad: float = 0.0005, turns: float = 1.0, ahead_s: float = 0.01
+    imu: ImuSamples, *, seen_sigma_rad: float = 0.0005, turns: float = 1.0, ahead_s: float = 0.01, limit_s: float = 0.06
 ) -> float | None:
     """What is found in six seconds; turns: the images' share of the true ones, ahead_s: of samples, when a frame comes."""
-    clock, rng = GyroClock(0.06), np.random.default_rng(2)
+    clock, rng = GyroClock(limit_s), np.random.default_rng(2)
     for k in range(1, 120):
         turn = turns * np.diff(yaw_rad(np.array([k - 1, k]) * FRAME_NS * 1e-9))
         seen = so3_exp(np.array([0.0, 0.0, turn[0]]) + seen_sigma_rad * rng.normal(size=3))
@@ -120,6 +120,12 @@ def test_no_other_fault_is_taken_for_a_wrong_clock(imu: ImuSamples) -> None:
 def test_images_that_see_no_turn_and_samples_that_come_late_accuse_no_clock() -> None:
     assert found(samples(), turns=0.0) is None
     assert found(samples(), ahead_s=-0.2) is None
+
+
+@pytest.mark.parametrize("limit_s", [0.0, 0.003, 0.01])
+def test_clocks_that_are_said_to_be_exact_are_not_accused_of_nothing(limit_s: float) -> None:
+    assert found(samples(), limit_s=limit_s) is None
+    assert found(samples(0.1), limit_s=limit_s) == pytest.approx(0.1, abs=0.02)
 
 
 @pytest.mark.parametrize(("wrong", "frames"), [("accelerometer", 80), ("clock", 50)])
