@@ -107,7 +107,9 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
     values = _parse_yaml(text, where)
     if "camera_matrix" in values:
         return CalibrationFile(RigCalibration((_ros_camera(values, where),), assumed=("base_from_body",)), {})
-    names = sorted((key for key in values if key.startswith("cam") and key[3:].isdigit()), key=lambda key: int(key[3:]))
+    names = sorted(
+        (key for key in values if key.startswith("cam") and key[3:].isdecimal()), key=lambda key: int(key[3:])
+    )
     if not names:
         raise CalibrationError(
             f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...), or for a "

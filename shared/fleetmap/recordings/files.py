@@ -78,4 +78,4 @@ def hash_file(path: Path, digest: "hashlib._Hash") -> None:
 
 def natural_key(name: str) -> tuple[object, ...]:
     """Sorts file names by the numbers in them."""
-    return tuple(int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name))
+    return tuple(int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name))

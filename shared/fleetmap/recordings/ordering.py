@@ -175,7 +175,7 @@ def _check_steps(stamps_ns: Stamps, what: str) -> None:
 
 def check_seconds(value: float, where: str) -> None:
     """RecordingError for what is too large for seconds since 1970, with the unit that it looks like."""
-    if abs(value) > 1e10:
+    if abs(value) > 9_223_372_036:  # what 64 bits of nanoseconds hold
         factor = next((factor for factor in _FINER if abs(value) < 1e11 * factor), 1_000_000_000)
         why = f"{value:.0f} is no time in seconds"
         raise wrong_unit(f"{where}:", _FINER[factor], why, f"divide them by {factor}")

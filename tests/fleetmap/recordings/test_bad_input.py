@@ -78,6 +78,32 @@ def test_camera_folder_without_table_or_images(euroc: Path) -> None:
         open_recording(euroc)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"), [("1403636579763555584.png", "times.txt"), (f"{10**25}.png", "times.txt"), ("².png", "")]
+)
+@pytest.mark.parametrize("has_times", [True, False])
+def test_names_of_kitti_images_that_are_no_number_of_a_frame(
+    tmp_path: Path, name: str, words: str, has_times: bool
+) -> None:
+    folder = write_kitti(tmp_path / "r", SAMPLE)
+    if has_times:
+        (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    shutil.copy(next((folder / "image_0").iterdir()), folder / "image_0" / name)
+    if not words:
+        assert len(open_recording(folder)) == 4
+        return
+    with pytest.raises(RecordingError, match=words):
+        open_recording(folder)
+
+
+def test_links_to_images_that_are_not_there_are_left_out_and_counted(euroc: Path) -> None:
+    image = euroc / "mav0/cam0/data/image2.png"
+    image.unlink()
+    image.symlink_to("nowhere.png")
+    recording = open_recording(euroc)
+    assert recording.issues[0] == DataIssue("cam0: images missing", "1 of 4, the first is image2.png")
+
+
 def test_zero_byte_image_is_left_out_and_counted(euroc: Path) -> None:
     (euroc / "mav0/cam0/data/image3.png").write_bytes(b"")
     recording = open_recording(euroc)

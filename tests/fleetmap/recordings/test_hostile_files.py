@@ -133,6 +133,16 @@ def test_records_are_measured_before_they_are_read(tmp_path: Path) -> None:
         assert any("1 left out" in issue.detail for issue in recording.issues if "too large" in issue.what)
 
 
+@pytest.mark.parametrize("length", [1 << 40, 1 << 63, (1 << 64) - 1])
+def test_lengths_inside_of_records_are_not_believed(tmp_path: Path, length: int) -> None:
+    lying = struct.pack("<Q", length) + b"0123456789"
+    bad_chunk = record(6, struct.pack("<QQQII", 0, 0, 100, 0, 0) + lying)
+    bad_attachment = record(9, struct.pack("<QQ", 0, 0) + _text("name") + _text("text/plain") + lying)
+    with open_recording(with_bomb(tmp_path, bad_chunk + bad_attachment)) as recording:
+        assert len(recording) == 4
+        assert {"damaged chunks (checksum or compression)", "a damaged record"} <= {i.what for i in recording.issues}
+
+
 def test_an_index_that_points_at_the_whole_file_is_not_read_at_once(tmp_path: Path) -> None:
     path = tmp_path / "sparse.mcap"
     with path.open("wb") as file:

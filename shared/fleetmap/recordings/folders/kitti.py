@@ -1,5 +1,6 @@
 """KITTI odometry folders: rectified image pairs, calib.txt, poses.txt and times.txt where they are. No IMU."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 # Folder names and the rows of calib.txt that describe them
 _PAIRS = (("image_l", "image_r", 0, 1), ("image_0", "image_1", 0, 1), ("image_2", "image_3", 2, 3))
 _PERIOD_NS = 100_000_000
+_MOST_NUMBER = 10**10  # three decades
 
 
 def recognises(path: Path) -> bool:
@@ -68,17 +70,22 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
 def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageFiles:
     if not folder.is_dir():
         raise RecordingError(f"{folder} is missing, the other camera's folder is there; copy the recording again")
-    paths = sorted((p for p in folder.iterdir() if p.is_file() and p.stem.isdigit()), key=lambda p: natural_key(p.name))
+    paths = sorted(
+        (p for p in folder.iterdir() if p.is_file() and p.stem.isdecimal()), key=lambda p: natural_key(p.name)
+    )
     if not paths:
         raise RecordingError(f"{folder} holds no numbered image such as 000000.png; copy the recording again")
-    numbers = np.array([int(path.stem) for path in paths], np.int64)
-    if stamps_of_number is None:
-        return existing_images(numbers * _PERIOD_NS, paths, folder.name, log)
-    beyond = np.flatnonzero(numbers >= len(stamps_of_number))
-    if len(beyond):
+    numbers = [int(path.stem) for path in paths]
+    most = _MOST_NUMBER if stamps_of_number is None else len(stamps_of_number) - 1
+    beyond = next((path for path, number in zip(paths, numbers, strict=True) if number > most), None)
+    if beyond is not None and stamps_of_number is None:
         raise RecordingError(
-            f"{paths[beyond[0]]} has no line in times.txt, which ends with number {len(stamps_of_number) - 1}"
+            f"{beyond}: {beyond.stem} is no frame's number; count from 0, and write the seconds to times.txt"
         )
+    if beyond is not None:
+        raise RecordingError(f"{beyond} has no line in times.txt, which ends with number {most}")
+    if stamps_of_number is None:
+        return existing_images(np.array(numbers, np.int64) * _PERIOD_NS, paths, folder.name, log)
     return existing_images(stamps_of_number[numbers], paths, folder.name, log)
 
 
@@ -112,7 +119,7 @@ def _projections(file: Path) -> dict[int, Array]:
             values = [float(word) for word in numbers.split()]
         except ValueError:
             raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers") from None
-        if len(values) == 12 and (not colon or (label.startswith("P") and label[1:].isdigit())):
+        if len(values) == 12 and (not colon or re.fullmatch(r"P\d{1,3}", label)):
             rows[int(label[1:]) if colon else len(rows)] = np.array(values).reshape(3, 4)
     return rows
 

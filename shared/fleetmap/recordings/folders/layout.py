@@ -94,7 +94,10 @@ def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: Re
     """
     series = ImageSeries(stamps_ns, tuple(paths)).forward(what, log)
     folders = [folder for folder in {path.parent for path in series.sources} if folder.is_dir()]
-    file_bytes = {entry.path: entry.stat().st_size for folder in folders for entry in os.scandir(folder)}
+    file_bytes: dict[str, int] = {}
+    for entry in (entry for folder in folders for entry in os.scandir(folder)):
+        with contextlib.suppress(OSError):  # a link to a file that is not there
+            file_bytes[entry.path] = entry.stat().st_size
     left_out: dict[str, list[str]] = {}
     kept, sizes_px = [], []
     for index, path in enumerate(series.sources):

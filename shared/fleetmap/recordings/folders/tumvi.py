@@ -63,7 +63,9 @@ def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
         rows = [line.split() for line in read_table(times).splitlines() if not line.startswith("#")]
         stamp_of = {row[0]: _stamp_ns(row[1], times) for row in rows if len(row) >= 2}
     else:
-        stamp_of = {stem: int(stem) for stem in sorted(files, key=natural_key) if stem.isdigit()}
+        stamp_of = {
+            stem: int(stem) for stem in sorted(files, key=natural_key) if stem.isdecimal() and int(stem) < 1 << 63
+        }
     listed = [stem for stem in stamp_of if stem in files]
     if not listed:
         raise RecordingError(

@@ -223,7 +223,7 @@ class McapFile(KeptBytes):
     def _unpacked_chunk(self, at: int) -> bytes:
         if at not in self._chunks:
             self._file.seek(at - 8)
-            (length,) = struct.unpack("<Q", self._file.read(8))
+            length = int.from_bytes(self._file.read(8), "little")
             chunk = _parsed(Opcode.CHUNK, self._file.read(min(length, _MAX_RECORD_BYTES)))
             while len(self._chunks) >= _KEPT_CHUNKS:
                 del self._chunks[next(iter(self._chunks))]
@@ -266,5 +266,5 @@ def _parsed(opcode: int, content: bytes | memoryview) -> Any:
     """A record by the mcap library, which is given its content alone; ValueError for what is none."""
     try:
         return _PARSED[opcode].read(ReadDataStream(BytesIO(content)))
-    except (McapError, struct.error, UnicodeDecodeError) as error:
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:  # the last: of lengths beyond 63 bits
         raise ValueError("it ends too early, or is no text") from error
