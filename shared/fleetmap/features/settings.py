@@ -1,5 +1,9 @@
 """Settings of features; apart from the code, so that reading a configuration compiles nothing."""
 
+from typing import Annotated
+
+from msgspec import Meta
+
 from fleetmap.config import Section
 
 
@@ -7,10 +11,10 @@ class OrbSettings(Section, frozen=True):
     """The extractor, a name in `EXTRACTORS`, how many features it finds and where."""
 
     extractor: str = "grid-orb"
-    count: int = 1000
+    count: Annotated[int, Meta(ge=0)] = 1000
     levels: int = 8  # of the image pyramid, 1.2 apart
-    fast_threshold: int = 12  # grey levels; halved where too few corners are found
-    min_distance_px: float = 7.0  # between features of a level
+    fast_threshold: Annotated[int, Meta(ge=0, le=255)] = 12  # grey levels; halved where too few corners are found
+    min_distance_px: Annotated[float, Meta(ge=0.1)] = 7.0  # between features of a level
 
 
 class StereoSettings(Section, frozen=True):

@@ -11,7 +11,7 @@ class TrackerSettings(Section, frozen=True):
     """Points to follow from frame to frame."""
 
     max_points: int = 180  # tracked at a time
-    min_distance_px: float = 22.0  # between tracked points
+    min_distance_px: Annotated[float, Meta(ge=0.1)] = 22.0  # between tracked points
     window_px: Annotated[int, Meta(ge=3, le=15)] = 15  # of the optical flow
     pyramid_levels: int = 3  # of the optical flow
     back_check_px: float = 0.5  # forward-backward error of the flow

@@ -1,6 +1,7 @@
 """Grid ORB: spread, orientation, scale and determinism."""
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -74,3 +75,11 @@ def test_features_are_deterministic_and_none_are_found_on_nothing(image: NDArray
     np.testing.assert_array_equal(first.pixels, second.pixels)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
     assert len(orb.detect(np.full((HEIGHT, WIDTH), 7, np.uint8), OrbSettings())) == 0
+
+
+@pytest.mark.parametrize(
+    "given", [{"fast_threshold": 300}, {"fast_threshold": -1}, {"min_distance_px": 0.0}, {"count": -1}]
+)
+def test_settings_that_no_corner_can_have_are_refused_where_they_are_read(given: dict[str, float]) -> None:
+    with pytest.raises(msgspec.ValidationError, match="Expected"):
+        msgspec.convert(given, OrbSettings)
