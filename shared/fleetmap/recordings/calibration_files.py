@@ -362,7 +362,7 @@ def _numbers(value: object, count: int | None, where: str) -> Array:
 def _need(values: Values, key: str, where: str) -> Any:
     if key not in values:
         none = "; images without distortion have distortion_model: none" if key.startswith("distortion") else ""
-        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(values)[:200]}{none}")
+        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(map(str, values))[:200]}{none}")
     return values[key]
 
 

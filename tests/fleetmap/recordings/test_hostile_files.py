@@ -180,6 +180,8 @@ HOSTILE_YAML: dict[str, Any] = {
     "a number of 5000 digits": "cam0: " + "9" * 5000,
     "a sexagesimal": "cam0: 1" + ":1" * 200_000,
     "keys that are numbers": "1: 2",
+    "keys of a camera that are numbers": "cam0: {1: 2}",
+    "a camera with a superscript": "cam0: {}\ncam²: {}",
     "keys that are lists": "? [1]\n: 2",
     "a merge of nothing": "<<: 3",
     "a number beyond floats": "cam0: {camera_model: pinhole, resolution: [1"
