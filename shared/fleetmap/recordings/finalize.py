@@ -117,8 +117,8 @@ def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:
 def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
     """(D,) one stamp for each moment of which an image is damaged and that is no frame: of a pair both may be."""
     moments: list[int] = []
-    for stamp_ns in sorted(damaged_ns):
-        if np.abs(frame_stamps_ns - stamp_ns).min() > 0 and (not moments or stamp_ns - moments[-1] > PAIR_TOLERANCE_NS):
+    for stamp_ns in np.setdiff1d(np.array(damaged_ns, np.int64), frame_stamps_ns).tolist():
+        if not moments or stamp_ns - moments[-1] > PAIR_TOLERANCE_NS:
             moments.append(stamp_ns)
     return np.array(moments, np.int64)
 
