@@ -87,8 +87,10 @@ def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
     mine, true = paired(estimate, truth)
     beside = 0.1 * np.hstack([np.eye(3), -np.eye(3)])
     corners = [
-        (poses.positions_m[:, :, None] + poses.frame_from_body[:, :3, :3] @ beside).transpose(0, 2, 1).reshape(-1, 3)
-        for poses in (true, mine)
+        (trajectory.positions_m[:, :, None] + trajectory.frame_from_body[:, :3, :3] @ beside)
+        .transpose(0, 2, 1)
+        .reshape(-1, 3)
+        for trajectory in (true, mine)
     ]
     return align_points(*corners)[0]
 

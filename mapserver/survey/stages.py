@@ -2,12 +2,15 @@
 
 | stage | takes | gives |
 |---|---|---|
-| `follow` | frames, IMU, wheels | odometry of all frames, keyframes with their features |
+| `follow` | frames, IMU, wheels, or given poses | odometry of all frames, keyframes with their features |
 | `adjust_chain` | odometry | keyframes matched with their neighbours, landmarks, both adjusted; of a long recording segment by segment |
-| `close_loops` | the chain | revisits, and keyframes where the pose graph with them says |
+| `close_loops` | the chain, vocabulary, zones, position priors | revisits, and keyframes where the pose graph with them says |
 | `adjust_globally` | keyframes after loops | all views matched anew, adjusted together; the stereo pair's error of yaw |
 | `keep_largest` | the adjusted state | the connected component that becomes the map |
-| `place_frames`, `assemble` | the state that is kept | all frames, and the map |
+| `place_frames`, `assemble` | the state that is kept | all frames, and the map; observations that do not fit are culled |
+
+`mapserver build` calls `survey` from drafting/survey_recordings.py; drafting/draft.py goes on with its map: the site's current map, tiles.
+Settings are given to every stage; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each of them.
 """
 
 from collections.abc import Callable
@@ -27,6 +30,7 @@ from mapserver.survey.finish.map_assembly import assemble
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.keyframes.connected_components import (
     Component,
+    Components,
     SigmaBetween,
     between_kept,
     find_components,
@@ -109,14 +113,21 @@ def _finished(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, 
     odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
-    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
-    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
+    state, odometry, loops, components = keep_largest(state, odometry, loops, settings)
     placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
     survey_map, culled = assemble(state, odometry, placed, settings)
     between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
     return Survey(survey_map, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+
+
+def keep_largest(
+    state: SurveyState, odometry: OdometryPass, loops: Loops, settings: SurveySettings
+) -> tuple[SurveyState, OdometryPass, Loops, Components]:
+    """The largest connected component, which becomes the map, and what all components are."""
+    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
+    return *only_kept(state, odometry, loops, components.kept), components
 
 
 def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:

@@ -1,4 +1,5 @@
-"""Camera models: pixel_from_ray and ray_from_pixel for each. To add one: a file here and a line in CAMERA_MODELS."""
+"""Camera models: pixel_from_ray and ray_from_pixel for each. To add one: a file here, a line in CAMERA_MODELS, and one in _NAMES
+for each name that calibration files have for it. Parameters beyond fx, fy, cx and cy are its `distortion`."""
 
 from dataclasses import dataclass
 from typing import Protocol
