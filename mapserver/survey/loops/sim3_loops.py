@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleetmap.geometry import Array, transform_points
-from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges
 from mapserver.survey.pose_graph.sim3_pose_graph import SimilarityEdge, SimilarityResult, optimize_similarities
 
 _MIN_SHARED = 8  # points with depth in both keyframes below which a loop says nothing about the scale
@@ -50,7 +50,9 @@ def solve_scaled(
     """The bodies that agree best with chain and loops, each loop with its measured change of scale.
 
     `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. Scales are in the distances between places.
+    SurveyError as `check_edges`.
     """
+    check_edges(len(map_from_body), [*chain, *loops])
     edges = [_edge(edge, 0.0, scale_walk) for edge in chain]
     edges += [_edge(edge, *scales.get((edge.i, edge.j), (0.0, _UNKNOWN_SIGMA))) for edge in loops]
     return optimize_similarities(map_from_body, edges)

@@ -82,9 +82,8 @@ def optimize_pose_graph(
             doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
             for n in sorted(set(range(graph.size())) - set(loops)):
                 certain.push_back(graph.at(n))
-            bound = float(
-                2.0 * gammaincinv(3.0, _INLIER_PROBABILITY)
-            )  # chi-square; scipy.stats takes half a second to import
+            # chi-square; scipy.stats takes half a second to import
+            bound = float(2.0 * gammaincinv(3.0, _INLIER_PROBABILITY))
             weights, begin = loop_weights(certain, doubtful, start, bound)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]

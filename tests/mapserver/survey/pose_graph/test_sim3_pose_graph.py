@@ -7,7 +7,6 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, align_points, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from mapserver.survey.loops.sim3_loops import gate_covariances, measured_log_scale, solve_scaled
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
-from mapserver.survey.pose_graph.sim3_pose_graph import SimilarityEdge, optimize_similarities
 
 COUNT = 120
 CHAIN_COV = np.diag([0.002**2] * 3 + [0.008**2] * 3)
@@ -95,10 +94,12 @@ def test_a_wrong_loop_is_disbelieved() -> None:
     assert scale_errors(result.map_from_body, truth)[1] < 0.005
 
 
-def test_a_keyframe_without_an_edge_is_named() -> None:
-    edges = [SimilarityEdge(0, 1, np.eye(4), 1.0, np.eye(7), is_loop=False)]
-    with pytest.raises(SurveyError, match=r"\[2, 3\]"):
-        optimize_similarities(circle()[:4], edges)
+def test_edges_that_cannot_be_solved_are_named() -> None:
+    start = circle()[:4]
+    chain, loop = chain_of(start), PoseEdge(3, 0, np.eye(4), np.nan * LOOP_COV, is_loop=True)
+    for edges, loops, reason in ((chain[:1], [], r"\[2, 3\]"), (chain, [loop], "edge 3-0: .* not finite")):
+        with pytest.raises(SurveyError, match=reason):
+            solve_scaled(start, edges, loops, {}, WALK)
 
 
 def test_points_of_both_keyframes_measure_the_scale() -> None:
