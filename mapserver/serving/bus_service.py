@@ -233,10 +233,10 @@ class ByteCache:
     def get(self, sha256: str) -> bytes:
         """The bytes of an address, read where they are not held; errors as of `read`."""
         with self._lock:
-            data = self._held.pop(sha256, None)
-            if data is None:
-                data = self._read(sha256)
-            self._held[sha256] = data
+            if (held := self._held.pop(sha256, None)) is not None:
+                self._held[sha256] = held
+                return held
+            data = self._held[sha256] = self._read(sha256)
             while self.total_bytes() > self._max_bytes:
                 del self._held[next(iter(self._held))]
             return data
