@@ -78,21 +78,16 @@ def test_camera_folder_without_table_or_images(euroc: Path) -> None:
         open_recording(euroc)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"), [("1403636579763555584.png", "times.txt"), (f"{10**25}.png", "times.txt"), ("².png", "")]
-)
+@pytest.mark.parametrize("name", ["1403636579763555584.png", f"{10**25}.png"])
 @pytest.mark.parametrize("has_times", [True, False])
-def test_names_of_kitti_images_that_are_no_number_of_a_frame(
-    tmp_path: Path, name: str, words: str, has_times: bool
-) -> None:
+def test_names_of_kitti_images_that_are_no_number_of_a_frame(tmp_path: Path, name: str, has_times: bool) -> None:
     folder = write_kitti(tmp_path / "r", SAMPLE)
     if has_times:
         (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
-    shutil.copy(next((folder / "image_0").iterdir()), folder / "image_0" / name)
-    if not words:
-        assert len(open_recording(folder)) == 4
-        return
-    with pytest.raises(RecordingError, match=words):
+    shutil.copy(next((folder / "image_0").iterdir()), folder / "image_0" / "².png")
+    assert len(open_recording(folder)) == 4
+    shutil.copy(folder / "image_0" / "².png", folder / "image_0" / name)
+    with pytest.raises(RecordingError, match=rf"{name}.*times\.txt"):
         open_recording(folder)
 
 
