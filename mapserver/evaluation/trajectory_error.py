@@ -11,6 +11,7 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
 _MAX_SHIFT_S = 0.05
+_OPEN_TURN_RAD = np.deg2rad(1.0)  # rotations of a motion capture system's bodies are as far off
 _KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 _SHORT_LENGTHS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # for runs too short for KITTI's
 _POSITION_BOUND, _BOUND = 7.8147, 12.5916  # 0.95 of chi-square with 3 and 6 degrees of freedom
@@ -80,19 +81,23 @@ def absolute_trajectory_error(
 
 
 def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
-    """(4, 4) least-squares alignment of whole poses: positions, and points 0.1 m along either side of each axis of the body.
+    """(4, 4) least-squares alignment of positions, and of rotations where those lie on a line and leave the turn about it open.
 
-    Positions of a straight drive leave the turn about it open; where they spread over metres the points beside them weigh nothing.
+    Open is a turn that the positions' own errors, at the distance of the path's second width, could make. Rotations then count as
+    points 0.1 m along either side of each axis of the body.
     """
     mine, true = paired(estimate, truth)
+    by_positions, _ = align_points(true.positions_m, mine.positions_m)
+    error_m = _rms(np.linalg.norm(transform_points(by_positions, mine.positions_m) - true.positions_m, axis=1))
+    spread = np.linalg.svd(true.positions_m - true.positions_m.mean(0), compute_uv=False)
+    if error_m <= _OPEN_TURN_RAD * float(spread[1]) / np.sqrt(len(true)):
+        return by_positions
     beside = 0.1 * np.hstack([np.eye(3), -np.eye(3)])
-    corners = [
-        (trajectory.positions_m[:, :, None] + trajectory.frame_from_body[:, :3, :3] @ beside)
-        .transpose(0, 2, 1)
-        .reshape(-1, 3)
-        for trajectory in (true, mine)
-    ]
-    return align_points(*corners)[0]
+
+    def corners(of: Trajectory) -> Array:
+        return (of.positions_m[:, :, None] + of.frame_from_body[:, :3, :3] @ beside).transpose(0, 2, 1).reshape(-1, 3)
+
+    return align_points(corners(true), corners(mine))[0]
 
 
 def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, float] | None:

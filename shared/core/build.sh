@@ -1,6 +1,6 @@
 #!/bin/sh
 # Builds fleetmap._core into shared/fleetmap, as far as its sources changed: shared/core/build.sh VENV, which has cmake, ninja, nanobind
-# and Eigen's headers (extra `core`). Where no C++ compiler is installed it takes that of `ziglang` from the package index.
+# and Eigen's headers. Where no C++ compiler is installed it takes that of `ziglang` from the package index.
 set -eu
 core=$(cd "$(dirname "$0")" && pwd)
 venv=$(cd "$1" && pwd)

@@ -283,9 +283,12 @@ BAD_ENTRIES = {
     "a FIFO in a folder": (_in_recording(os.mkfifo), "more is a FIFO"),
     "a FIFO as a table": (_in_recording(os.mkfifo, "mav0/imu0/data.csv"), "data.csv is a FIFO"),
     "folders without end": (_in_recording(_deep), "levels of folders"),
-    "a table of terabytes": (_in_recording(_sparse(1 << 41), "mav0/imu0/data.csv"), "1024 MiB"),
+    "a table of terabytes": (_in_recording(_sparse(1 << 41), "mav0/imu0/data.csv"), "at most 1073741824 are read"),
     "a table of one line": (_in_recording(_long_line, "mav0/imu0/data.csv"), "no row"),
-    "a calibration of terabytes": (_in_recording(_sparse(1 << 41), "mav0/cam0/sensor.yaml"), "1048576 bytes"),
+    "a calibration of terabytes": (
+        _in_recording(_sparse(1 << 41), "mav0/cam0/sensor.yaml"),
+        "at most 1048576 are read",
+    ),
     "a zip file": (lambda path: path.write_bytes(b"PK\3\4" + bytes(30)), "`unzip` it"),
     "an MCAP file of holes": (_sparse(1 << 41, b"\x89MCAP0\r\n"), "MCAP"),
 }
