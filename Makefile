@@ -2,9 +2,9 @@
 #
 #   make demo                  survey a simulated warehouse, serve its map, localize the robots of the next day in it
 #   make demo RECORDING=PATH   build a map of half of a recording, serve it, localize the other half in it
-#   make test                  all tests but the long ones, six minutes on two cores
+#   make test                  all tests but the long ones
 #   make test-all              every test: with browser walks, fault sweeps, real recordings, nights and drills
-#   make test-ci               make test, and of the long tests one drive, one fault sweep and one browser walk
+#   make test-ci               make test, and those of the long tests that CI runs (tests/tiers.toml)
 #   make check                 format, lint, types, import contracts
 #   make docs                  write the tables of docs/command_line.md and docs/settings.md anew
 #   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
