@@ -6,7 +6,6 @@ import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial.so3_kernels import (
-    exp_into,
     inverse_left_jacobian_into,
     log_into,
     matmul3,
@@ -17,6 +16,7 @@ from fleetmap.inertial.so3_kernels import (
     right_jacobian_into,
 )
 from fleetmap.numerics.kernel import kernel
+from fleetmap.numerics.linear_kernels import exp_into
 
 Moment = tuple[Array, Array, Array]
 """Rotation (3, 3), position (3,) and motion (9,) of a keyframe: velocity, gyro bias, accelerometer bias."""

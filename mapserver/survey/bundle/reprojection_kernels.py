@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.inertial.so3_kernels import exp_into, matmul3
+from fleetmap.inertial.so3_kernels import matmul3
 from fleetmap.numerics.kernel import inline_kernel, kernel
+from fleetmap.numerics.linear_kernels import exp_into
 from mapserver.survey.bundle.schur_kernels import Eliminated, ObservationTable, View, add_lifted
 
 MIN_DEPTH_M = 0.02

@@ -4,7 +4,6 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.inertial.so3_kernels import (
-    exp_into,
     matmul3,
     matmul3_skew,
     matmul3_transposed,
@@ -12,6 +11,7 @@ from fleetmap.inertial.so3_kernels import (
     right_jacobian_into,
 )
 from fleetmap.numerics.kernel import kernel
+from fleetmap.numerics.linear_kernels import exp_into
 from fleetmap.sensors.samples import Stamps
 
 

@@ -9,8 +9,6 @@ from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
 from fleetmap.numerics.linear_kernels import skew_series
 
-SMALL_ANGLE_RAD = 1e-4  # below it the series' next term is under 1e-17
-
 
 @kernel
 def matmul3(left: Array, right: Array, out: Array) -> None:
@@ -50,17 +48,6 @@ def matmul3_skew(matrix: Array, vector: Array, out: Array) -> None:
         out[a, 0] = matrix[a, 1] * z - matrix[a, 2] * y
         out[a, 1] = matrix[a, 2] * x - matrix[a, 0] * z
         out[a, 2] = matrix[a, 0] * y - matrix[a, 1] * x
-
-
-@kernel
-def exp_into(rotvec_rad: Array, out: Array) -> None:
-    """out = the rotation of a rotation vector. Source: Rodrigues' formula."""
-    squared = rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2
-    angle = np.sqrt(squared)
-    if angle < SMALL_ANGLE_RAD:
-        skew_series(rotvec_rad, 1.0 - squared / 6.0, 0.5 - squared / 24.0, out)
-    else:
-        skew_series(rotvec_rad, np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared, out)
 
 
 @kernel

@@ -8,6 +8,8 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
 
+SMALL_ANGLE_RAD = 1e-4  # below it the series' next term is under 1e-17
+
 
 @kernel
 def matmul(a: Array, b: Array) -> Array:
@@ -99,17 +101,21 @@ def skew_series(vector: Array, linear: float, square: float, out: Array) -> None
 
 
 @kernel
-def exp_so3(rotvec: Array) -> Array:
-    """(3, 3) rotation of a rotation vector."""
-    x, y, z = rotvec[0], rotvec[1], rotvec[2]
-    squared = x * x + y * y + z * z
+def exp_into(rotvec_rad: Array, out: Array) -> None:
+    """out = the rotation of a rotation vector. Source: Rodrigues' formula."""
+    squared = rotvec_rad[0] ** 2 + rotvec_rad[1] ** 2 + rotvec_rad[2] ** 2
     angle = np.sqrt(squared)
-    if angle < 1e-6:
-        a, b = 1.0 - squared / 6.0, 0.5 - squared / 24.0
+    if angle < SMALL_ANGLE_RAD:
+        skew_series(rotvec_rad, 1.0 - squared / 6.0, 0.5 - squared / 24.0, out)
     else:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared
+        skew_series(rotvec_rad, np.sin(angle) / angle, (1.0 - np.cos(angle)) / squared, out)
+
+
+@kernel
+def exp_so3(rotvec_rad: Array) -> Array:
+    """(3, 3) rotation of a rotation vector."""
     out = np.empty((3, 3))
-    skew_series(rotvec, a, b, out)
+    exp_into(rotvec_rad, out)
     return out
 
 

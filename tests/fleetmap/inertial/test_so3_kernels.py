@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import so3_exp, so3_left_jacobian, so3_log
-from fleetmap.inertial.so3_kernels import exp_into, inverse_left_jacobian_into, log_into, right_jacobian_into
+from fleetmap.inertial.so3_kernels import inverse_left_jacobian_into, log_into, right_jacobian_into
+from fleetmap.numerics.linear_kernels import exp_into
 
 AXES = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1], [0.6, -0.48, 0.64], [-0.3, 0.9, 0.316227766]])
 ANGLES = [0.0, 1e-12, 1e-6, 0.99e-4, 1.01e-4, 0.99e-2, 1.01e-2, 0.5, 2.0, 3.0, np.pi - 1e-7]

@@ -7,17 +7,13 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.numerics.kernel import kernel
-from fleetmap.numerics.linear_kernels import exp_so3, matmul, rotate
+from fleetmap.numerics.linear_kernels import exp_so3, matmul, rotate, skew
 from fleetmap.numerics.transform_kernels import (
     adjoint,
     copy_into,
     earlier_from_later,
     inverse,
-    product,
-    rotation_of,
-    skewed,
     transform_of,
-    turned,
 )
 from fleetmap.odometry.filter.covariance_kernels import with_clone, without_errors
 
@@ -53,9 +49,9 @@ def turn_clones(rotations: Array, positions: Array, errors: Array) -> None:
 @kernel
 def apply_error(state: State, rotations: Array, positions: Array, error: Array) -> None:
     """Corrects state and clones in place by an error (16 + 6 M,): state, time offset, clones."""
-    turn = rotation_of(error[0:3])
-    velocity, position = turned(turn, state.velocity), turned(turn, state.position)
-    copy_into(state.rotation, product(turn, state.rotation))
+    turn = exp_so3(error[0:3])
+    velocity, position = rotate(turn, state.velocity), rotate(turn, state.position)
+    copy_into(state.rotation, matmul(turn, state.rotation))
     for a in range(3):
         state.velocity[a] = velocity[a] + error[3 + a]
         state.position[a] = position[a] + error[6 + a]
@@ -84,8 +80,8 @@ def add_clone(window: Window, state: State, rate_body: Array, considered: int, o
         copy_into(rotations[m], window.rotations[m])
     copy_into(positions, window.positions)
     copy_into(rotations[count], state.rotation)
-    turn, by_offset = turned(state.rotation, rate_body), np.empty(6)
-    moved = turned(skewed(state.position), turn)
+    turn, by_offset = rotate(state.rotation, rate_body), np.empty(6)
+    moved = rotate(skew(state.position), turn)
     for a in range(3):
         positions[count, a] = state.position[a]
         by_offset[a], by_offset[3 + a] = turn[a], state.velocity[a] + moved[a]
@@ -113,23 +109,23 @@ def cam_from_earlier(
     state: State, rotation: Array, position: Array, cam_from_body: Array, body_from_cam: Array
 ) -> Array:
     """(4, 4) from the camera of an earlier body, a rotation and a position, to that of the state."""
-    body_from_earlier = product(
-        product(cam_from_body, inverse(state.rotation, state.position)), transform_of(rotation, position)
+    body_from_earlier = matmul(
+        matmul(cam_from_body, inverse(state.rotation, state.position)), transform_of(rotation, position)
     )
-    return product(body_from_earlier, body_from_cam)
+    return matmul(body_from_earlier, body_from_cam)
 
 
 @kernel
 def body_covariance(position: Array, true_error_cov: Array, considered: int) -> Array:
     """(6, 6) of rotation and position of the state, from that of its errors, which begin at number `considered`."""
     jacobian = np.zeros((6, 9))
-    lever = skewed(position)
+    lever = skew(position)
     for a in range(3):
         jacobian[a, a] = jacobian[3 + a, 6 + a] = 1.0
         for b in range(3):
             jacobian[3 + a, b] = -lever[a, b]
     own = true_error_cov[considered : considered + 9, considered : considered + 9]
-    return product(product(jacobian, own), jacobian.T)
+    return matmul(matmul(jacobian, own), jacobian.T)
 
 
 @kernel
@@ -143,7 +139,7 @@ def motion_since(window: Window, index: int, errors: int) -> tuple[Array, Array]
             difference[a, b] = both - c[end + a, at + b] - c[at + a, end + b]
     carry = adjoint(inverse(window.rotations[index], window.positions[index]))
     earlier_from_now = earlier_from_later(window.rotations, window.positions, index, newest)
-    return earlier_from_now, product(product(carry, difference), carry.T)
+    return earlier_from_now, matmul(matmul(carry, difference), carry.T)
 
 
 @kernel
@@ -162,11 +158,11 @@ def wheel_rows(
     for a in range(3):
         rate[a] = gyro[a] - state.gyro_bias[a]
     base_body = inverse(turn, base_from_body[:3, 3])[:3, 3]
-    base_from_odom, turning = product(turn, state.rotation.T), turned(turn, rate)
-    driven, swung = turned(base_from_odom, state.velocity), turned(turn, turned(skewed(rate), base_body))
+    base_from_odom, turning = matmul(turn, state.rotation.T), rotate(turn, rate)
+    driven, swung = rotate(base_from_odom, state.velocity), rotate(turn, rotate(skew(rate), base_body))
     # R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
     copy_into(jacobian[:3, 3:6], base_from_odom)
-    copy_into(jacobian[:3, 9:12], product(turn, skewed(base_body)))
+    copy_into(jacobian[:3, 9:12], matmul(turn, skew(base_body)))
     residual = np.empty(4)
     for a in range(3):
         jacobian[3, 9 + a] = -turn[2, a]
