@@ -1,0 +1,89 @@
+// Small dense linear algebra on matrices row by row. Sums go in the order of their terms: the same bits everywhere.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <vector>
+
+namespace fleetmap {
+
+// A matrix that owns its numbers, zero at first. Those that every frame needs are kept and resized, so that nothing is allocated.
+struct Matrix {
+  std::vector<double> values;
+  size_t rows = 0, columns = 0;
+
+  Matrix() = default;
+  Matrix(size_t rows, size_t columns) : values(rows * columns), rows(rows), columns(columns) {}
+  void resize(size_t new_rows, size_t new_columns) {
+    rows = new_rows, columns = new_columns;
+    values.assign(rows * columns, 0.0);
+  }
+  double* operator[](size_t row) { return values.data() + row * columns; }
+  const double* operator[](size_t row) const { return values.data() + row * columns; }
+};
+
+// out (n, m) = a (n, k) b (k, m), all without gaps; out is neither of them.
+inline void multiply(const double* a, const double* b, double* __restrict out, size_t n, size_t k, size_t m) {
+  for (size_t i = 0; i < n; ++i) {
+    double* __restrict row = out + i * m;
+    for (size_t j = 0; j < m; ++j) row[j] = 0.0;
+    size_t at = 0;
+    for (; at + 4 <= k; at += 4) {  // so that a row is read and written once for four additions
+      const double x0 = a[i * k + at], x1 = a[i * k + at + 1], x2 = a[i * k + at + 2], x3 = a[i * k + at + 3];
+      if (x0 == 0.0 && x1 == 0.0 && x2 == 0.0 && x3 == 0.0) continue;
+      const double *b0 = b + at * m, *b1 = b0 + m, *b2 = b1 + m, *b3 = b2 + m;
+      for (size_t j = 0; j < m; ++j) row[j] = row[j] + x0 * b0[j] + x1 * b1[j] + x2 * b2[j] + x3 * b3[j];
+    }
+    for (; at < k; ++at) {
+      const double x = a[i * k + at];
+      if (x == 0.0) continue;
+      for (size_t j = 0; j < m; ++j) row[j] += x * b[at * m + j];
+    }
+  }
+}
+
+// Fills the lower triangle of symmetric a (n, n), rows `stride` apart, with its Cholesky factor; false where it is not positive definite.
+inline bool cholesky_in_place(double* a, size_t n, size_t stride) {
+  for (size_t j = 0; j < n; ++j) {
+    double* const row = a + j * stride;
+    double diagonal = row[j];
+    for (size_t k = 0; k < j; ++k) diagonal -= row[k] * row[k];
+    if (!(diagonal > 0.0)) return false;
+    diagonal = std::sqrt(diagonal);
+    row[j] = diagonal;
+    for (size_t i = j + 1; i < n; ++i) {
+      double total = a[i * stride + j];
+      for (size_t k = 0; k < j; ++k) total -= a[i * stride + k] * row[k];
+      a[i * stride + j] = total / diagonal;
+    }
+  }
+  return true;
+}
+
+// Solves lower x = b in place, b (n,).
+inline void forward_substitute(const double* lower, double* b, size_t n, size_t stride) {
+  for (size_t i = 0; i < n; ++i) {
+    double total = b[i];
+    for (size_t k = 0; k < i; ++k) total -= lower[i * stride + k] * b[k];
+    b[i] = total / lower[i * stride + i];
+  }
+}
+
+// Solves lower^T x = b in place, b (n,).
+inline void back_substitute(const double* lower, double* b, size_t n, size_t stride) {
+  for (size_t i = n; i-- > 0;) {
+    double total = b[i];
+    for (size_t k = i + 1; k < n; ++k) total -= lower[k * stride + i] * b[k];
+    b[i] = total / lower[i * stride + i];
+  }
+}
+
+// Solves a x = b in place for symmetric positive definite a (n, n), which it destroys; false where a is not definite.
+inline bool solve_spd(double* a, double* b, size_t n, size_t stride) {
+  if (!cholesky_in_place(a, n, stride)) return false;
+  forward_substitute(a, b, n, stride);
+  back_substitute(a, b, n, stride);
+  return true;
+}
+
+}  // namespace fleetmap

@@ -1,0 +1,144 @@
+// Vectors and rotations in space. Sums go from left to right, so that every compiler and every processor gives the same bits.
+#pragma once
+
+#include <cmath>
+
+namespace fleetmap {
+
+struct Vec3 {
+  double at[3];
+  double& operator[](int i) { return at[i]; }
+  double operator[](int i) const { return at[i]; }
+};
+
+inline Vec3 operator+(Vec3 a, Vec3 b) { return {a[0] + b[0], a[1] + b[1], a[2] + b[2]}; }
+inline Vec3 operator-(Vec3 a, Vec3 b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
+inline Vec3 operator-(Vec3 a) { return {-a[0], -a[1], -a[2]}; }
+inline Vec3 operator*(double s, Vec3 a) { return {s * a[0], s * a[1], s * a[2]}; }
+inline double dot(Vec3 a, Vec3 b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+inline double norm(Vec3 a) { return std::sqrt(dot(a, a)); }
+inline Vec3 cross(Vec3 a, Vec3 b) { return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}; }
+inline Vec3 vec3(const double* from) { return {from[0], from[1], from[2]}; }
+inline void store(Vec3 a, double* to) { to[0] = a[0], to[1] = a[1], to[2] = a[2]; }
+
+// Row by row: m[row][column].
+struct Mat3 {
+  double at[3][3];
+  double* operator[](int row) { return at[row]; }
+  const double* operator[](int row) const { return at[row]; }
+};
+
+constexpr Mat3 kIdentity = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+
+inline Mat3 operator*(const Mat3& a, const Mat3& b) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j];
+  return out;
+}
+inline Vec3 operator*(const Mat3& a, Vec3 v) { return {dot(vec3(a[0]), v), dot(vec3(a[1]), v), dot(vec3(a[2]), v)}; }
+inline Mat3 operator+(const Mat3& a, const Mat3& b) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] + b[i][j];
+  return out;
+}
+inline Mat3 operator*(double s, const Mat3& a) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = s * a[i][j];
+  return out;
+}
+inline Mat3 transposed(const Mat3& a) {
+  return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}};
+}
+inline double trace(const Mat3& a) { return a[0][0] + a[1][1] + a[2][2]; }
+
+// The upper left corner of a matrix in memory whose rows are `stride` numbers apart.
+inline Mat3 mat3(const double* from, int stride = 3) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = from[stride * i + j];
+  return out;
+}
+inline void store(const Mat3& a, double* to, int stride = 3) {
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) to[stride * i + j] = a[i][j];
+}
+
+// The matrix of the cross product with v.
+inline Mat3 skew(Vec3 v) { return {{{0, -v[2], v[1]}, {v[2], 0, -v[0]}, {-v[1], v[0], 0}}}; }
+
+// I + linear skew(v) + square skew(v)^2.
+inline Mat3 skew_series(Vec3 v, double linear, double square) {
+  const double x = v[0], y = v[1], z = v[2];
+  return {{{1.0 - square * (y * y + z * z), square * x * y - linear * z, square * x * z + linear * y},
+           {square * x * y + linear * z, 1.0 - square * (x * x + z * z), square * y * z - linear * x},
+           {square * x * z - linear * y, square * y * z + linear * x, 1.0 - square * (x * x + y * y)}}};
+}
+
+// The rotation of a rotation vector. Source: Rodrigues' formula.
+inline Mat3 so3_exp(Vec3 r) {
+  const double squared = dot(r, r), angle = std::sqrt(squared);
+  if (angle < 1e-4)  // below it the series' next term is under 1e-17
+    return skew_series(r, 1.0 - squared / 6.0, 0.5 - squared / 24.0);
+  return skew_series(r, std::sin(angle) / angle, (1.0 - std::cos(angle)) / squared);
+}
+
+// J with Exp(r + dr) ~ Exp(r) Exp(J dr). Source: Forster et al. 2017, eq. 8.
+inline Mat3 right_jacobian(Vec3 r) {
+  const double squared = dot(r, r), angle = std::sqrt(squared);
+  if (angle < 1e-2)
+    return skew_series(r, -0.5 + squared / 24.0 - squared * squared / 720.0,
+                       1.0 / 6.0 - squared / 120.0 + squared * squared / 5040.0);
+  return skew_series(r, -(1.0 - std::cos(angle)) / squared, (angle - std::sin(angle)) / (squared * angle));
+}
+
+// J with Log(Exp(dr) Exp(r)) ~ r + J dr; transposed, the inverse right one. Source: Forster et al. 2017, eq. 9.
+inline Mat3 inverse_left_jacobian(Vec3 r) {
+  const double squared = dot(r, r), angle = std::sqrt(squared);
+  const double square = angle < 1e-2 ? 1.0 / 12.0 + squared / 720.0 + squared * squared / 30240.0
+                                     : 1.0 / squared - (1.0 + std::cos(angle)) / (2.0 * angle * std::sin(angle));
+  return skew_series(r, -0.5, square);
+}
+
+// The rotation vector, of an angle from 0 to pi, by way of the quaternion, which is stable near pi. Source: Shepperd 1978.
+inline Vec3 so3_log(const Mat3& m) {
+  const double t = trace(m);
+  double w, x, y, z;
+  if (t > m[0][0] && t > m[1][1] && t > m[2][2]) {
+    w = 1.0 + t, x = m[2][1] - m[1][2], y = m[0][2] - m[2][0], z = m[1][0] - m[0][1];
+  } else if (m[0][0] > m[1][1] && m[0][0] > m[2][2]) {
+    w = m[2][1] - m[1][2], x = 1.0 + m[0][0] - m[1][1] - m[2][2], y = m[0][1] + m[1][0], z = m[0][2] + m[2][0];
+  } else if (m[1][1] > m[2][2]) {
+    w = m[0][2] - m[2][0], y = 1.0 - m[0][0] + m[1][1] - m[2][2], x = m[0][1] + m[1][0], z = m[1][2] + m[2][1];
+  } else {
+    w = m[1][0] - m[0][1], z = 1.0 - m[0][0] - m[1][1] + m[2][2], x = m[0][2] + m[2][0], y = m[1][2] + m[2][1];
+  }
+  if (w < 0.0) w = -w, x = -x, y = -y, z = -z;
+  const double sine = std::sqrt(x * x + y * y + z * z);
+  const double scale = sine < 1e-9 * w ? 2.0 / w : 2.0 * std::atan2(sine, w) / sine;
+  return {scale * x, scale * y, scale * z};
+}
+
+// A rigid transform of points: rotation, then translation.
+struct SE3 {
+  Mat3 rotation;
+  Vec3 translation;
+};
+
+inline SE3 operator*(const SE3& a, const SE3& b) { return {a.rotation * b.rotation, a.rotation * b.translation + a.translation}; }
+inline Vec3 operator*(const SE3& a, Vec3 point) { return a.rotation * point + a.translation; }
+inline SE3 inverse(const SE3& a) {
+  const Mat3 turned = transposed(a.rotation);
+  return {turned, -(turned * a.translation)};
+}
+// From and to matrices (4, 4) in memory.
+inline SE3 se3(const double* matrix) { return {mat3(matrix, 4), {matrix[3], matrix[7], matrix[11]}}; }
+inline void store(const SE3& a, double* matrix) {
+  store(a.rotation, matrix, 4);
+  for (int i = 0; i < 3; ++i) matrix[4 * i + 3] = a.translation[i], matrix[12 + i] = 0.0;
+  matrix[15] = 1.0;
+}
+
+}  // namespace fleetmap
