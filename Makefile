@@ -69,6 +69,7 @@ test-all: core
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/clang-format --dry-run -Werror $$(git ls-files 'shared/core/*.h' 'shared/core/*.cpp')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 

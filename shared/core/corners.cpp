@@ -12,9 +12,7 @@ namespace {
 constexpr ptrdiff_t kCircleRadius = 3;
 
 // The whole pixel towards zero; far outside for what is not finite.
-inline ptrdiff_t whole(double coordinate) {
-  return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000;
-}
+inline ptrdiff_t whole(double coordinate) { return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000; }
 
 // Eight numbers in one wide register, by the compilers' vector types: loops over bytes come out half as fast.
 template <typename Number>
@@ -115,8 +113,8 @@ std::vector<Pixel> fast_corners(GreyImage image, int threshold, ptrdiff_t border
     for_each_set(here, border, width - border, [&](ptrdiff_t x) {
       const uint8_t s = here[x];
       if (free != nullptr && free[y * width + x] == 0) return;
-      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] &&
-          s > below[x] && s > below[x + 1])
+      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] && s > below[x] &&
+          s > below[x + 1])
         corners.push_back({float(x), float(y)});
     });
   }
@@ -153,8 +151,8 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
   }
 }
 
-std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
-                                   size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
+std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken, size_t taken_count,
+                                   double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
   const ptrdiff_t columns = ptrdiff_t(double(width) / distance) + 1, rows = ptrdiff_t(double(height) / distance) + 1;
   struct Held {
     double x, y;

@@ -32,8 +32,8 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
 
 // Indices of up to count pixels, best first as order says, no two within distance of each other or of taken: greedy suppression on
 // a grid of cells of that size.
-std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
-                                   size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height);
+std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken, size_t taken_count,
+                                   double distance, size_t count, ptrdiff_t width, ptrdiff_t height);
 
 // Sets what is nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
 void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius);

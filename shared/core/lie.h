@@ -49,9 +49,7 @@ inline Mat3 operator*(double s, const Mat3& a) {
     for (int j = 0; j < 3; ++j) out[i][j] = s * a[i][j];
   return out;
 }
-inline Mat3 transposed(const Mat3& a) {
-  return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}};
-}
+inline Mat3 transposed(const Mat3& a) { return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}}; }
 inline double trace(const Mat3& a) { return a[0][0] + a[1][1] + a[2][2]; }
 
 // The upper left corner of a matrix in memory whose rows are `stride` numbers apart.
@@ -89,8 +87,7 @@ inline Mat3 so3_exp(Vec3 r) {
 inline Mat3 right_jacobian(Vec3 r) {
   const double squared = dot(r, r), angle = std::sqrt(squared);
   if (angle < 1e-2)
-    return skew_series(r, -0.5 + squared / 24.0 - squared * squared / 720.0,
-                       1.0 / 6.0 - squared / 120.0 + squared * squared / 5040.0);
+    return skew_series(r, -0.5 + squared / 24.0 - squared * squared / 720.0, 1.0 / 6.0 - squared / 120.0 + squared * squared / 5040.0);
   return skew_series(r, -(1.0 - std::cos(angle)) / squared, (angle - std::sin(angle)) / (squared * angle));
 }
 

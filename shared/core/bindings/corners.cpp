@@ -32,9 +32,10 @@ auto min_eigenvalues_of(const Image& image, const Pixels& pixels) {
   return as_numpy<double, 1>(std::move(scores), {count});
 }
 
-auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, const Pixels& taken, double distance_px, int count,
-                      int width, int height) {
-  if (!(distance_px >= 0.1 && width >= 0 && height >= 0 && count >= 0)) throw nb::value_error("distance_px: at least 0.1; sizes: not negative");
+auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, const Pixels& taken, double distance_px, int count, int width,
+                      int height) {
+  if (!(distance_px >= 0.1 && width >= 0 && height >= 0 && count >= 0))
+    throw nb::value_error("distance_px: at least 0.1; sizes: not negative");
   const int64_t known = int64_t(pixels.shape(0));
   for (size_t k = 0; k < order.shape(0); ++k)
     if (order(k) < 0 || order(k) >= known) throw nb::value_error("order: indices of pixels");
@@ -51,9 +52,8 @@ auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, con
 
 void clear_discs_of(const MutableArray<uint8_t, -1, -1>& free, const Pixels& taken, double radius_px) {
   if (!(radius_px >= 0.0 && radius_px < 1e6)) throw nb::value_error("radius_px: 0 to a million");
-  unlocked([&] {
-    clear_discs({free.data(), ptrdiff_t(free.shape(0)), ptrdiff_t(free.shape(1))}, first(taken), taken.shape(0), radius_px);
-  });
+  unlocked(
+      [&] { clear_discs({free.data(), ptrdiff_t(free.shape(0)), ptrdiff_t(free.shape(1))}, first(taken), taken.shape(0), radius_px); });
 }
 
 auto centroid_angles_deg_of(const Image& image, const Pixels& pixels, int radius) {

@@ -39,9 +39,8 @@ auto mutual_within_of(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, con
   if (!std::all_of(nodes_a.data(), nodes_a.data() + nodes_a.size(), is_node) ||
       !std::all_of(nodes_b.data(), nodes_b.data() + nodes_b.size(), is_node))
     throw nb::value_error("nodes are numbers from 0 to 2^20");
-  return pairs_array(unlocked([&] {
-    return mutual_within(descriptors_of(a), nodes_a.data(), descriptors_of(b), nodes_b.data(), max_distance, ratio);
-  }));
+  return pairs_array(
+      unlocked([&] { return mutual_within(descriptors_of(a), nodes_a.data(), descriptors_of(b), nodes_b.data(), max_distance, ratio); }));
 }
 
 }  // namespace
