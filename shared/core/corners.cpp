@@ -11,13 +11,6 @@ namespace {
 
 constexpr ptrdiff_t kCircleRadius = 3;
 
-// The whole pixel towards zero; far outside for what is not finite.
-inline ptrdiff_t whole(double coordinate) { return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000; }
-
-// Eight numbers in one wide register, by the compilers' vector types: loops over bytes come out half as fast.
-template <typename Number>
-using Eight [[gnu::vector_size(8 * sizeof(Number))]] = Number;
-
 inline Eight<int16_t> eight(const uint8_t* pixels) {
   Eight<uint8_t> bytes;
   std::memcpy(&bytes, pixels, sizeof bytes);

@@ -5,16 +5,9 @@
 #include <cstdint>
 #include <vector>
 
-namespace fleetmap {
+#include "image.h"
 
-// A grey image without gaps between its rows.
-template <typename Byte>
-struct Grey {
-  Byte* at;
-  ptrdiff_t height, width;
-  Byte* row(ptrdiff_t y) const { return at + y * width; }
-};
-using GreyImage = Grey<const uint8_t>;
+namespace fleetmap {
 
 struct Pixel {
   float x, y;

@@ -12,6 +12,7 @@ _Grey = NDArray[np.uint8]
 _Numbers = NDArray[np.int32]
 _Indices = NDArray[np.int64]
 _Pixels = NDArray[np.float32]
+_Reals = NDArray[np.float64]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -52,3 +53,19 @@ def clear_discs(free: _Grey, taken: _Pixels, radius_px: float) -> None:
 
 def centroid_angles_deg(image: _Grey, pixels: _Pixels, radius: int) -> NDArray[np.float32]:
     """(N,) direction from each pixel to the intensity centroid of its disc."""
+
+def match_rows(
+    left: _Grey,
+    right: _Grey,
+    left_half: _Grey,
+    right_half: _Grey,
+    pixels: _Reals,
+    prior_px: _Reals,
+    max_disparity_px: float,
+    min_correlation: float,
+    uniqueness: float,
+    wide_half: int,
+    narrow_half: int,
+    agreement_px: float,
+) -> _Reals:
+    """(N, 2) disparity and standard deviation of left pixels (N, 2), NaN where unknown; prior_px (N,) NaN where there is none."""

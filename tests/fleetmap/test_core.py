@@ -8,15 +8,26 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from fleetmap import _core, core  # type: ignore[attr-defined]
+from fleetmap.geometry import Array
 from support.fleet.contracts_documents import text
 
 STUB = {
     node.name: node for node in ast.parse(text("shared/fleetmap/_core.pyi")).body if isinstance(node, ast.FunctionDef)
 }
 # What nanobind calls the types of the stub's names.
-DTYPES = {"_Descriptors": "uint64", "_Grey": "uint8", "_Numbers": "int32", "_Indices": "int64", "_Pixels": "float32"}
+DTYPES = {
+    "_Descriptors": "uint64",
+    "_Grey": "uint8",
+    "_Numbers": "int32",
+    "_Indices": "int64",
+    "_Pixels": "float32",
+    "_Reals": "float64",
+}
 
 
 def named(annotation: ast.expr | None) -> str:
@@ -57,6 +68,8 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
 OUTSIDE = np.full((3, 2), np.nan, np.float32)
+PLACES = np.full((4, 2), 9.0)
+STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
 
 
 @pytest.mark.parametrize(
@@ -75,6 +88,10 @@ OUTSIDE = np.full((3, 2), np.nan, np.float32)
         (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, float("nan"), 9, 30, 20), "distance_px"),
         (lambda: core.clear_discs(IMAGE.copy(), PIXELS, float("nan")), "radius_px"),
         (lambda: core.centroid_angles_deg(IMAGE[:0], PIXELS, 15), "image"),
+        (lambda: core.match_rows(IMAGE, IMAGE[:9], IMAGE, IMAGE, PLACES, PLACES[:, 0].copy(), *STEREO_LIMITS), "right"),
+        (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:2, 0].copy(), *STEREO_LIMITS), "prior_px"),
+        (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), np.inf, *STEREO_LIMITS[1:]), "max_dis"),
+        (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 4, 5, 0.25), "narrow_half"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(call: object, told: str) -> None:
@@ -90,6 +107,24 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
     assert len(core.centroid_angles_deg(IMAGE, OUTSIDE, 15)) == 3
     assert len(core.select_spread(PIXELS, np.arange(3), OUTSIDE, 5.0, 9, 30, 20)) == 1
     assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
+
+
+# Calls with places (4, 2) of any numbers, at which they read a noisy image.
+HOSTILE = {
+    "match_rows": lambda places: core.match_rows(*[NOISE] * 4, places, places[:, 0].copy(), *STEREO_LIMITS),
+    "match_rows, without a limit": lambda places: core.match_rows(
+        *[NOISE] * 4, places, places[:, 1].copy(), 8.0, -np.inf, np.inf, 7, 7, np.inf
+    ),
+}
+NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
+ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18, 1e308, 29.999999999999996, -1e-300]))
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+@given(places=arrays(np.float64, (4, 2), elements=ANY))
+@settings(max_examples=200, deadline=None)
+def test_no_number_leads_out_of_an_image(name: str, places: Array) -> None:
+    HOSTILE[name](places)
 
 
 @pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])

@@ -4,15 +4,13 @@
 #include <optional>
 
 #include "corners.h"
+#include "images.h"
 
 using namespace fleetmap;
 
 namespace {
 
-using Image = Array<uint8_t, -1, -1>;
 using Pixels = Array<float, -1, 2>;
-
-GreyImage grey(const Image& image) { return {image.data(), ptrdiff_t(image.shape(0)), ptrdiff_t(image.shape(1))}; }
 
 const Pixel* first(const Pixels& pixels) { return reinterpret_cast<const Pixel*>(pixels.data()); }
 

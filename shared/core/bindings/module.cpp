@@ -9,6 +9,7 @@ namespace nb = nanobind;
 
 void bind_corners(nb::module_&);
 void bind_matching(nb::module_&);
+void bind_stereo(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
 #if defined(__x86_64__)
@@ -32,5 +33,6 @@ NB_MODULE(_core, module) {
 #endif
   bind_corners(module);
   bind_matching(module);
+  bind_stereo(module);
   bind_vocabulary(module);
 }

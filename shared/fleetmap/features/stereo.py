@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.features.settings import StereoSettings
-from fleetmap.features.stereo_kernels import match_rows
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
@@ -28,7 +28,7 @@ def disparities(
     sought = np.ascontiguousarray(pixels, np.float64), prior
     scores, windows = (settings.min_correlation, settings.uniqueness), (settings.wide_half_px, settings.narrow_half_px)
     images = frame.left, frame.right
-    matched = match_rows(*images, *halves, *sought, max_disparity, *scores, *windows, settings.agreement_px)
+    matched = core.match_rows(*images, *halves, *sought, max_disparity, *scores, *windows, settings.agreement_px)
     matched[~(matched[:, 0] > settings.min_disparity_px)] = np.nan
     return matched
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fleetmap.features import stereo_kernels
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo import disparities
@@ -120,19 +119,3 @@ def test_depth_pictures_give_their_median_but_not_at_edges() -> None:
     np.testing.assert_allclose(found[[0, 2], 0], [10.0, 20.0])
     assert np.isnan(found[[1, 3, 4]]).all()
     assert (found[[0, 2], 1] == SETTINGS.depth_sigma_px).all()
-
-
-def test_correlations_of_a_row_equal_those_of_each_window() -> None:
-    """Against numpy's corrcoef, window by window."""
-    rng = np.random.default_rng(3)
-    left, right = (rng.integers(0, 256, (30, 90)).astype(np.uint8) for _ in range(2))
-    half, xl, y, x_first, count = 4, 60, 12, 9, 40
-    scores, cross = np.empty(count), np.empty(count + 8, np.int32)
-    stereo_kernels._correlate(
-        left, right, xl, y, x_first, count, half, scores, cross, np.empty((2, count + 8), np.int32)
-    )
-    ours = left[y - half : y + half + 1, xl - half : xl + half + 1].ravel()
-    for n in range(count):
-        x = x_first + n
-        theirs = right[y - half : y + half + 1, x - half : x + half + 1].ravel()
-        assert scores[n] == pytest.approx(np.corrcoef(ours, theirs)[0, 1], abs=1e-12)

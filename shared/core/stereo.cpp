@@ -1,0 +1,223 @@
+#include "stereo.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+namespace fleetmap {
+namespace {
+
+constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
+constexpr int kCoarseHalf = 4;  // of the windows at half size
+constexpr int kMostSide = 2 * kMostStereoHalf + 1;
+constexpr int kMostIterations = 12;
+constexpr double kSettledPx = 0.005;
+
+struct Disparity {
+  double px = kUnknown, sigma_px = kUnknown;
+};
+
+struct Peak {
+  ptrdiff_t disparity = -1;
+  double correlation = -1.0, rival = -1.0;  // that of the best disparity, and of the best that is not its neighbour
+};
+
+// rho of one window on the left with many on the right. Sums are whole numbers below 2^24, which floats add without rounding in any
+// order: all columns of a row at once.
+class Correlation {
+ public:
+  explicit Correlation(ptrdiff_t most_columns) : room_(most_columns + 2 * kMostStereoHalf + 8), rows_(kMostSide * room_) {
+    for (auto* of : {&sums_, &squares_, &window_sums_, &window_squares_, &products_}) of->resize(room_);
+    rho_.resize(room_);
+  }
+
+  // rho[n], n < count: of the left window around (x, y) with the right one around (x_first + n, y). All windows lie inside.
+  const double* operator()(const StereoPair& pair, ptrdiff_t x, ptrdiff_t y, ptrdiff_t x_first, ptrdiff_t count, int half) {
+    const int side = 2 * half + 1;
+    const double area = side * side;
+    const ptrdiff_t columns = count + 2 * half;
+    std::fill_n(sums_.begin(), columns, 0.0f);
+    std::fill_n(squares_.begin(), columns, 0.0f);
+    float l[kMostSide][kMostSide];
+    double sum_l = 0.0, sum_ll = 0.0;
+    for (int v = 0; v < side; ++v) {
+      const uint8_t* left = pair.left.row(y - half + v) + x - half;
+      for (int u = 0; u < side; ++u) {
+        l[v][u] = float(left[u]);
+        sum_l += left[u];
+        sum_ll += left[u] * left[u];
+      }
+      const uint8_t* right = pair.right.row(y - half + v) + x_first - half;
+      float* __restrict r = row(v);
+      float* __restrict sum = sums_.data(), * __restrict square = squares_.data();
+      for (ptrdiff_t k = 0; k < columns; ++k) {
+        r[k] = float(right[k]);
+        sum[k] += r[k];
+        square[k] += r[k] * r[k];
+      }
+    }
+    correlate(l, side, count);
+    float sum_r = 0.0f, sum_rr = 0.0f;
+    for (ptrdiff_t k = 0; k < side - 1; ++k) sum_r += sums_[k], sum_rr += squares_[k];
+    for (ptrdiff_t n = 0; n < count; ++n) {
+      window_sums_[n] = sum_r += sums_[n + side - 1];
+      window_squares_[n] = sum_rr += squares_[n + side - 1];
+      sum_r -= sums_[n];
+      sum_rr -= squares_[n];
+    }
+    const double energy_l = sum_ll - sum_l * sum_l / area;
+    const float *products = products_.data(), *window_sums = window_sums_.data(), *window_squares = window_squares_.data();
+    double* __restrict rho = rho_.data();
+    for (ptrdiff_t n = 0; n < count; ++n) {
+      const double sum = window_sums[n], energies = energy_l * (window_squares[n] - sum * sum / area);
+      const double value = (products[n] - sum_l * sum / area) / std::sqrt(energies);
+      rho[n] = energies < 1e-6 ? -1.0 : value;
+    }
+    return rho_.data();
+  }
+
+ private:
+  float* row(int v) { return rows_.data() + v * room_; }
+
+  // products[n] = sum l r; what stands beyond the rows' last column goes into products beyond count alone.
+  void correlate(const float (&l)[kMostSide][kMostSide], int side, ptrdiff_t count) {
+    for (ptrdiff_t n = 0; n < count; n += 8) {
+      Eight<float> total = {};
+      for (int v = 0; v < side; ++v) {
+        const float* r = row(v) + n;
+        Eight<float> of_row = {};
+        for (int u = 0; u < side; ++u) {
+          Eight<float> values;
+          std::memcpy(&values, r + u, sizeof values);
+          of_row += l[v][u] * values;
+        }
+        total += of_row;
+      }
+      std::memcpy(products_.data() + n, &total, sizeof total);
+    }
+  }
+
+  ptrdiff_t room_;
+  std::vector<float> rows_, sums_, squares_, window_sums_, window_squares_, products_;
+  std::vector<double> rho_;
+};
+
+// The whole-pixel disparity in [first, last] where rho is highest.
+Peak search(const StereoPair& pair, ptrdiff_t x, ptrdiff_t y, ptrdiff_t first, ptrdiff_t last, int half, Correlation& correlation) {
+  const ptrdiff_t height = pair.left.height, width = pair.left.width;
+  if (y < half || y + half >= height || x < half || x + half >= width) return {};
+  const ptrdiff_t x_first = std::max<ptrdiff_t>(x - last, half), x_last = std::min(x - first, width - 1 - half);
+  const ptrdiff_t count = x_last - x_first + 1;
+  if (count <= 0) return {};
+  const double* rho = correlation(pair, x, y, x_first, count, half);
+  Peak peak;
+  ptrdiff_t best = -1;
+  for (ptrdiff_t n = count; n-- > 0;)
+    if (rho[n] > peak.correlation) best = n, peak.correlation = rho[n];
+  if (best < 0) return {};
+  for (ptrdiff_t n = 0; n < count; ++n)
+    if (std::abs(n - best) > 2 && rho[n] > peak.rival) peak.rival = rho[n];
+  peak.disparity = x - (x_first + best);
+  return peak;
+}
+
+// Brightness between pixels, whole steps apart: `side` rows around (x, y), each of which goes on by `rim` pixels on both sides. All must
+// lie inside.
+void sample(GreyImage image, double x, double y, int half, int rim, double* __restrict samples) {
+  const ptrdiff_t column = ptrdiff_t(x), row = ptrdiff_t(y);
+  const Bilinear<double> at(x - double(column), y - double(row));
+  const int columns = 2 * (half + rim) + 1;
+  for (ptrdiff_t v = row - half; v <= row + half; ++v, samples += columns) {
+    const uint8_t *upper = image.row(v) + column - half - rim, *lower = upper + image.width;
+    for (int k = 0; k < columns; ++k) samples[k] = at(upper + k, lower + k);
+  }
+}
+
+// Gauss-Newton from a disparity; unknown where it does not settle.
+Disparity refine(const StereoPair& pair, double x, double y, double disparity, int half) {
+  const double height = double(pair.right.height), width = double(pair.right.width);
+  const int side = 2 * half + 1, area = side * side, stride = side + 2;
+  if (x - half < 1 || y - half < 1 || x + half + 2 >= width || y + half + 2 >= height) return {};
+  double l[kMostSide * kMostSide], r[kMostSide * (kMostSide + 2)];
+  sample(pair.left, x, y, half, 0, l);
+  double mean_l = 0.0, energy = 0.0;
+  for (int n = 0; n < area; ++n) mean_l += l[n];
+  mean_l /= area;
+  for (int n = 0; n < area; ++n) {
+    l[n] -= mean_l;
+    energy += l[n] * l[n];
+  }
+  if (energy < area) return {};
+  for (int iteration = 0; iteration < kMostIterations; ++iteration) {
+    const double x_right = x - disparity;
+    if (x_right - half < 2 || x_right + half + 3 >= width) return {};
+    sample(pair.right, x_right, y, half, 1, r);
+    double sum_r = 0.0, sum_rr = 0.0, sum_lr = 0.0;
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) {
+        const double value = r[v * stride + u + 1];
+        sum_r += value;
+        sum_rr += value * value;
+        sum_lr += l[v * side + u] * value;
+      }
+    const double mean_r = sum_r / area, gain = sum_lr / std::max(sum_rr - sum_r * mean_r, 1e-9);
+    if (gain < 0.4 || gain > 2.5) return {};
+    double sum_jj = 0.0, sum_je = 0.0, sum_ee = 0.0;
+    for (int v = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u) {
+        const double* at = r + v * stride + u + 1;
+        const double j = 0.5 * gain * (at[1] - at[-1]), e = l[v * side + u] - gain * (at[0] - mean_r);
+        sum_jj += j * j;
+        sum_je += j * e;
+        sum_ee += e * e;
+      }
+    if (sum_jj < 10.0 * area) return {};
+    const double step = sum_je / sum_jj;
+    disparity -= step;
+    if (std::abs(step) > 2.0) return {};
+    if (std::abs(step) < kSettledPx) {
+      if (sum_ee > 0.3 * energy) return {};
+      return {disparity, std::sqrt((sum_ee / area + 4.0) / sum_jj)};
+    }
+  }
+  return {};
+}
+
+Disparity match(const StereoPair& whole, const StereoPair& halved, double x, double y, double prior_px, const StereoLimits& limits,
+                Correlation& correlation) {
+  if (!(x > -1.0 && y > -1.0 && x < double(whole.left.width) && y < double(whole.left.height))) return {};
+  const ptrdiff_t column = ptrdiff_t(x + 0.5), row = ptrdiff_t(y + 0.5);
+  ptrdiff_t around;
+  if (prior_px == prior_px) {
+    around = ptrdiff_t(std::clamp(prior_px, -1e6, 1e6) + 0.5);
+    around = std::max<ptrdiff_t>(around, 3);
+  } else {
+    const Peak coarse = search(halved, column / 2, row / 2, 0, ptrdiff_t(limits.max_disparity_px / 2), kCoarseHalf, correlation);
+    if (coarse.correlation < limits.min_correlation || coarse.rival > limits.uniqueness * coarse.correlation) return {};
+    around = 2 * coarse.disparity;
+  }
+  const Peak peak = search(whole, column, row, std::max<ptrdiff_t>(around - 3, 0), around + 3, limits.wide_half, correlation);
+  if (peak.correlation < limits.min_correlation) return {};
+  const Disparity wide = refine(whole, x, y, double(peak.disparity), limits.wide_half);
+  if (std::isnan(wide.px)) return {};
+  const Disparity narrow = refine(whole, x, y, wide.px, limits.narrow_half);
+  const double apart = wide.px - narrow.px;  // as a standard deviation, half of it
+  if (std::isnan(narrow.px) || std::abs(apart) > limits.agreement_px) return {};
+  return {narrow.px, std::sqrt(narrow.sigma_px * narrow.sigma_px + 0.25 * apart * apart)};
+}
+
+}  // namespace
+
+void match_rows(const StereoPair& whole, const StereoPair& halved, const double* pixels, const double* prior_px, size_t count,
+                const StereoLimits& limits, double* out) {
+  Correlation correlation(ptrdiff_t(limits.max_disparity_px) + 8);
+  for (size_t n = 0; n < count; ++n) {
+    const Disparity found = match(whole, halved, pixels[2 * n], pixels[2 * n + 1], prior_px[n], limits, correlation);
+    out[2 * n] = found.px;
+    out[2 * n + 1] = found.sigma_px;
+  }
+}
+
+}  // namespace fleetmap
