@@ -15,6 +15,7 @@ inline Vec3 operator+(Vec3 a, Vec3 b) { return {a[0] + b[0], a[1] + b[1], a[2] +
 inline Vec3 operator-(Vec3 a, Vec3 b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
 inline Vec3 operator-(Vec3 a) { return {-a[0], -a[1], -a[2]}; }
 inline Vec3 operator*(double s, Vec3 a) { return {s * a[0], s * a[1], s * a[2]}; }
+inline Vec3 operator/(Vec3 a, double s) { return {a[0] / s, a[1] / s, a[2] / s}; }
 inline double dot(Vec3 a, Vec3 b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 inline double norm(Vec3 a) { return std::sqrt(dot(a, a)); }
 inline Vec3 cross(Vec3 a, Vec3 b) { return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}; }
@@ -47,6 +48,18 @@ inline Mat3 operator*(double s, const Mat3& a) {
   Mat3 out;
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) out[i][j] = s * a[i][j];
+  return out;
+}
+inline Mat3 operator-(const Mat3& a, const Mat3& b) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] - b[i][j];
+  return out;
+}
+inline Mat3 operator/(const Mat3& a, double s) {
+  Mat3 out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] / s;
   return out;
 }
 inline Mat3 transposed(const Mat3& a) { return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}}; }

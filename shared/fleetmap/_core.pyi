@@ -69,3 +69,25 @@ def match_rows(
     agreement_px: float,
 ) -> _Reals:
     """(N, 2) disparity and standard deviation of left pixels (N, 2), NaN where unknown; prior_px (N,) NaN where there is none."""
+
+# --- inertial samples: stamps_ns (N,), gyro_radps and accel_mps2 (N, 3) ---
+
+def imu_intervals(
+    stamps_ns: _Indices, gyro_radps: _Reals, accel_mps2: _Reals, start_ns: int, end_ns: int
+) -> tuple[_Reals, _Reals, _Reals]:
+    """Durations (N,) s of intervals from start to end, rates and forces (N, 3) at their middles."""
+
+def preintegrate(
+    stamps_ns: _Indices,
+    gyro_radps: _Reals,
+    accel_mps2: _Reals,
+    start_ns: int,
+    end_ns: int,
+    gyro_bias: _Reals,
+    accel_bias: _Reals,
+    noise: tuple[float, float, float, float],
+) -> tuple[_Reals, _Reals, _Reals, _Reals, _Reals, float]:
+    """Rotation, velocity, position, their Jacobians (5, 3, 3) by the biases, covariance (15, 15), longest gap in seconds.
+
+    noise: densities of gyro and accelerometer and of their biases' walks.
+    """

@@ -67,6 +67,7 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
 
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
+STAMPS, SAMPLES, ZERO = np.arange(3), np.zeros((3, 3)), np.zeros(3)
 OUTSIDE = np.full((3, 2), np.nan, np.float32)
 PLACES = np.full((4, 2), 9.0)
 STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
@@ -92,6 +93,8 @@ STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:2, 0].copy(), *STEREO_LIMITS), "prior_px"),
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), np.inf, *STEREO_LIMITS[1:]), "max_dis"),
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 4, 5, 0.25), "narrow_half"),
+        (lambda: core.imu_intervals(STAMPS, SAMPLES, SAMPLES[:2], 0, 9), "accel_mps2"),
+        (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(call: object, told: str) -> None:
@@ -125,6 +128,17 @@ ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18
 @settings(max_examples=200, deadline=None)
 def test_no_number_leads_out_of_an_image(name: str, places: Array) -> None:
     HOSTILE[name](places)
+
+
+INT64 = st.integers(-(2**63), 2**63 - 1)
+
+
+@given(st.lists(INT64 | st.integers(0, 50), max_size=12), INT64 | st.integers(0, 50), INT64 | st.integers(0, 50))
+def test_absurd_stamps_of_samples_give_values(stamps: list[int], start_ns: int, end_ns: int) -> None:
+    start_ns, end_ns = min(start_ns, end_ns), max(start_ns, end_ns)
+    imu = np.array(stamps, np.int64), np.full((len(stamps), 3), np.nan), np.full((len(stamps), 3), np.inf)
+    assert len(core.imu_intervals(*imu, start_ns, end_ns)) == 3
+    assert core.preintegrate(*imu, start_ns, end_ns, ZERO, ZERO, (1.0, np.nan, np.inf, -1.0))[0].shape == (3, 3)
 
 
 @pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])

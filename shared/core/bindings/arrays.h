@@ -26,6 +26,14 @@ nb::ndarray<nb::numpy, Element, nb::ndim<kDimensions>> as_numpy(std::vector<T>&&
   return {reinterpret_cast<Element*>(kept->data()), shape, owner};
 }
 
+// A numpy array with a copy of a few numbers.
+template <int kDimensions>
+nb::ndarray<nb::numpy, double, nb::ndim<kDimensions>> copied(const double* from, std::initializer_list<size_t> shape) {
+  size_t count = 1;
+  for (size_t length : shape) count *= length;
+  return as_numpy<double, kDimensions>(std::vector<double>(from, from + count), shape);
+}
+
 // The result of a computation that needs no Python, done without its lock.
 template <typename Compute>
 auto unlocked(Compute&& compute) {

@@ -10,6 +10,7 @@ namespace nb = nanobind;
 void bind_corners(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_stereo(nb::module_&);
+void bind_preintegration(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
 #if defined(__x86_64__)
@@ -34,5 +35,6 @@ NB_MODULE(_core, module) {
   bind_corners(module);
   bind_matching(module);
   bind_stereo(module);
+  bind_preintegration(module);
   bind_vocabulary(module);
 }
