@@ -91,3 +91,30 @@ def preintegrate(
 
     noise: densities of gyro and accelerometer and of their biases' walks.
     """
+
+class BlockCholesky:
+    """The pattern of sparse matrices of N nodes with sizes (N,) unknowns each, of which pairs (B, 2) are coupled.
+
+    order (N,): the nodes in an order that fills in little.
+    """
+
+    def __init__(self, sizes: _Indices, pairs: _Indices, order: _Indices) -> None: ...
+    @property
+    def size(self) -> int:
+        """How many values a factor has."""
+
+    def order(self) -> _Indices:
+        """(U,) the unknowns as they are eliminated."""
+
+    def places(self, rows: _Indices, cols: _Indices) -> _Indices:
+        """(B, 3) where blocks of nodes (row, col), which are coupled, stand among the values.
+
+        Number (a, b) of a block belongs at first + a * down + b * right of its row here. A block is added once; its mirror image must
+        not be. Of blocks on the diagonal the lower triangle counts.
+        """
+
+    def factorise(self, values: _Reals) -> bool:
+        """Values (size,) of a matrix become those of its factor; False where it is not positive definite."""
+
+    def solve(self, values: _Reals, rhs: _Reals) -> _Reals:
+        """x (U,) of A x = rhs (U,), by the values of the factor."""

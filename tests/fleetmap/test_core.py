@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import operator
 import re
 import subprocess
 import sys
@@ -16,8 +17,13 @@ from fleetmap import _core, core  # type: ignore[attr-defined]
 from fleetmap.geometry import Array
 from support.fleet.contracts_documents import text
 
-STUB = {
-    node.name: node for node in ast.parse(text("shared/fleetmap/_core.pyi")).body if isinstance(node, ast.FunctionDef)
+MODULE = ast.parse(text("shared/fleetmap/_core.pyi")).body
+CLASSES = {node.name: node for node in MODULE if isinstance(node, ast.ClassDef)}
+STUB = {node.name: node for node in MODULE if isinstance(node, ast.FunctionDef)} | {
+    f"{name}.{method.name}": method
+    for name, held in CLASSES.items()
+    for method in held.body
+    if isinstance(method, ast.FunctionDef) and not method.decorator_list
 }
 # What nanobind calls the types of the stub's names.
 DTYPES = {
@@ -40,20 +46,24 @@ def named(annotation: ast.expr | None) -> str:
 
 def compiled(name: str) -> tuple[list[tuple[str, str]], str]:
     """Arguments with their types, and the result's type, of a function of the module, as its signature says."""
-    signature = re.sub(r"(?:numpy\.)?ndarray\[(dtype=\w+)[^\]]*\]", r"\1", inspect.getdoc(getattr(_core, name)) or "")
-    found = re.fullmatch(rf"{name}\((.*)\) -> (.*)", signature.splitlines()[0])
+    function = operator.attrgetter(name)(_core)
+    signature = re.sub(r"(?:numpy\.)?ndarray\[(dtype=\w+)[^\]]*\]", r"\1", inspect.getdoc(function) or "")
+    found = re.fullmatch(rf"{name.rpartition('.')[2]}\((?:self(?:, )?)?(.*)\) -> (.*)", signature.splitlines()[0])
     assert found, signature
-    arguments = [part.split(": ", 1) for part in re.split(r", (?=\w+: )", found[1])]
+    arguments = [part.split(": ", 1) for part in re.split(r", (?=\w+: )", found[1]) if part]
     return [(argument, kind) for argument, kind in arguments], found[2]
 
 
-def test_the_stub_names_every_function() -> None:
-    assert set(STUB) == {name for name in dir(_core) if not name.startswith("_")}
+def test_the_stub_names_everything() -> None:
+    assert {name for name in STUB if "." not in name} | set(CLASSES) == {n for n in dir(_core) if not n.startswith("_")}
+    for name, held in CLASSES.items():
+        members = {method.name for method in held.body if isinstance(method, ast.FunctionDef)} - {"__init__"}
+        assert members == {member for member in dir(getattr(_core, name)) if not member.startswith("_")}
 
 
 @pytest.mark.parametrize("name", STUB)
 def test_arguments_and_results_are_those_of_the_stub(name: str) -> None:
-    wanted = [(argument.arg, named(argument.annotation)) for argument in STUB[name].args.args]
+    wanted = [(argument.arg, named(argument.annotation)) for argument in STUB[name].args.args if argument.arg != "self"]
     assert compiled(name) == (wanted, named(STUB[name].returns))
 
 
@@ -61,8 +71,8 @@ def test_arguments_and_results_are_those_of_the_stub(name: str) -> None:
 def test_an_array_of_another_type_is_refused(name: str) -> None:
     """Not converted, which would cost a copy in each frame without a word."""
     strange = np.zeros((2, 2, 2), np.complex128)
-    with pytest.raises(TypeError, match=rf"{name}\(\): incompatible function arguments"):
-        getattr(_core, name)(*[strange] * len(STUB[name].args.args))
+    with pytest.raises(TypeError, match=rf"{name.rpartition('.')[2]}\(\): incompatible function arguments"):
+        operator.attrgetter(name)(_core)(*[strange] * max(1, len(STUB[name].args.args)))
 
 
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
@@ -71,6 +81,7 @@ STAMPS, SAMPLES, ZERO = np.arange(3), np.zeros((3, 3)), np.zeros(3)
 OUTSIDE = np.full((3, 2), np.nan, np.float32)
 PLACES = np.full((4, 2), 9.0)
 STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
+CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arange(3))
 
 
 @pytest.mark.parametrize(
@@ -95,6 +106,16 @@ STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 4, 5, 0.25), "narrow_half"),
         (lambda: core.imu_intervals(STAMPS, SAMPLES, SAMPLES[:2], 0, 9), "accel_mps2"),
         (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
+        (lambda: core.BlockCholesky(np.array([1, 0]), np.array([[0, 1]]), np.arange(2)), "sizes"),
+        (lambda: core.BlockCholesky(np.array([1 << 30, 1]), np.array([[0, 1]]), np.arange(2)), "sizes"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 2]]), np.arange(2)), "pairs"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 1]]), np.zeros(2, np.int64)), "order"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 1]]), np.arange(1)), "order"),
+        (lambda: CHAIN.places(np.array([0]), np.array([2])), "coupled"),
+        (lambda: CHAIN.places(np.array([-1]), np.array([2])), "nodes"),
+        (lambda: CHAIN.places(np.array([0, 1]), np.array([2])), "cols"),
+        (lambda: CHAIN.factorise(np.zeros(CHAIN.size - 1)), "values"),
+        (lambda: CHAIN.solve(np.zeros(CHAIN.size), np.zeros(5)), "rhs"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(call: object, told: str) -> None:

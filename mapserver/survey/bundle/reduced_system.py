@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
+from fleetmap import core
 from fleetmap.geometry import AnyArray, Array
 from mapserver.survey.bundle.reduced_system_kernels import BlockPlaces, SystemArrays, fill_blocks, fill_lower
 from mapserver.survey.bundle.sparsity import Structure
-from mapserver.survey.sparse_solver.block_cholesky import BlockCholesky
+from mapserver.survey.sparse_solver.block_cholesky import block_cholesky
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class SparseLayout:
     Poses and motions are blocks of their own, as images join poses alone.
     """
 
-    pattern: BlockCholesky
+    pattern: core.BlockCholesky
     places: BlockPlaces
 
     @classmethod
@@ -65,19 +66,20 @@ class SparseLayout:
         images = len(parts) * np.stack([rows, s.cols], axis=1)
         edges = _edge_pairs(system.edge_slots) if len(parts) == 2 else np.zeros((0, 10, 2), np.int64)
         joined = edges[(edges >= 0).all(axis=2)]
-        pattern = BlockCholesky.of(np.tile(parts, count), np.concatenate([images, joined]))
+        pattern = block_cholesky(np.tile(parts, count), np.concatenate([images, joined]))
         edge_places = np.full((*edges.shape[:2], 3), -1)
-        edge_places[(edges >= 0).all(axis=2)] = pattern.places(*joined.T)
+        edge_places[(edges >= 0).all(axis=2)] = pattern.places(*joined.T.copy())
         own = np.arange(len(parts) * count)
         diagonal = pattern.places(own, own).reshape(count, len(parts), 3)
-        return cls(pattern, BlockPlaces(pattern.places(*images.T), edge_places, diagonal))
+        return cls(pattern, BlockPlaces(pattern.places(*images.T.copy()), edge_places, diagonal))
 
     def solve(self, system: ReducedSystem) -> Array | None:
         """The step by sparse Cholesky, None where S is not positive definite."""
         values = np.zeros(self.pattern.size)
         fill_blocks(system.arrays, self.places, values)
-        factor = self.pattern.factorised(values)
-        return None if factor is None else factor.solve(system.rhs.ravel()).reshape(system.rhs.shape)
+        if not self.pattern.factorise(values):
+            return None
+        return self.pattern.solve(values, system.rhs.ravel()).reshape(system.rhs.shape)
 
 
 def _edge_pairs(edge_slots: AnyArray) -> AnyArray:

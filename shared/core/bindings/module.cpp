@@ -7,6 +7,7 @@
 
 namespace nb = nanobind;
 
+void bind_block_cholesky(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_stereo(nb::module_&);
@@ -32,6 +33,7 @@ NB_MODULE(_core, module) {
         "fleetmap needs a processor with AVX2 and FMA (x86-64-v3: Intel since Haswell, 2013; AMD since Excavator, 2015), which this one "
         "is not; in a virtual machine let it see the host's processor");
 #endif
+  bind_block_cholesky(module);
   bind_corners(module);
   bind_matching(module);
   bind_stereo(module);

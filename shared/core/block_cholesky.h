@@ -1,0 +1,62 @@
+// Cholesky factorisation of large sparse symmetric matrices whose unknowns come in blocks, such as poses.
+//
+// Multifrontal and supernodal: what fills in, and in which order, is found once for each pattern, over blocks; the arithmetic is dense
+// LAPACK on runs of columns with the same rows. Sources: Davis 2006, Direct methods for sparse linear systems, chapters 4 and 7;
+// Liu 1992, The multifrontal method for sparse matrix solution.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+namespace fleetmap {
+
+// Where a block stands among the values of a factor: its number (a, b) at first + a * down + b * right.
+struct BlockPlace {
+  int64_t first, down, right;
+};
+
+class BlockCholesky {
+ public:
+  // The pattern of nodes with sizes[n] unknowns each, numbered one after the other, of which pairs are coupled. order: the nodes in an
+  // order that fills in little; every subtree of their elimination tree is then brought together.
+  BlockCholesky(const std::vector<int64_t>& sizes, const std::vector<std::pair<int64_t, int64_t>>& pairs, std::vector<int64_t> order);
+
+  size_t nodes() const { return position_.size(); }
+  size_t unknowns() const { return order_.size(); }
+  // How many values a factor has.
+  size_t size() const { return size_; }
+  // The matrix's unknowns as they are eliminated.
+  const std::vector<int64_t>& order() const { return order_; }
+
+  // The place of the block of nodes (row, col); first is negative where they are not coupled. A block is added once; its mirror image
+  // must not be. Of blocks on the diagonal the lower triangle counts.
+  BlockPlace place(int64_t row, int64_t col) const;
+
+  // Values become those of the factor; false where the matrix is not positive definite.
+  bool factorise(double* values) const;
+
+  // b (U,) becomes the x of A x = b, by the values of the factor.
+  void solve(const double* values, double* b) const;
+
+ private:
+  // One run of columns, `own` unknowns wide from `column` on in the order of elimination, over `below` unknowns of later nodes. Its
+  // triangle (own, own) begins at `start` among the values, then follow the (below, own) rows under it, both column by column.
+  struct Front {
+    int64_t start;
+    int own, below, column;
+    std::vector<int32_t> rows;            // (below,) its unknowns there, in the order of elimination
+    std::vector<int32_t> at;              // (below,) those rows in the front of its parent
+    std::vector<int32_t> nodes, offsets;  // positions of the nodes below, rising, and where their unknowns begin among the rows
+    std::vector<int32_t> children;        // the fronts that update it
+  };
+
+  std::vector<Front> fronts_;  // children first
+  std::vector<int64_t> order_;
+  std::vector<int32_t> position_;        // (N,) of the nodes in the order of elimination
+  std::vector<int32_t> front_, offset_;  // by position: front of a node, and where its unknowns begin there
+  size_t size_ = 0;
+};
+
+}  // namespace fleetmap
