@@ -37,6 +37,30 @@ def descend(
 def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
     """(N, 2) numbers of the nearest and the second nearest centre."""
 
+def refine_pnp(
+    cam_from_source: _Reals,
+    points: _Reals,
+    pixels: _Reals,
+    weights: _Reals,
+    lens: _Reals,
+    refinement: tuple[float, float, tuple[int, int]],
+    prior: _Reals | None,
+) -> tuple[_Reals, _Reals, _Reals] | None:
+    """cam_from_source (4, 4) refined, its information (6, 6) and the squared normalised residuals (N,); None where singular.
+
+    points (N, 3) in the source frame, pixels (N, 3) u_left v u_right (NaN none), weights (N, 2) 1 / sigma of u and v, of the disparity.
+    lens: focal, cx, cy, focal * baseline. refinement: width of the robust weight in sigmas, squared gate of inliers, iterations on
+    all and on inliers. prior (6, 6): information that holds the start.
+    """
+
+def search_translation(
+    rotation: _Reals, points: _Reals, seen_points: _Reals, pixels: _Reals, lens: _Reals, threshold_px: float
+) -> tuple[int, _Reals]:
+    """How many of points (N, 3) a camera of this rotation sees within the threshold of their pixels (N, 2), and its translation (3,).
+
+    seen_points (N, 3): the same in the camera, by its own stereo (NaN none).
+    """
+
 def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
     """(N, 2) whole-pixel corners, row by row."""
 

@@ -10,6 +10,7 @@ namespace nb = nanobind;
 void bind_block_cholesky(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_matching(nb::module_&);
+void bind_pnp(nb::module_&);
 void bind_stereo(nb::module_&);
 void bind_preintegration(nb::module_&);
 void bind_vocabulary(nb::module_&);
@@ -36,6 +37,7 @@ NB_MODULE(_core, module) {
   bind_block_cholesky(module);
   bind_corners(module);
   bind_matching(module);
+  bind_pnp(module);
   bind_stereo(module);
   bind_preintegration(module);
   bind_vocabulary(module);

@@ -6,8 +6,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3, transform_points
-from fleetmap.pnp import p3p_ransac_kernels, pnp_kernels
+from fleetmap.pnp import p3p_ransac_kernels
 from fleetmap.sensors.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight (Geman-McClure), in sigmas
@@ -65,18 +66,19 @@ def refine_pnp(
     """
     if len(matches) == 0:
         return None
-    prior = np.zeros((6, 6)) if prior_information is None else np.ascontiguousarray(prior_information)
-    rotation, translation = cam_from_source[:3, :3].copy(), cam_from_source[:3, 3].copy()
-    points, measured, weights = (
+    solved = core.refine_pnp(
+        np.ascontiguousarray(cam_from_source),
         np.ascontiguousarray(matches.points_source, np.float64),
         np.ascontiguousarray(matches.pixels, np.float64),
         1.0 / np.ascontiguousarray(matches.sigmas_px, np.float64),
+        matches.camera.lens,
+        REFINEMENT,
+        None if prior_information is None else np.ascontiguousarray(prior_information),
     )
-    lens, hessian, squared = matches.camera.lens, np.empty((6, 6)), np.empty(len(points))
-    limits = _WIDTH, GATE_SQUARED, prior, ITERATIONS
-    if not pnp_kernels.refine_twice(rotation, translation, points, measured, weights, lens, *limits, hessian, squared):
+    if solved is None:
         return None
-    return PnpResult(se3(rotation, translation), hessian + prior, squared < GATE_SQUARED, squared)
+    refined, information, squared = solved
+    return PnpResult(refined, information, squared < GATE_SQUARED, squared)
 
 
 def ransac_pnp(
@@ -119,10 +121,9 @@ def pnp_with_rotation(
         return None
     camera, points, pixels = matches.camera, matches.points_source, matches.pixels
     seen = camera.point_from_pixel(pixels[:, :2], pixels[:, 0] - pixels[:, 2])
-    rotation, translation = np.ascontiguousarray(cam_from_source_rotation), np.zeros(3)
-    measured = np.ascontiguousarray(pixels[:, :2])
-    score = pnp_kernels.search_translation(
-        rotation, np.ascontiguousarray(points), seen, measured, camera.lens, threshold_px, translation
+    rotation, measured = np.ascontiguousarray(cam_from_source_rotation), np.ascontiguousarray(pixels[:, :2])
+    score, translation = core.search_translation(
+        rotation, np.ascontiguousarray(points), seen, measured, camera.lens, threshold_px
     )
     if score < min_inliers:
         return None

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.geometry import Array, rotation_angle_rad, se3_exp, se3_inverse, se3_log, transform_points
 from fleetmap.pnp.pnp import Correspondences, pnp_with_rotation, ransac_pnp, refine_pnp
-from fleetmap.pnp.pnp_kernels import linearize
 from fleetmap.sensors.rectification import StereoCamera
 
 CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
@@ -50,29 +50,30 @@ def test_without_disparities_it_still_solves() -> None:
     np.testing.assert_allclose(error(found.cam_from_source), 0, atol=1e-6)
 
 
-def test_gradient_and_hessian_agree_with_numeric_derivatives() -> None:
-    rng = np.random.default_rng(3)
-    points, pixels, sigmas = seen(rng, 12, noise=3.0)
+def test_it_ends_where_the_cost_is_least_and_its_information_is_the_curvature() -> None:
+    """By differences of the cost, which is summed up from the residuals."""
+    points, pixels, sigmas = seen(np.random.default_rng(3), 12, noise=3.0)
     pixels[3, 2] = np.nan
-    intrinsics = np.array([CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px, CAMERA.focal_px * CAMERA.baseline_m])
 
-    def at(rot_trans: Array, width: float) -> tuple[float, Array, Array]:
-        cam_from_map = se3_exp(rot_trans) @ CAM_FROM_MAP
-        hessian, gradient, squared = np.empty((6, 6)), np.empty(6), np.empty(len(points))
-        cost = linearize(
-            cam_from_map[:3, :3].copy(), cam_from_map[:3, 3].copy(), points, pixels, 1 / sigmas, intrinsics, width,
-            hessian, gradient, squared,
-        )  # fmt: skip
-        return cost, gradient, hessian
+    def at(cam_from_map: Array, width: float, iterations: int = 0) -> tuple[float, Array, Array]:
+        """The cost after so many iterations, the camera and its information."""
+        limits = width, 0.0, (iterations, 0)
+        found = core.refine_pnp(cam_from_map, points, pixels, 1 / sigmas, CAMERA.lens, limits, None)
+        assert found is not None
+        return float(np.sum(0.5 * found[2] * width**2 / (width**2 + found[2]))), found[0], found[1]
 
-    step = 1e-5
-    numeric = [(at(d, 4.0)[0] - at(-d, 4.0)[0]) / (2 * step) for d in step * np.eye(6)]
-    np.testing.assert_allclose(-at(np.zeros(6), 4.0)[1], numeric, rtol=1e-4, atol=1e-3)
+    _, best, _ = at(CAM_FROM_MAP, 4.0, 50)
+    slope = [at(se3_exp(d) @ best, 4.0)[0] - at(se3_exp(-d) @ best, 4.0)[0] for d in 1e-5 * np.eye(6)]
+    beside = at(se3_exp(np.full(6, 1e-3)) @ best, 4.0)[0] - at(best, 4.0)[0]
+    np.testing.assert_allclose(slope, 0, atol=1e-4 * beside)
     # on clean pixels and without robust weight the Gauss-Newton Hessian is the cost's own
     pixels[:] = np.where(np.isnan(pixels), np.nan, CAMERA.pixel_from_point(transform_points(CAM_FROM_MAP, points)))
-    curvature = [-(at(d, 1e6)[1] - at(-d, 1e6)[1]) / (2 * step) for d in step * np.eye(6)]
-    hessian = at(np.zeros(6), 1e6)[2]
-    np.testing.assert_allclose(np.array(curvature), hessian, rtol=1e-4, atol=1e-5 * np.abs(hessian).max())
+    steps = 1e-5 * np.eye(6)
+    cost = {(s, t): [[at(se3_exp(s * a + t * b) @ CAM_FROM_MAP, 1e6)[0] for b in steps] for a in steps]
+            for s in (-1, 1) for t in (-1, 1)}  # fmt: skip
+    curvature = np.array(cost[1, 1]) - cost[1, -1] - np.array(cost[-1, 1]) + cost[-1, -1]
+    hessian = at(CAM_FROM_MAP, 1e6)[2]
+    np.testing.assert_allclose(curvature / 4e-10, hessian, rtol=1e-3, atol=1e-4 * np.abs(hessian).max())
 
 
 def test_covariance_is_the_scatter_of_many_solutions() -> None:

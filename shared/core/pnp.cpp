@@ -1,0 +1,158 @@
+#include "pnp.h"
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "dense.h"
+
+namespace fleetmap {
+namespace {
+
+constexpr double kNearest = 0.05;  // metres before the camera
+constexpr double kUnseen = 1e12;   // the squared residual of what lies nearer, or behind
+constexpr int kTrials = 5;         // of larger and larger damping in an iteration
+constexpr double kEnough = 1e-6;   // share of the cost by which an iteration must lower it to be followed by another
+constexpr size_t kLeastInliers = 4;
+
+// Robust cost, and the normal equations of a step.
+struct Normal {
+  double cost;
+  double hessian[6][6], gradient[6];
+};
+
+// At a camera; fills squared normalised residuals (count,) too.
+void linearize(const Sightings& seen, const StereoLens& lens, double width, const SE3& cam_from_source, Normal& normal, double* squared) {
+  normal = {};
+  for (size_t n = 0; n < seen.count; ++n) {
+    const Vec3 point = cam_from_source * vec3(seen.points + 3 * n);
+    const double x = point[0], y = point[1], z = point[2];
+    squared[n] = kUnseen;
+    if (z < kNearest) {
+      normal.cost += 0.5 * width * width;
+      continue;
+    }
+    const double *pixel = seen.pixels + 3 * n, inverse = 1.0 / z;
+    const bool is_stereo = !std::isnan(pixel[2]) && lens.focal_baseline > 0.0;
+    const double w = seen.weights[2 * n], w_disparity = is_stereo ? seen.weights[2 * n + 1] : 0.0;
+    const double residual[3] = {(lens.focal * x * inverse + lens.cx - pixel[0]) * w, (lens.focal * y * inverse + lens.cy - pixel[1]) * w,
+                                is_stereo ? (lens.focal_baseline * inverse - (pixel[0] - pixel[2])) * w_disparity : 0.0};
+    // d residual / d point, and by the step: the point moves by turn x point + shift.
+    const Vec3 by_point[3] = {{lens.focal * inverse * w, 0.0, -lens.focal * x * inverse * inverse * w},
+                              {0.0, lens.focal * inverse * w, -lens.focal * y * inverse * inverse * w},
+                              {0.0, 0.0, -lens.focal_baseline * inverse * inverse * w_disparity}};
+    double jacobian[3][6];
+    for (int k = 0; k < 3; ++k) store(cross(point, by_point[k]), jacobian[k]), store(by_point[k], jacobian[k] + 3);
+    const double e2 = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
+    squared[n] = e2;
+    const double damped = width * width / (width * width + e2), robust = damped * damped;
+    normal.cost += 0.5 * e2 * damped;
+    for (int a = 0; a < 6; ++a) {
+      normal.gradient[a] -= robust * (jacobian[0][a] * residual[0] + jacobian[1][a] * residual[1] + jacobian[2][a] * residual[2]);
+      for (int b = 0; b < 6; ++b)
+        normal.hessian[a][b] +=
+            robust * (jacobian[0][a] * jacobian[0][b] + jacobian[1][a] * jacobian[1][b] + jacobian[2][a] * jacobian[2][b]);
+    }
+  }
+}
+
+// Levenberg-Marquardt in place; leaves the normal equations and squared residuals where it ends. False where those are singular.
+bool refine(const Sightings& seen, const StereoLens& lens, double width, const double* prior, int iterations, SE3& cam_from_source,
+            Normal& normal, double* squared) {
+  double moved[6] = {}, damping = 1e-4;
+  linearize(seen, lens, width, cam_from_source, normal, squared);
+  for (int iteration = 0; iteration < iterations; ++iteration) {
+    Normal trial;
+    SE3 stepped;
+    double moved_then[6];
+    bool is_better = false;
+    for (int k = 0; k < kTrials && !is_better; ++k) {
+      double damped[36], step[6];
+      for (int a = 0; a < 6; ++a) {
+        step[a] = normal.gradient[a];
+        for (int b = 0; b < 6; ++b) {
+          damped[6 * a + b] = normal.hessian[a][b] + prior[6 * a + b];
+          step[a] -= prior[6 * a + b] * moved[b];
+        }
+        damped[7 * a] += damping * normal.hessian[a][a] + 1e-9;
+      }
+      if (!solve_spd(damped, step, 6, 6)) return false;
+      const Mat3 turn = so3_exp(vec3(step));
+      stepped.rotation = turn * cam_from_source.rotation;
+      for (int a = 0; a < 3; ++a) {
+        stepped.translation[a] = step[3 + a];
+        for (int b = 0; b < 3; ++b) stepped.translation[a] += turn[a][b] * cam_from_source.translation[b];
+      }
+      linearize(seen, lens, width, stepped, trial, squared);
+      for (int a = 0; a < 6; ++a) moved_then[a] = moved[a] + step[a];
+      for (int a = 0; a < 6; ++a)
+        for (int b = 0; b < 6; ++b) trial.cost += 0.5 * moved_then[a] * prior[6 * a + b] * moved_then[b];
+      is_better = trial.cost <= normal.cost;
+      if (!is_better) damping *= 10.0;
+    }
+    if (!is_better) {  // the residuals are those of the last trial
+      linearize(seen, lens, width, cam_from_source, normal, squared);
+      break;
+    }
+    const double gain = normal.cost - trial.cost;
+    cam_from_source = stepped;
+    normal = trial;
+    std::copy_n(moved_then, 6, moved);
+    damping = std::max(0.1 * damping, 1e-9);
+    if (gain < kEnough * (normal.cost + 1e-9)) break;
+  }
+  double information[36];
+  for (int a = 0; a < 6; ++a)
+    for (int b = 0; b < 6; ++b) information[6 * a + b] = normal.hessian[a][b] + prior[6 * a + b];
+  return cholesky_in_place(information, 6, 6);
+}
+
+}  // namespace
+
+bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
+                  double* hessian, double* squared) {
+  constexpr double kNoPrior[36] = {};
+  if (prior == nullptr) prior = kNoPrior;
+  Normal normal;
+  if (!refine(seen, lens, refinement.width, prior, refinement.iterations, cam_from_source, normal, squared)) return false;
+  const size_t count = size_t(std::count_if(squared, squared + seen.count, [&](double e2) { return e2 < refinement.gate_squared; }));
+  if (count >= kLeastInliers) {
+    std::vector<double> points, pixels, weights, again(count);
+    points.reserve(3 * count), pixels.reserve(3 * count), weights.reserve(2 * count);
+    for (size_t n = 0; n < seen.count; ++n) {
+      if (!(squared[n] < refinement.gate_squared)) continue;
+      points.insert(points.end(), seen.points + 3 * n, seen.points + 3 * n + 3);
+      pixels.insert(pixels.end(), seen.pixels + 3 * n, seen.pixels + 3 * n + 3);
+      weights.insert(weights.end(), seen.weights + 2 * n, seen.weights + 2 * n + 2);
+    }
+    const Sightings inliers{points.data(), pixels.data(), weights.data(), count};
+    if (!refine(inliers, lens, refinement.width, prior, refinement.inlier_iterations, cam_from_source, normal, again.data())) return false;
+    Normal of_all;
+    linearize(seen, lens, refinement.width, cam_from_source, of_all, squared);
+  }
+  std::copy_n(&normal.hessian[0][0], 36, hessian);
+  return true;
+}
+
+int search_translation(const Mat3& rotation, const double* points, const double* seen_points, const double* pixels, size_t count,
+                       const StereoLens& lens, double threshold_px, Vec3& best) {
+  int best_score = 0;
+  std::vector<Vec3> turned(count);
+  for (size_t n = 0; n < count; ++n) turned[n] = rotation * vec3(points + 3 * n);
+  for (size_t k = 0; k < count; ++k) {
+    if (std::isnan(seen_points[3 * k + 2])) continue;
+    const Vec3 translation = vec3(seen_points + 3 * k) - turned[k];
+    int score = 0;
+    for (size_t n = 0; n < count; ++n) {
+      const double z = turned[n][2] + translation[2];
+      if (z < kNearest) continue;
+      const double du = lens.focal * (turned[n][0] + translation[0]) / z + lens.cx - pixels[2 * n];
+      const double dv = lens.focal * (turned[n][1] + translation[1]) / z + lens.cy - pixels[2 * n + 1];
+      if (du * du + dv * dv < threshold_px * threshold_px) ++score;
+    }
+    if (score > best_score) best_score = score, best = translation;
+  }
+  return best_score;
+}
+
+}  // namespace fleetmap

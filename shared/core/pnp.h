@@ -1,0 +1,40 @@
+// The pose of one camera from points with known positions (PnP).
+#pragma once
+
+#include <cstddef>
+
+#include "camera.h"
+#include "lie.h"
+
+namespace fleetmap {
+
+// Points with known positions, and the pixels where a camera sees them.
+struct Sightings {
+  const double* points;   // (count, 3) in the source frame, metres
+  const double* pixels;   // (count, 3) u left, v, u right (NaN none)
+  const double* weights;  // (count, 2) 1 / sigma of u and v, of the disparity; 1 / pixels
+  size_t count;
+};
+
+// The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared
+// normalised residual is under the gate. So many iterations on all points, and on the inliers.
+struct Refinement {
+  double width, gate_squared;
+  int iterations, inlier_iterations;
+};
+
+// Robust least squares from a start, cam_from_source, in place: Levenberg-Marquardt on all points, and once more on the inliers alone, so
+// that no outlier biases the result. False where the points do not determine the camera.
+// The step is rotation first, applied from the left in camera axes; prior (6, 6): information that holds the start (no pointer: none).
+// Fills the last Hessian (6, 6), without the prior, and the squared normalised residuals (count,) of all points.
+// Source: Geman and McClure 1987 for the weight, Marquardt 1963 for the damping.
+bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
+                  double* hessian, double* squared);
+
+// The best translation for a known rotation, into `best`, and how many points (count, 3) of the source frame it brings nearer than the
+// threshold to their pixels (count, 2). Each point that the camera's own stereo has located too, seen_points (count, 3) in the camera
+// frame with NaN for none, proposes one.
+int search_translation(const Mat3& rotation, const double* points, const double* seen_points, const double* pixels, size_t count,
+                       const StereoLens& lens, double threshold_px, Vec3& best);
+
+}  // namespace fleetmap
