@@ -14,13 +14,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from fleetmap import core
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.grid.site_grid import AGAINST, HIT
 from mapserver.surfels.expected_view import expected_depth
-from mapserver.surfels.merge_kernels import EDGE_M, MAX_RANGE_M, MIN_RANGE_M, voxel_keys
-from mapserver.surfels.surfel_map import Surfels
+from mapserver.surfels.surfel_map import EDGE_M, MAX_RANGE_M, MIN_RANGE_M, Surfels
 
 CELL_M = 0.1
 APPEARED, VANISHED = "appeared", "vanished"
@@ -139,8 +139,7 @@ def _fill(layer: NDArray[np.bool_], points_map: Array | NDArray[np.float32], cor
 def _only_in(one: Surfels, other: Surfels) -> _Voxels:
     """Voxels of fine surfels of `one` that `other` has no surfel near to."""
     fine = one[one.levels <= _FINEST]
-    keys = np.empty(len(fine), np.int64)
-    voxel_keys(fine.points_map.astype(np.float64), np.full(len(fine), _VOXEL_LEVEL, np.uint8), keys)
+    keys = core.voxel_keys(fine.points_map, np.full(len(fine), _VOXEL_LEVEL, np.uint8))
     _, first, of_voxel = np.unique(keys, return_index=True, return_inverse=True)
     voxels = np.floor(fine.points_map[first].astype(np.float64) / _VOXEL_M)
     gaps_m = cKDTree(other.points_map).query((voxels + 0.5) * _VOXEL_M, distance_upper_bound=_REACH_M)[0]

@@ -7,17 +7,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.errors import CalibrationError, UsageError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.surfels.exposure import lens_factor
-from mapserver.surfels.render_kernels import BINS, BLOCK_PX, RIM, Image32, discs_before, draw_discs, near_to_far
 from mapserver.surfels.surfel_map import Surfels
 
+Image32 = NDArray[np.float32]
 FAR_M = 40.0
 RADIUS_EDGES = 1.2  # of a disc: more than half of the diagonal of a voxel's face
 MOST_PIXELS = 1 << 21
+_RIM = 0.1  # of the width: discs whose centre is so far outside may reach in
 _ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # views so near to each other have one exposure
 _MOST_SQUARED = 1.0  # tangent of the angle to the axis up to which a survey's lens is known
 
@@ -85,28 +87,31 @@ def _drawn(
     rays, pixels_per_rad, cosine = _lens(
         camera.model, camera.width_px, camera.height_px, tuple(camera.intrinsics_px), tuple(camera.distortion)
     )
-    cam_from_map, shape = se3_inverse(map_from_cam), rays.shape[:2]
+    cam_from_map = se3_inverse(map_from_cam)
     bends = camera.model != "radial-tangential" or camera.distortion.any()
-    numbers, points, pixels = np.empty(len(surfels), np.int32), np.empty((len(surfels), 3)), np.empty((len(surfels), 2))
-    count = discs_before(
-        surfels.points_map, surfels.normals, cam_from_map, (cosine, far_m), camera.intrinsics_px * (not bends),
-        (camera.width_px, camera.height_px), numbers, points, pixels,
+    numbers, points, pixels = core.discs_before(
+        surfels.points_map, surfels.normals, cam_from_map, cosine, far_m, camera.intrinsics_px * (not bends), camera.width_px,
+        camera.height_px,
     )  # fmt: skip
-    numbers, points, pixels = numbers[:count], points[:count], pixels[:count]
     if bends:
         pixels = camera.pixel_from_ray(points)
-        low, high = -RIM * camera.width_px, np.array([camera.width_px, camera.height_px]) + RIM * camera.width_px
+        low, high = -_RIM * camera.width_px, np.array([camera.width_px, camera.height_px]) + _RIM * camera.width_px
         inside = ((pixels > low) & (pixels < high)).all(axis=1)
         numbers, points, pixels = numbers[inside], points[inside], pixels[inside]
-    order = np.empty(len(points), np.int32)
-    near_to_far(points, far_m, np.zeros(BINS + 1, np.int64), order)
-    nearest, hidden = np.full(shape, np.inf, np.float32), np.empty([-(-side // BLOCK_PX) for side in shape], np.float32)
-    weight, colour, depth_m = (np.zeros(shape, np.float32) for _ in range(3))
-    draw_discs(
-        order, numbers, pixels, points, cam_from_map, surfels.normals, surfels.levels, surfels.greys, RADIUS_EDGES, rays, pixels_per_rad,
-        hidden, nearest, weight, colour, depth_m,
-    )  # fmt: skip
-    return rays, weight, colour, depth_m
+    drawn = core.draw_discs(
+        numbers,
+        points,
+        pixels,
+        cam_from_map,
+        surfels.normals,
+        surfels.levels,
+        surfels.greys,
+        far_m,
+        RADIUS_EDGES,
+        rays,
+        pixels_per_rad,
+    )
+    return rays, *drawn
 
 
 def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:

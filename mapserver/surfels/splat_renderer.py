@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration
-from mapserver.surfels.blend_kernels import LEAST_ALPHA, blend
 from mapserver.surfels.splat_file import THICKNESS, Splats
 
+LEAST_ALPHA = core.SPLAT_LEAST_ALPHA
 BLUR_PX2 = 0.3  # variance of a pixel, as in the viewers
 NEAR_M, FAR_M = 0.1, 40.0
 LEAST_OPACITY, MOST_OPACITY = 0.01, 0.985
@@ -83,19 +84,15 @@ def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_
         (flat.pixels + reaches_px >= 0) & (flat.pixels - reaches_px <= size_px - 1)
     ).all(axis=1)
     conics = blurred[is_seen][:, [2, 1, 0]] * (1.0, -1.0, 1.0) / _determinant(blurred[is_seen])[:, None]
-    numbers, count, shape = flat.numbers[is_seen], int(is_seen.sum()), (camera.height_px, camera.width_px)
-    every = (
-        flat.pixels[is_seen], conics, reaches_px[is_seen], peaks[is_seen], opacities[is_seen],
-        np.ascontiguousarray(chosen[is_seen, GREY]), BLUR_PX2,
-    )  # fmt: skip
+    reaches_px = np.ascontiguousarray(reaches_px[is_seen])
+    gaussians = flat.pixels[is_seen], np.ascontiguousarray(conics), reaches_px, peaks[is_seen], chosen[is_seen, GREY]
+    numbers, opacities = flat.numbers[is_seen], opacities[is_seen]
+    through, picture = core.blend(*gaussians, camera.width_px, camera.height_px)
 
-    def passed(slopes: Array, whole: Array, is_learning: bool) -> tuple[Array, Array, Array]:
-        through, picture, gradients = np.ones(shape), np.zeros(shape), np.zeros((count, 3))
-        blend(*every, slopes, whole, is_learning, through, picture, gradients)
-        return through, picture, gradients
+    def backward(slopes: Array) -> tuple[NDArray[np.int64], Array]:
+        return numbers, core.blend_backward(*gaussians, opacities, BLUR_PX2, np.ascontiguousarray(slopes), picture)
 
-    through, picture, _ = passed(np.zeros(shape), np.zeros(shape), False)
-    return Drawn(picture, through, lambda slopes: (numbers, passed(slopes, picture, True)[2]))
+    return Drawn(picture, through, backward)
 
 
 def _determinant(shapes: Array) -> Array:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.geometry import AnyArray, Array
@@ -16,8 +17,9 @@ from fleetmap.mapformat import Manifest, sha256_hex
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
 from mapserver.surfels.exposure import FALLOFF
-from mapserver.surfels.merge_kernels import EDGE_M, LEVELS
 
+EDGE_M, LEVELS = core.SURFEL_EDGE_M, core.SURFEL_LEVELS
+MIN_RANGE_M, MAX_RANGE_M = core.SURFEL_RANGE_M
 TILE_SIZE_M = 16.0  # the size of the map's own tiles
 SURFEL_MAGIC, SURFEL_FORMAT = b"FMSU", 1
 SURFELS_KEY = "surfels"

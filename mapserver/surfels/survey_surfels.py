@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.grid_tile import CELL_M
@@ -18,79 +19,16 @@ from mapserver.grid.grid_kernels import CLEAR_SIGMAS
 from mapserver.grid.site_grid import AGAINST, HIT, OCCUPIED, REACH_PX
 from mapserver.grid.survey_grid import GridSession, depth_views, measures_depth
 from mapserver.surfels.exposure import Sample, estimate_exposure, squared_tangent
-from mapserver.surfels.merge_kernels import (
-    EDGE_M,
-    LEVELS,
-    MAX_RANGE_M,
-    NORMAL,
-    OFFSET,
-    SEEN,
-    SEEN_THROUGH,
-    STRIDE,
-    SUMS,
-    VIEWS,
-    WEIGHT,
-    fill_slots,
-    look_at,
-    merge_view,
-    voxel_keys,
-)
-from mapserver.surfels.surfel_map import EXPOSURE, Surfels
+from mapserver.surfels.surfel_map import EDGE_M, EXPOSURE, LEVELS, MAX_RANGE_M, Surfels
 from mapserver.survey.state import Keyframe
 
+_SEEN, _SEEN_THROUGH = 1, 2
 _KEPT_STEP_PX = 4  # of what a view shows every so many pixels are kept, to ask what it sees through
 _BLOCK_M = 4.0  # surfels are judged by the views that are near to their block
 _OWN_LIGHT_M = 2.0
 _DARK, _MIN_ALIKE = 5, 50  # grey levels; voxels of one place that tell how two drives differ
 _SAMPLED, _SATURATED = 16, 250  # one surfel in so many tells the exposure; grey levels from which a pixel tells none
 _MIN_FINER = 2  # voxels of the next finer level that make a coarse one needless
-
-
-class VoxelTable:
-    """Voxels of one recording, which grow view by view."""
-
-    def __init__(self) -> None:
-        self._slots = np.full(1 << 16, -1, np.int32)
-        self._keys = np.zeros(0, np.int64)
-        self._sums = np.zeros((0, SUMS), np.float32)
-        self._views = np.zeros((0, 2), np.int32)
-        self._count = self._added = 0
-
-    def add(
-        self, disparity_px: NDArray[np.float32], sigma_px: float, camera: StereoCamera, map_from_cam: Array
-    ) -> None:
-        """One view, as of `depth_views`."""
-        self._make_room(-(-disparity_px.shape[0] // STRIDE) * -(-disparity_px.shape[1] // STRIDE))
-        self._count = merge_view(
-            disparity_px, sigma_px, camera.lens, np.ascontiguousarray(map_from_cam), self._added,
-            self._slots, self._keys, self._sums, self._views, self._count,
-        )  # fmt: skip
-        self._added += 1
-
-    def surfels(self) -> tuple[Surfels, NDArray[np.int64]]:
-        """The voxels as surfels without a colour, and of how many views each is."""
-        keys, sums = self._keys[: self._count], self._sums[: self._count].astype(np.float64)
-        levels = (keys >> 60).astype(np.uint8)
-        corners = np.stack([(keys >> shift & 0xFFFFF) - (1 << 19) for shift in (40, 20, 0)], axis=1)
-        edges_m = EDGE_M * np.exp2(levels.astype(np.float64))[:, None]
-        points = corners * edges_m + sums[:, OFFSET : OFFSET + 3] / sums[:, WEIGHT, None]
-        length = np.linalg.norm(sums[:, NORMAL : NORMAL + 3], axis=1, keepdims=True)
-        normals = sums[:, NORMAL : NORMAL + 3] / np.maximum(length, 1e-9)
-        greys = np.zeros(len(keys), np.uint8)
-        whole = Surfels(points.astype(np.float32), normals.astype(np.float32), levels, greys)
-        is_sound = length[:, 0] > 1e-9
-        return whole[is_sound], self._views[: self._count, VIEWS].astype(np.int64)[is_sound]
-
-    def _make_room(self, pixels: int) -> None:
-        needed = self._count + pixels
-        if needed > len(self._keys):
-            more = max(needed, 2 * len(self._keys)) - len(self._keys)
-            self._keys = np.concatenate([self._keys, np.zeros(more, np.int64)])
-            self._sums = np.concatenate([self._sums, np.zeros((more, SUMS), np.float32)])
-            self._views = np.concatenate([self._views, np.zeros((more, 2), np.int32)])
-        if 2 * needed > len(self._slots):
-            self._slots = np.full(1 << int(np.ceil(np.log2(4 * needed))), -1, np.int32)
-            fill_slots(self._slots, self._keys, self._count)
 
 
 def grow_surfels(
@@ -116,14 +54,15 @@ class _Look(NamedTuple):
 
 def _grown(before: Surfels, session: GridSession, settings: StereoSettings) -> Surfels:
     """After one session: what it saw through is gone, and what it saw as finely as it was known takes its place."""
-    camera, table, looks = session.survey.state.camera, VoxelTable(), list[_Look]()
+    camera, table, looks = session.survey.state.camera, core.VoxelTable(), list[_Look]()
     keyframes = session.survey.odometry.keyframes
     for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
-        table.add(disparity_px, sigma_px, camera, map_from_cam)
+        table.add(disparity_px, sigma_px, camera.lens, np.ascontiguousarray(map_from_cam))
         kept = slice(None, None, _KEPT_STEP_PX), slice(None, None, _KEPT_STEP_PX)
         nearest = np.where(disparity_px[kept] > 0, nearest_around(disparity_px, REACH_PX)[kept], np.float32(0.0))
         looks.append(_Look(keyframes[0].images.keep([nearest])[0], sigma_px, se3_inverse(map_from_cam)))
-    new, views = table.surfels()
+    points_map, normals, levels, views = table.surfels()
+    new = Surfels(points_map, normals, levels, np.zeros_like(levels))
     hits, passes = _judged(new, looks, camera)
     new = new[HIT * np.maximum(hits, views) - passes >= OCCUPIED]
     new = _coloured(new[~_known_finer(new, new, finer_by=1)], keyframes, looks, camera)
@@ -152,9 +91,7 @@ def _as_bright_as(old: Surfels, new: Surfels) -> Surfels:
 
 def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The voxels of surfels, once each, and the first surfel of each."""
-    keys = np.empty(len(surfels), np.int64)
-    voxel_keys(surfels.points_map.astype(np.float64), surfels.levels, keys)
-    found, first = np.unique(keys, return_index=True)
+    found, first = np.unique(core.voxel_keys(surfels.points_map, surfels.levels), return_index=True)
     return found, first
 
 
@@ -163,8 +100,8 @@ def _judged(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> t
     hits, passes = np.zeros((2, len(surfels)))
     for number, rows in _near(surfels, looks):
         marks, weights, _ = _look(surfels, rows, looks[number], camera)
-        hits[rows] += marks == SEEN
-        passes[rows] += weights * (marks == SEEN_THROUGH)
+        hits[rows] += marks == _SEEN
+        passes[rows] += weights * (marks == _SEEN_THROUGH)
     return hits, passes
 
 
@@ -185,14 +122,11 @@ def _near(surfels: Surfels, looks: Sequence[_Look]) -> Iterator[tuple[int, NDArr
 def _look(
     surfels: Surfels, rows: NDArray[np.int64], look: _Look, camera: StereoCamera
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Marks, weights and pixels as of `look_at` of these surfels."""
-    marks, weights = np.zeros(len(rows), np.uint8), np.zeros(len(rows), np.float32)
-    pixels = np.zeros((len(rows), 2), np.float32)
-    look_at(
+    """Marks, weights and pixels as of `core.look_at` of these surfels."""
+    return core.look_at(
         surfels.points_map[rows], surfels.levels[rows], look.nearest_px, _KEPT_STEP_PX, look.sigma_px, camera.lens, look.cam_from_map,
-        (CLEAR_SIGMAS, CELL_M), marks, weights, pixels,
+        CLEAR_SIGMAS, CELL_M,
     )  # fmt: skip
-    return marks, weights, pixels
 
 
 def _coloured(surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera) -> Surfels:
@@ -226,10 +160,11 @@ def _shown(
     for number, near in _near(surfels, looks):
         rows = near[near % every == 0]
         marks, _, pixels = _look(surfels, rows, looks[number], camera)
-        rows, pixels = rows[marks == SEEN], pixels[marks == SEEN]
+        rows, pixels = rows[marks == _SEEN], pixels[marks == _SEEN]
         if not len(rows):
             continue
-        smooth = np.asarray(cv2.blur(keyframes[number].frame.left, (STRIDE + 1, STRIDE + 1)), np.uint8)
+        size = (core.SURFEL_STRIDE_PX + 1,) * 2
+        smooth = np.asarray(cv2.blur(keyframes[number].frame.left, size), np.uint8)
         yield number, rows, pixels, _bilinear(smooth, pixels)
 
 
@@ -261,6 +196,4 @@ def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[
 
 
 def _keys(points_map: NDArray[np.float32], level: int) -> NDArray[np.int64]:
-    keys = np.empty(len(points_map), np.int64)
-    voxel_keys(points_map.astype(np.float64), np.full(len(points_map), level, np.uint8), keys)
-    return keys
+    return core.voxel_keys(points_map, np.full(len(points_map), level, np.uint8))

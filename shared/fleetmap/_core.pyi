@@ -13,6 +13,7 @@ _Numbers = NDArray[np.int32]
 _Indices = NDArray[np.int64]
 _Pixels = NDArray[np.float32]
 _Reals = NDArray[np.float64]
+_Floats = NDArray[np.float32]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -142,3 +143,81 @@ class BlockCholesky:
 
     def solve(self, values: _Reals, rhs: _Reals) -> _Reals:
         """x (U,) of A x = rhs (U,), by the values of the factor."""
+
+# --- surfels: lengths in metres, points, normals and pixels (N, ...) in `map` or the camera, poses (4, 4), lens (4,) as of StereoCamera ---
+SURFEL_EDGE_M: float
+SURFEL_LEVELS: int
+SURFEL_STRIDE_PX: int
+SURFEL_RANGE_M: tuple[float, float]
+SPLAT_LEAST_ALPHA: float
+
+def voxel_keys(points_map: _Floats, levels: _Grey) -> _Indices:
+    """(N,) voxels of points at these levels."""
+
+class VoxelTable:
+    """Voxels of one recording, which grow view by view."""
+
+    def __init__(self) -> None: ...
+    def add(self, disparity_px: _Floats, sigma_px: float, lens: _Reals, map_from_cam: _Reals) -> None:
+        """Merges the points of a view (H, W) into voxels; NaN is unknown."""
+
+    def surfels(self) -> tuple[_Floats, _Floats, _Grey, _Indices]:
+        """Points, normals, levels of the voxels, and of how many views each is."""
+
+def look_at(
+    points_map: _Floats,
+    levels: _Grey,
+    nearest_px: _Floats,
+    step_px: int,
+    sigma_px: float,
+    lens: _Reals,
+    cam_from_map: _Reals,
+    clear_sigmas: float,
+    clear_m: float,
+) -> tuple[_Grey, _Floats, _Pixels]:
+    """Marks (N,), 1 seen, 2 seen through, 0 neither; for how many views the view counts; where the points are."""
+
+def discs_before(
+    points_map: _Floats,
+    normals_map: _Floats,
+    cam_from_map: _Reals,
+    cosine: float,
+    far_m: float,
+    pinhole: _Reals,
+    width: int,
+    height: int,
+) -> tuple[_Numbers, _Reals, _Reals]:
+    """Numbers of the discs that face the camera in a cone, their points in the camera, and their pixels through a pinhole."""
+
+def draw_discs(
+    numbers: _Numbers,
+    points_cam: _Reals,
+    pixels: _Reals,
+    cam_from_map: _Reals,
+    normals_map: _Floats,
+    levels: _Grey,
+    colours: _Grey,
+    far_m: float,
+    radius_edges: float,
+    rays: _Reals,
+    pixels_per_rad: _Floats,
+) -> tuple[_Floats, _Floats, _Floats]:
+    """Weight, and colour and depth along the ray times it, of each pixel (H, W)."""
+
+def blend(
+    pixels: _Reals, conics: _Reals, reaches_px: _Reals, peaks: _Reals, greys: _Reals, width: int, height: int
+) -> tuple[_Reals, _Reals]:
+    """The share of light that passes all Gaussians, and their picture (H, W)."""
+
+def blend_backward(
+    pixels: _Reals,
+    conics: _Reals,
+    reaches_px: _Reals,
+    peaks: _Reals,
+    greys: _Reals,
+    opacities: _Reals,
+    blur_px2: float,
+    slopes: _Reals,
+    whole: _Reals,
+) -> _Reals:
+    """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""

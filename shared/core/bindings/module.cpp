@@ -9,6 +9,7 @@ namespace nb = nanobind;
 
 void bind_block_cholesky(nb::module_&);
 void bind_corners(nb::module_&);
+void bind_surfels(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_pnp(nb::module_&);
 void bind_stereo(nb::module_&);
@@ -41,4 +42,5 @@ NB_MODULE(_core, module) {
   bind_stereo(module);
   bind_preintegration(module);
   bind_vocabulary(module);
+  bind_surfels(module);
 }

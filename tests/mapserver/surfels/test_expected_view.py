@@ -1,4 +1,4 @@
-"""Views drawn by the kernels against a slow reference, and of scenes whose view can be said."""
+"""Views drawn by the core against a slow reference, and of scenes whose view can be said."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.surfels.expected_view import MOST_PIXELS, RADIUS_EDGES, expected_view, filled, resized
-from mapserver.surfels.render_kernels import MIN_PIXELS, THICK_EDGES, THICK_PER_M
 from mapserver.surfels.surfel_map import Surfels
 from support.storage.map_samples import wall
 
@@ -20,6 +19,7 @@ FISHEYE = CameraCalibration(
 )
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 FORWARD = se3(OPTICAL, np.zeros(3))
+MIN_PIXELS, THICK_EDGES, THICK_PER_M = 0.75, 3.0, 100.0  # as surfels.cpp has them
 
 
 def reference(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array) -> tuple[Array, Array]:

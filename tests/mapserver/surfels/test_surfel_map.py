@@ -10,8 +10,7 @@ import pytest
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from mapserver import releases
 from mapserver.store import MapStore, Retention
-from mapserver.surfels.merge_kernels import LEVELS
-from mapserver.surfels.surfel_map import TILE_SIZE_M, Surfels, encode_surfels, known_surfels, surfels_of
+from mapserver.surfels.surfel_map import LEVELS, TILE_SIZE_M, Surfels, encode_surfels, known_surfels, surfels_of
 from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
 
 

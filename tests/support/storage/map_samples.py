@@ -13,8 +13,7 @@ from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
-from mapserver.surfels.merge_kernels import EDGE_M
-from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
+from mapserver.surfels.surfel_map import EDGE_M, Surfels, encode_surfels, surfel_report
 from mapserver.survey.survey_map import SurveyMap
 
 
