@@ -115,18 +115,12 @@ bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinemen
   if (prior == nullptr) prior = kNoPrior;
   Normal normal;
   if (!refine(seen, lens, refinement.width, prior, refinement.iterations, cam_from_source, normal, squared)) return false;
-  const size_t count = size_t(std::count_if(squared, squared + seen.count, [&](double e2) { return e2 < refinement.gate_squared; }));
-  if (count >= kLeastInliers) {
-    std::vector<double> points, pixels, weights, again(count);
-    points.reserve(3 * count), pixels.reserve(3 * count), weights.reserve(2 * count);
-    for (size_t n = 0; n < seen.count; ++n) {
-      if (!(squared[n] < refinement.gate_squared)) continue;
-      points.insert(points.end(), seen.points + 3 * n, seen.points + 3 * n + 3);
-      pixels.insert(pixels.end(), seen.pixels + 3 * n, seen.pixels + 3 * n + 3);
-      weights.insert(weights.end(), seen.weights + 2 * n, seen.weights + 2 * n + 2);
-    }
-    const Sightings inliers{points.data(), pixels.data(), weights.data(), count};
-    if (!refine(inliers, lens, refinement.width, prior, refinement.inlier_iterations, cam_from_source, normal, again.data())) return false;
+  ChosenSightings inliers;
+  for (size_t n = 0; n < seen.count; ++n)
+    if (squared[n] < refinement.gate_squared) inliers.add(seen, n);
+  const Sightings again = inliers.all();
+  if (again.count >= kLeastInliers) {
+    if (!refine(again, lens, refinement.width, prior, refinement.inlier_iterations, cam_from_source, normal, squared)) return false;
     Normal of_all;
     linearize(seen, lens, refinement.width, cam_from_source, of_all, squared);
   }
@@ -134,25 +128,13 @@ bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinemen
   return true;
 }
 
-int search_translation(const Mat3& rotation, const double* points, const double* seen_points, const double* pixels, size_t count,
-                       const StereoLens& lens, double threshold_px, Vec3& best) {
-  int best_score = 0;
-  std::vector<Vec3> turned(count);
-  for (size_t n = 0; n < count; ++n) turned[n] = rotation * vec3(points + 3 * n);
-  for (size_t k = 0; k < count; ++k) {
-    if (std::isnan(seen_points[3 * k + 2])) continue;
-    const Vec3 translation = vec3(seen_points + 3 * k) - turned[k];
-    int score = 0;
-    for (size_t n = 0; n < count; ++n) {
-      const double z = turned[n][2] + translation[2];
-      if (z < kNearest) continue;
-      const double du = lens.focal * (turned[n][0] + translation[0]) / z + lens.cx - pixels[2 * n];
-      const double dv = lens.focal * (turned[n][1] + translation[1]) / z + lens.cy - pixels[2 * n + 1];
-      if (du * du + dv * dv < threshold_px * threshold_px) ++score;
-    }
-    if (score > best_score) best_score = score, best = translation;
-  }
-  return best_score;
+std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
+                                    const SE3& start) {
+  Resection found{start, {}, std::vector<double>(seen.count)};
+  if (!refine_twice(seen, lens, refinement, prior, found.cam_from_source, found.information, found.squared.data())) return {};
+  if (prior != nullptr)
+    for (int k = 0; k < 36; ++k) found.information[k] += prior[k];
+  return found;
 }
 
 }  // namespace fleetmap

@@ -2,6 +2,8 @@
 #pragma once
 
 #include <cstddef>
+#include <optional>
+#include <vector>
 
 #include "camera.h"
 #include "lie.h"
@@ -14,6 +16,18 @@ struct Sightings {
   const double* pixels;   // (count, 3) u left, v, u right (NaN none)
   const double* weights;  // (count, 2) 1 / sigma of u and v, of the disparity; 1 / pixels
   size_t count;
+};
+
+// Sightings that are chosen one by one.
+struct ChosenSightings {
+  std::vector<double> points, pixels, weights;
+
+  void add(const Sightings& from, size_t n) {
+    points.insert(points.end(), from.points + 3 * n, from.points + 3 * n + 3);
+    pixels.insert(pixels.end(), from.pixels + 3 * n, from.pixels + 3 * n + 3);
+    weights.insert(weights.end(), from.weights + 2 * n, from.weights + 2 * n + 2);
+  }
+  Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size() / 3}; }
 };
 
 // The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared
@@ -31,10 +45,15 @@ struct Refinement {
 bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
                   double* hessian, double* squared);
 
-// The best translation for a known rotation, into `best`, and how many points (count, 3) of the source frame it brings nearer than the
-// threshold to their pixels (count, 2). Each point that the camera's own stereo has located too, seen_points (count, 3) in the camera
-// frame with NaN for none, proposes one.
-int search_translation(const Mat3& rotation, const double* points, const double* seen_points, const double* pixels, size_t count,
-                       const StereoLens& lens, double threshold_px, Vec3& best);
+// A solved camera: the information (6, 6), with the prior, on a perturbation as that of the steps, and the squared normalised residuals.
+struct Resection {
+  SE3 cam_from_source;
+  double information[36];
+  std::vector<double> squared;
+};
+
+// As refine_twice.
+std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
+                                    const SE3& start);
 
 }  // namespace fleetmap

@@ -39,12 +39,12 @@ def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
     """(N, 2) numbers of the nearest and the second nearest centre."""
 
 def refine_pnp(
-    cam_from_source: _Reals,
     points: _Reals,
     pixels: _Reals,
     weights: _Reals,
     lens: _Reals,
     refinement: tuple[float, float, tuple[int, int]],
+    cam_from_source: _Reals,
     prior: _Reals | None,
 ) -> tuple[_Reals, _Reals, _Reals] | None:
     """cam_from_source (4, 4) refined, its information (6, 6) and the squared normalised residuals (N,); None where singular.
@@ -54,13 +54,31 @@ def refine_pnp(
     all and on inliers. prior (6, 6): information that holds the start.
     """
 
-def search_translation(
-    rotation: _Reals, points: _Reals, seen_points: _Reals, pixels: _Reals, lens: _Reals, threshold_px: float
-) -> tuple[int, _Reals]:
-    """How many of points (N, 3) a camera of this rotation sees within the threshold of their pixels (N, 2), and its translation (3,).
+def ransac_pnp(
+    points: _Reals,
+    pixels: _Reals,
+    weights: _Reals,
+    lens: _Reals,
+    refinement: tuple[float, float, tuple[int, int]],
+    threshold_px: float,
+    min_inliers: int,
+    draws: _Reals,
+    confidence: float,
+) -> tuple[_Reals, _Reals, _Reals] | None:
+    """As refine_pnp without a start. draws (I, 3) in [0, 1): which three points propose."""
 
-    seen_points (N, 3): the same in the camera, by its own stereo (NaN none).
-    """
+def pnp_with_rotation(
+    points: _Reals,
+    pixels: _Reals,
+    weights: _Reals,
+    lens: _Reals,
+    refinement: tuple[float, float, tuple[int, int]],
+    threshold_px: float,
+    min_inliers: int,
+    rotation: _Reals,
+    rotation_sigma_rad: float,
+) -> tuple[_Reals, _Reals, _Reals] | None:
+    """As ransac_pnp where the rotation (3, 3) is nearly known."""
 
 def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
     """(N, 2) whole-pixel corners, row by row."""

@@ -78,7 +78,8 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
         operator.attrgetter(name)(_core)(*[strange] * max(1, len(STUB[name].args.args)))
 
 
-POINTS, PAIRS, LENS, REFINEMENT = np.ones((3, 3)), np.ones((3, 2)), np.ones(4), (4.0, 11.0, (10, 5))
+POINTS = np.ones((5, 3))
+SEEN = POINTS, POINTS, np.ones((5, 2)), np.ones(4), (4.0, 11.0, (10, 5))  # as PnP takes it
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
 STAMPS, SAMPLES, ZERO = np.arange(3), np.zeros((3, 3)), np.zeros(3)
@@ -96,10 +97,10 @@ CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arang
         (lambda: core.descend(WORDS, WORDS, NUMBERS, NUMBERS + 5, NUMBERS), "children"),
         (lambda: core.descend(WORDS, WORDS[:0], NUMBERS[:0], NUMBERS[:0], NUMBERS[:0]), "root"),
         (lambda: core.descend(WORDS, WORDS, NUMBERS[:2], NUMBERS, NUMBERS), "one number for each node"),
-        (lambda: core.refine_pnp(np.eye(4), POINTS, POINTS[:2], PAIRS, LENS, REFINEMENT, None), "pixels"),
-        (lambda: core.refine_pnp(np.eye(4), POINTS, POINTS, PAIRS[:2], LENS, REFINEMENT, None), "weights"),
-        (lambda: core.search_translation(np.eye(3), POINTS, POINTS[:2], PAIRS, LENS, 1.0), "seen_points"),
-        (lambda: core.search_translation(np.eye(3), POINTS, POINTS, PAIRS[:2], LENS, 1.0), "pixels"),
+        (lambda: core.refine_pnp(POINTS, POINTS[:2], *SEEN[2:], np.eye(4), None), "pixels"),
+        (lambda: core.ransac_pnp(*SEEN[:2], np.ones((2, 2)), *SEEN[3:], 1.0, 4, POINTS / 2, 0.9), "weights"),
+        (lambda: core.ransac_pnp(*SEEN, 1.0, 4, POINTS, 0.9), "draws"),
+        (lambda: core.pnp_with_rotation(POINTS[:2], *SEEN[1:], 1.0, 4, np.eye(3), 0.1), "one row for each point"),
         (lambda: core.fast_corners(IMAGE, 300, 3, None), "threshold"),
         (lambda: core.fast_corners(IMAGE, 20, 2, None), "border_px"),
         (lambda: core.fast_corners(IMAGE, 20, 3, IMAGE[:5]), "free"),
@@ -139,8 +140,11 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
     assert len(core.centroid_angles_deg(IMAGE, OUTSIDE, 15)) == 3
     assert len(core.select_spread(PIXELS, np.arange(3), OUTSIDE, 5.0, 9, 30, 20)) == 1
     assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
-    assert core.refine_pnp(np.eye(4), np.full((3, 3), np.nan), POINTS, PAIRS, LENS, REFINEMENT, None) is None
-    assert core.search_translation(np.eye(3), np.full((3, 3), np.inf), POINTS, PAIRS, LENS, 1.0)[0] == 0
+    for strange in (np.nan, np.inf, 1e200, 0.0):
+        points = np.full((5, 3), strange)
+        assert core.refine_pnp(points, *SEEN[1:], np.eye(4), None) is None
+        assert core.ransac_pnp(POINTS, points, *SEEN[2:], 1.0, 4, np.eye(3) / 2, 0.9) is None
+        assert core.pnp_with_rotation(points, *SEEN[1:], 1.0, 4, np.eye(3), 0.1) is None
 
 
 # Calls with places (4, 2) of any numbers, at which they read a noisy image.

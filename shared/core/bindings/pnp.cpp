@@ -1,8 +1,9 @@
 #include "arrays.h"  // first: Python's header comes before the system's
 
+#include <algorithm>
 #include <optional>
 
-#include "pnp.h"
+#include "pnp_search.h"
 
 using namespace fleetmap;
 
@@ -10,50 +11,74 @@ namespace {
 
 using Lens = Array<double, 4>;
 using Points = Array<double, -1, 3>;
+using Weights = Array<double, -1, 2>;
+using Limits = std::tuple<double, double, std::tuple<int, int>>;
 
-StereoLens stereo_lens(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
-
-auto refine_pnp_of(const Array<double, 4, 4>& cam_from_source, const Points& points, const Points& pixels,
-                   const Array<double, -1, 2>& weights, const Lens& lens,
-                   const std::tuple<double, double, std::tuple<int, int>>& refinement, const std::optional<Array<double, 6, 6>>& prior) {
-  const size_t count = points.shape(0);
-  if (pixels.shape(0) != count || weights.shape(0) != count) throw nb::value_error("pixels and weights: one row for each point");
-  const auto [width, gate_squared, iterations] = refinement;
-  using Result = std::tuple<nb::ndarray<nb::numpy, double, nb::ndim<2>>, nb::ndarray<nb::numpy, double, nb::ndim<2>>,
-                            nb::ndarray<nb::numpy, double, nb::ndim<1>>>;
-  SE3 refined = se3(cam_from_source.data());
-  std::vector<double> information(36), squared(count), matrix(16);
-  const bool is_solved = unlocked([&] {
-    const Sightings seen{points.data(), pixels.data(), weights.data(), count};
-    const Refinement limits{width, gate_squared, std::get<0>(iterations), std::get<1>(iterations)};
-    return refine_twice(seen, stereo_lens(lens), limits, prior ? prior->data() : nullptr, refined, information.data(), squared.data());
-  });
-  if (!is_solved) return std::optional<Result>();
-  if (prior)
-    for (size_t k = 0; k < 36; ++k) information[k] += prior->data()[k];
-  store(refined, matrix.data());
-  return std::optional<Result>(Result(as_numpy<double, 2>(std::move(matrix), {4, 4}), as_numpy<double, 2>(std::move(information), {6, 6}),
-                                      as_numpy<double, 1>(std::move(squared), {count})));
+Sightings sightings_of(const Points& points, const Points& pixels, const Weights& weights) {
+  if (pixels.shape(0) != points.shape(0) || weights.shape(0) != points.shape(0))
+    throw nb::value_error("pixels and weights: one row for each point");
+  return {points.data(), pixels.data(), weights.data(), points.shape(0)};
 }
 
-auto search_translation_of(const Array<double, 3, 3>& rotation, const Points& points, const Points& seen_points,
-                           const Array<double, -1, 2>& pixels, const Lens& lens, double threshold_px) {
-  const size_t count = points.shape(0);
-  if (seen_points.shape(0) != count || pixels.shape(0) != count) throw nb::value_error("seen_points and pixels: one row for each point");
-  Vec3 best = {};
-  const int score = unlocked([&] {
-    return search_translation(mat3(rotation.data()), points.data(), seen_points.data(), pixels.data(), count, stereo_lens(lens),
-                              threshold_px, best);
-  });
-  return std::make_tuple(score, as_numpy<double, 1>(std::vector<double>(best.at, best.at + 3), {3}));
+StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
+
+Refinement refinement_of(const Limits& limits) {
+  const auto& [width, gate_squared, iterations] = limits;
+  return {width, gate_squared, std::get<0>(iterations), std::get<1>(iterations)};
+}
+
+Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
+
+using Matrix2 = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
+using Result = std::optional<std::tuple<Matrix2, Matrix2, nb::ndarray<nb::numpy, double, nb::ndim<1>>>>;
+
+Result result_of(std::optional<Resection>&& found) {
+  if (!found) return {};
+  std::vector<double> matrix(16), information(found->information, found->information + 36);
+  store(found->cam_from_source, matrix.data());
+  const size_t count = found->squared.size();
+  return {{as_numpy<double, 2>(std::move(matrix), {4, 4}), as_numpy<double, 2>(std::move(information), {6, 6}),
+           as_numpy<double, 1>(std::move(found->squared), {count})}};
+}
+
+Result refine_pnp_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
+                     const Array<double, 4, 4>& cam_from_source, const std::optional<Array<double, 6, 6>>& prior) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  return result_of(unlocked([&] {
+    return refine_pnp(seen, lens_of(lens), refinement_of(refinement), prior ? prior->data() : nullptr, se3(cam_from_source.data()));
+  }));
+}
+
+Result ransac_pnp_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
+                     double threshold_px, int min_inliers, const Points& draws, double confidence) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  if (!std::all_of(draws.data(), draws.data() + draws.size(), [](double draw) { return draw >= 0.0 && draw < 1.0; }))
+    throw nb::value_error("draws: from 0 to below 1");
+  return result_of(unlocked([&] {
+    return ransac_pnp(seen, lens_of(lens), refinement_of(refinement), agreement_of(threshold_px, min_inliers), draws.data(), draws.shape(0),
+                      confidence);
+  }));
+}
+
+Result pnp_with_rotation_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
+                            double threshold_px, int min_inliers, const Array<double, 3, 3>& rotation, double rotation_sigma_rad) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  return result_of(unlocked([&] {
+    return pnp_with_rotation(seen, lens_of(lens), refinement_of(refinement), agreement_of(threshold_px, min_inliers), mat3(rotation.data()),
+                             rotation_sigma_rad);
+  }));
 }
 
 }  // namespace
 
 void bind_pnp(nb::module_& module) {
-  const auto points = "points"_a.noconvert(), pixels = "pixels"_a.noconvert(), lens = "lens"_a.noconvert();
-  module.def("refine_pnp", &refine_pnp_of, "cam_from_source"_a.noconvert(), points, pixels, "weights"_a.noconvert(), lens, "refinement"_a,
+  const auto points = "points"_a.noconvert(), pixels = "pixels"_a.noconvert(), weights = "weights"_a.noconvert();
+  const auto lens = "lens"_a.noconvert();
+  const auto refinement = "refinement"_a, threshold = "threshold_px"_a, least = "min_inliers"_a;
+  module.def("refine_pnp", &refine_pnp_of, points, pixels, weights, lens, refinement, "cam_from_source"_a.noconvert(),
              "prior"_a.noconvert().none());
-  module.def("search_translation", &search_translation_of, "rotation"_a.noconvert(), points, "seen_points"_a.noconvert(), pixels, lens,
-             "threshold_px"_a);
+  module.def("ransac_pnp", &ransac_pnp_of, points, pixels, weights, lens, refinement, threshold, least, "draws"_a.noconvert(),
+             "confidence"_a);
+  module.def("pnp_with_rotation", &pnp_with_rotation_of, points, pixels, weights, lens, refinement, threshold, least,
+             "rotation"_a.noconvert(), "rotation_sigma_rad"_a);
 }

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3, transform_points
-from fleetmap.pnp import p3p_ransac_kernels
+from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight (Geman-McClure), in sigmas
@@ -66,19 +65,8 @@ def refine_pnp(
     """
     if len(matches) == 0:
         return None
-    solved = core.refine_pnp(
-        np.ascontiguousarray(cam_from_source),
-        np.ascontiguousarray(matches.points_source, np.float64),
-        np.ascontiguousarray(matches.pixels, np.float64),
-        1.0 / np.ascontiguousarray(matches.sigmas_px, np.float64),
-        matches.camera.lens,
-        REFINEMENT,
-        None if prior_information is None else np.ascontiguousarray(prior_information),
-    )
-    if solved is None:
-        return None
-    refined, information, squared = solved
-    return PnpResult(refined, information, squared < GATE_SQUARED, squared)
+    prior = None if prior_information is None else np.ascontiguousarray(prior_information)
+    return _result(core.refine_pnp(*_sightings(matches), np.ascontiguousarray(cam_from_source), prior))
 
 
 def ransac_pnp(
@@ -86,22 +74,12 @@ def ransac_pnp(
 ) -> PnpResult | None:
     """As `refine_pnp` without a start: three-point RANSAC first, of so many iterations at most.
 
-    None below min_inliers. Sources are named in the kernels.
+    None below min_inliers. Sources are named in the core.
     """
     if len(matches) < max(min_inliers, 4):
         return None
-    points = np.ascontiguousarray(matches.points_source, np.float64)
-    measured = np.ascontiguousarray(matches.pixels[:, :2], np.float64)
-    rotation, translation, camera = np.eye(3), np.zeros(3), matches.camera
     draws = np.random.default_rng(seed).random((iterations, 3))
-    votes = p3p_ransac_kernels.search(
-        points, measured, camera.lens, threshold_px, draws, _CONFIDENCE, rotation, translation
-    )
-    if votes < min_inliers:
-        return None
-    start = se3(rotation, translation)
-    off = np.linalg.norm(camera.pixel_from_point(transform_points(start, points))[:, :2] - measured, axis=1)
-    return _refined_twice(matches, off < threshold_px, start, None, min_inliers)
+    return _result(core.ransac_pnp(*_sightings(matches), threshold_px, min_inliers, draws, _CONFIDENCE))
 
 
 def pnp_with_rotation(
@@ -117,27 +95,24 @@ def pnp_with_rotation(
     One correspondence proposes the translation. Needs depth in both views. Finds the pose among far more wrong matches
     than three points can; none below min_inliers.
     """
-    if len(matches) < min_inliers:
-        return None
-    camera, points, pixels = matches.camera, matches.points_source, matches.pixels
-    seen = camera.point_from_pixel(pixels[:, :2], pixels[:, 0] - pixels[:, 2])
-    rotation, measured = np.ascontiguousarray(cam_from_source_rotation), np.ascontiguousarray(pixels[:, :2])
-    score, translation = core.search_translation(
-        rotation, np.ascontiguousarray(points), seen, measured, camera.lens, threshold_px
+    rotation = np.ascontiguousarray(cam_from_source_rotation)
+    return _result(
+        core.pnp_with_rotation(*_sightings(matches), threshold_px, min_inliers, rotation, rotation_sigma_rad)
     )
-    if score < min_inliers:
+
+
+def _sightings(matches: Correspondences) -> tuple[Array, Array, Array, Array, tuple[float, float, tuple[int, int]]]:
+    return (
+        np.ascontiguousarray(matches.points_source, np.float64),
+        np.ascontiguousarray(matches.pixels, np.float64),
+        1.0 / np.ascontiguousarray(matches.sigmas_px, np.float64),
+        matches.camera.lens,
+        REFINEMENT,
+    )
+
+
+def _result(solved: tuple[Array, Array, Array] | None) -> PnpResult | None:
+    if solved is None:
         return None
-    prior = np.zeros((6, 6))
-    prior[:3, :3] = np.eye(3) / rotation_sigma_rad**2
-    start = se3(cam_from_source_rotation, translation)
-    off = np.linalg.norm(camera.pixel_from_point(points @ start[:3, :3].T + translation)[:, :2] - pixels[:, :2], axis=1)
-    return _refined_twice(matches, off < threshold_px, start, prior, min_inliers)
-
-
-def _refined_twice(
-    matches: Correspondences, near: NDArray[np.bool_], start: Array, prior: Array | None, min_inliers: int
-) -> PnpResult | None:
-    """Least squares on the matches near a start, then on all; None below min_inliers."""
-    first = refine_pnp(matches.take(near), start, prior)
-    result = None if first is None else refine_pnp(matches, first.cam_from_source, prior)
-    return result if result is not None and int(result.inliers.sum()) >= min_inliers else None
+    cam_from_source, information, squared = solved
+    return PnpResult(cam_from_source, information, squared < GATE_SQUARED, squared)

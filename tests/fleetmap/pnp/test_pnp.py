@@ -58,7 +58,7 @@ def test_it_ends_where_the_cost_is_least_and_its_information_is_the_curvature() 
     def at(cam_from_map: Array, width: float, iterations: int = 0) -> tuple[float, Array, Array]:
         """The cost after so many iterations, the camera and its information."""
         limits = width, 0.0, (iterations, 0)
-        found = core.refine_pnp(cam_from_map, points, pixels, 1 / sigmas, CAMERA.lens, limits, None)
+        found = core.refine_pnp(points, pixels, 1 / sigmas, CAMERA.lens, limits, cam_from_map, None)
         assert found is not None
         return float(np.sum(0.5 * found[2] * width**2 / (width**2 + found[2]))), found[0], found[1]
 
@@ -114,6 +114,39 @@ def test_ransac_needs_no_start() -> None:
     again = ransac_pnp(Correspondences(CAMERA, points, pixels, sigmas), threshold_px=2.0, min_inliers=12, seed=1)
     assert again is not None
     np.testing.assert_array_equal(again.cam_from_source, found.cam_from_source)
+
+
+def test_the_truth_is_among_the_cameras_that_three_points_allow() -> None:
+    """Three points propose, of which one try takes any, and the fourth chooses; nothing is refined."""
+    rng, missed = np.random.default_rng(2), 0
+    for _ in range(400):
+        cam_from_map = se3_exp(np.concatenate([rng.normal(0, 1.2, 3), rng.normal(0, 5, 3)]))
+        points_cam = transform_points(CAM_FROM_MAP, seen(rng, 4)[0])
+        points, pixels = transform_points(se3_inverse(cam_from_map), points_cam), CAMERA.pixel_from_point(points_cam)
+        limits = 4.0, 1e9, (0, 0)
+        found = core.ransac_pnp(points, pixels, np.ones((4, 2)), CAMERA.lens, limits, 0.1, 4, rng.random((1, 3)), 0.999)
+        missed += found is None or not np.allclose(found[0], cam_from_map, atol=1e-4)
+    assert missed <= 4
+
+
+def test_points_in_a_line_propose_nothing() -> None:
+    points = np.array([[0.0, 0.0, 3.0], [0.1, 0.1, 3.1], [0.2, 0.2, 3.2], [0.3, 0.3, 3.3]])
+    matches = Correspondences(CAMERA, points, CAMERA.pixel_from_point(points), np.ones((4, 2)))
+    assert ransac_pnp(matches, threshold_px=2.0, min_inliers=0, seed=1) is None
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 0.75])
+def test_the_camera_is_found_among_wrong_matches(wrong: float) -> None:
+    rng = np.random.default_rng(3)
+    for k in range(10):
+        points, pixels, sigmas = seen(rng, 80, noise=1.0)
+        bad = rng.random(80) < wrong
+        pixels[bad, :2], pixels[:, 2] = rng.uniform([0, 0], [640, 480], (int(bad.sum()), 2)), np.nan
+        matches = Correspondences(CAMERA, points, pixels, sigmas)
+        found = ransac_pnp(matches, threshold_px=3.0, min_inliers=12, seed=k)
+        assert found is not None
+        assert found.inliers.sum() >= 0.8 * (~bad).sum()
+        assert np.linalg.norm(error(found.cam_from_source)) < 0.1
 
 
 def test_known_rotation_survives_70_percent_outliers() -> None:
