@@ -48,10 +48,10 @@ class MappedImageStore:
         """See ImageStore."""
         frame = pictures.frame
         with disk_errors("a picture of the survey cannot be set aside", "make space beside the store"), self._lock:
-            left, *halves = (self._mapped(level) for level in pictures.pyramid)
+            left, half, quarter = (self._mapped(level) for level in pictures.pyramid)
             right, disparity = (None if a is None else self._mapped(a) for a in (frame.right, frame.disparity_px))
             kept = replace(frame, left=left, right=right, disparity_px=disparity)
-            self._pictures.append(Pictures(kept, (left, *halves)))
+            self._pictures.append(Pictures(kept, (left, half, quarter)))
             number = len(self._pictures) - 1
         self.note(number)
         return number

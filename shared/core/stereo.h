@@ -17,7 +17,7 @@ struct StereoLimits {
   double max_disparity_px;  // searched where there is no prior
   double min_correlation;
   double uniqueness;           // the rival's correlation is at most this share of the best
-  int wide_half, narrow_half;  // windows of 2 half + 1 pixels; narrow ones are no wider
+  int wide_half, narrow_half;  // windows of 2 half + 1 pixels
   double agreement_px;         // of the disparities by both windows
 };
 

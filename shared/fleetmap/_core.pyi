@@ -14,6 +14,9 @@ _Indices = NDArray[np.int64]
 _Pixels = NDArray[np.float32]
 _Reals = NDArray[np.float64]
 _Floats = NDArray[np.float32]
+_Flags = NDArray[np.bool_]
+_Octaves = NDArray[np.int8]
+_Pyramid = tuple[_Grey, _Grey, _Grey]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -25,6 +28,19 @@ def mutual_within(
     a: _Descriptors, nodes_a: _Numbers, b: _Descriptors, nodes_b: _Numbers, max_distance: int, ratio: float
 ) -> _Indices:
     """(P, 2) pairs that are each other's nearest, of nodes_a (A, 2) and nodes_b (B,) that share one."""
+
+def match_projected(
+    predicted: _Reals,
+    radius_px: _Reals,
+    a: _Descriptors,
+    octave_range: _Indices,
+    pixels: _Reals,
+    octaves: _Octaves,
+    b: _Descriptors,
+    max_distance: int,
+    ratio: float,
+) -> tuple[_Indices, _Numbers]:
+    """(A,) index of the feature of b, of pixels (B, 2), that shows each of a near predicted (A, 2); their distance."""
 
 def descend(
     descriptors: _Descriptors,
@@ -239,3 +255,61 @@ def blend_backward(
     whole: _Reals,
 ) -> _Reals:
     """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""
+
+def follow_windows(
+    before: _Grey,
+    now: _Grey,
+    scale: float,
+    half: int,
+    steps: int,
+    settled_px: float,
+    pixels: _Reals,
+    places: _Reals,
+    found: _Flags,
+) -> None:
+    """Moves places (N, 2) to where the windows around pixels (N, 2) are; found (N,) ends where they are lost."""
+
+def check_windows_back(
+    before: _Grey,
+    now: _Grey,
+    half: int,
+    steps: int,
+    settled_px: float,
+    pixels: _Reals,
+    places: _Reals,
+    within_px: float,
+    margin_px: float,
+    held: _Flags,
+) -> None:
+    """Ends held (N,) where places (N, 2) do not lead back to pixels (N, 2)."""
+
+def align_patches(
+    reference: _Pyramid,
+    reference_pixels: _Reals,
+    reference_octaves: _Octaves,
+    current: _Pyramid,
+    pixels: _Reals,
+    octaves: _Octaves,
+    reference_from_current: _Reals,
+    half: int,
+    max_shift_px: float,
+    min_correlation: float,
+) -> _Reals:
+    """(N, 3) x, y, sigma_px of pixels (N, 2) where patches, warped (N, 2, 2), lie on the reference's; NaN where they do not agree."""
+
+def align_observations(
+    reference: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
+    own: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
+    points_reference: _Reals,
+    own_from_reference: _Reals,
+    half: int,
+    max_shift_px: float,
+    min_correlation: float,
+) -> _Reals:
+    """As align_patches, of chosen features (N,) of pyramid, pixels, octaves, angles, with warps from the motion where it gives them."""
+
+def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) -> _Reals:
+    """(N, 2, 2) reference_from_current of pixel offsets, NaN where degenerate."""
+
+def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
+    """(V,) root of each node after the links first-second, none of which puts a keyframe twice into a group."""

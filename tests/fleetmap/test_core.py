@@ -35,6 +35,9 @@ DTYPES = {
     "_Pixels": "float32",
     "_Reals": "float64",
     "_Floats": "float32",
+    "_Flags": "bool",
+    "_Octaves": "int8",
+    "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
 }
 
 
@@ -42,7 +45,7 @@ def named(annotation: ast.expr | None) -> str:
     """A stub's type in nanobind's words."""
     written = ast.unparse(annotation) if annotation is not None else "?"
     for name, dtype in DTYPES.items():
-        written = re.sub(rf"\b{name}\b", f"dtype={dtype}", written)
+        written = re.sub(rf"\b{name}\b", dtype if "[" in dtype else f"dtype={dtype}", written)
     return re.sub(r"NDArray\[np\.(\w+)\]", r"dtype=\1", written)
 
 
@@ -86,6 +89,10 @@ STAMPS, SAMPLES, ZERO = np.arange(3), np.zeros((3, 3)), np.zeros(3)
 OUTSIDE = np.full((3, 2), np.nan, np.float32)
 PLACES = np.full((4, 2), 9.0)
 STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
+OCTAVES = np.zeros(4, np.int8)
+NEAR = PLACES[:3], PLACES[:3, 0].copy(), WORDS, np.zeros((3, 2), np.int64), PLACES[:3], OCTAVES[:3], WORDS, 64, 0.9
+PATCHES = (IMAGE, IMAGE, IMAGE), PLACES, OCTAVES
+CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
 CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arange(3))
 
 
@@ -112,7 +119,21 @@ CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arang
         (lambda: core.match_rows(IMAGE, IMAGE[:9], IMAGE, IMAGE, PLACES, PLACES[:, 0].copy(), *STEREO_LIMITS), "right"),
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:2, 0].copy(), *STEREO_LIMITS), "prior_px"),
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), np.inf, *STEREO_LIMITS[1:]), "max_dis"),
-        (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 4, 5, 0.25), "narrow_half"),
+        (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 5, 8, 0.25), "narrow_half"),
+        (lambda: core.match_projected(*NEAR[:3], NEAR[3][:1], *NEAR[4:]), "octave_range"),
+        (lambda: core.match_projected(*NEAR[:5], NEAR[5][:1], *NEAR[6:]), "octaves"),
+        (lambda: core.follow_windows(IMAGE, IMAGE, 1.0, 8, 9, 0.1, PLACES, PLACES.copy(), np.ones(4, bool)), "half"),
+        (lambda: core.follow_windows(IMAGE, IMAGE, 1.0, 3, 9, 0.1, PLACES, PLACES.copy(), np.ones(3, bool)), "flags"),
+        (lambda: core.follow_windows(IMAGE, IMAGE[:0], 1.0, 3, 9, 0.1, PLACES, PLACES.copy(), np.ones(4, bool)), "now"),
+        (lambda: core.check_windows_back(IMAGE, IMAGE, 3, 9, 0.1, PLACES, PLACES[:1], 1.0, 0.0, np.ones(4, bool)), "places"),
+        (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((4, 2, 2)), 16, 3.0, 0.8), "half"),
+        (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((3, 2, 2)), 4, 3.0, 0.8), "reference_from_current"),
+        (lambda: core.align_patches(*PATCHES[:2], OCTAVES[:3], *PATCHES, np.ones((4, 2, 2)), 4, 3.0, 0.8), "octaves"),
+        (lambda: core.align_observations(CHOSEN, CHOSEN, np.ones((3, 3)), np.eye(4), 4, 3.0, 0.8), "points_reference"),
+        (lambda: core.align_observations(CHOSEN, (*CHOSEN[:4], CHOSEN[4] - 1), np.ones((4, 3)), np.eye(4), 4, 3.0, 0.8), "chosen"),
+        (lambda: core.join_tracks(NUMBERS, NUMBERS[:1], NUMBERS), "second"),
+        (lambda: core.join_tracks(NUMBERS, NUMBERS - 1, NUMBERS), "first, second"),
+        (lambda: core.join_tracks(NUMBERS, NUMBERS, NUMBERS + 3), "keyframes"),
         (lambda: core.imu_intervals(STAMPS, SAMPLES, SAMPLES[:2], 0, 9), "accel_mps2"),
         (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
         (lambda: core.BlockCholesky(np.array([1, 0]), np.array([[0, 1]]), np.arange(2)), "sizes"),
@@ -153,8 +174,34 @@ HOSTILE = {
     "match_rows, without a limit": lambda places: core.match_rows(
         *[NOISE] * 4, places, places[:, 1].copy(), 8.0, -np.inf, np.inf, 7, 7, np.inf
     ),
+    "follow_windows": lambda places: core.follow_windows(
+        NOISE, NOISE, 1.0, 3, 9, 0.1, places, places[::-1].copy(), np.ones(4, bool)
+    ),
+    "check_windows_back": lambda places: core.check_windows_back(
+        NOISE, NOISE[:5, :9].copy(), 7, 9, 0.1, places, places[::-1].copy(), 3.0, -np.inf, np.ones(4, bool)
+    ),
+    "align_patches": lambda places: core.align_patches(
+        *(PICTURES, places, OCTAVES),
+        *(PICTURES, places[::-1].copy(), OCTAVES + np.int8(5)),
+        np.stack([places, places[::-1]], 1),
+        2,
+        np.inf,
+        -1.0,
+    ),
+    "match_projected": lambda places: core.match_projected(
+        places,
+        np.abs(places[:, 1]),
+        EMPTY,
+        np.array([[-200, 200]] * 4),
+        places[::-1].copy(),
+        OCTAVES + np.int8(-128),
+        EMPTY,
+        64,
+        1.5,
+    ),
 }
 NOISE = np.random.default_rng(1).integers(0, 256, (20, 30), np.uint8)
+PICTURES, EMPTY = (NOISE, NOISE, NOISE), np.zeros((4, 4), np.uint64)
 ANY = st.one_of(st.floats(-9.0, 40.0), st.floats(), st.sampled_from([1e18, -1e18, 1e308, 29.999999999999996, -1e-300]))
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from fleetmap.bow import Vocabulary
 from fleetmap.features import patch_align, stereo
 from fleetmap.features.orb import SCALE_FACTOR
-from fleetmap.features.patch_align_kernels import align_patches
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import Rows
@@ -109,28 +108,19 @@ def _aligned(
     base: BaseMap, keyframe: Keyframe, rows: Rows, features: Rows, cam_from_map: Array, settings: SurveySettings
 ) -> Array:
     """(P, 3) as patch_align.refine_matches, against the landmarks' patches instead of whole pictures."""
-    references = base.references[rows]
-    levels = patch_align.halvings(base.map.obs_octave[references])
-    exact = base.map.obs_pixels[references, :2] / 2.0 ** levels[:, None]
+    octaves = base.map.obs_octave[base.references[rows]]
+    sizes = 2.0 ** patch_align.halvings(octaves)[:, None]
+    exact = base.map.obs_pixels[base.references[rows], :2] / sizes
     side = base.map.patches.shape[1]
     mosaic = np.ascontiguousarray(base.map.patches[rows].reshape(-1, side))
     centres = exact - np.rint(exact) + side // 2
     # Patches lie below each other: a window that leaves its patch sideways would leave it up or down too.
     centres[:, 1] += side * np.arange(len(rows))
-    warps = _warps(base, rows, cam_from_map)
-    out = np.full((len(rows), 3), np.nan)
-    current_levels = patch_align.halvings(keyframe.features.octaves[features])
-    pyramid = keyframe.pyramid
-    for level in np.unique(current_levels):
-        index = np.flatnonzero((current_levels == level) & np.isfinite(warps).all(axis=(1, 2)))
-        found = np.empty((len(index), 4))
-        start = np.ascontiguousarray(keyframe.features.pixels[features[index]] / 2.0**level)
-        warp = warps[index] * 2.0 ** (level - levels[index])[:, None, None]
-        window, max_shift_px = settings.align.half_window_px, settings.align.max_shift_px
-        align_patches(mosaic, pyramid[level], centres[index], start, warp, window, max_shift_px, found)
-        found[~(found[:, 3] >= settings.align.min_correlation)] = np.nan
-        out[index] = found[:, :3] * 2.0**level
-    return out
+    # Each patch was cut on its own level, and so the mosaic is that of all.
+    reference = patch_align.Patches((mosaic, mosaic, mosaic), centres * sizes, octaves)
+    seen = keyframe.features.take(features)
+    current = patch_align.Patches(keyframe.pyramid, seen.pixels, seen.octaves)
+    return patch_align.refine_matches(reference, current, _warps(base, rows, cam_from_map), settings.align)
 
 
 def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
@@ -142,5 +132,5 @@ def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
         own = np.flatnonzero(order == k)
         reference_from_map = se3_inverse(cameras[own[0]])
         points = transform_points(reference_from_map, base.points_map[rows[own]])
-        warps[own] = patch_align.similarity_from_motion(base.camera, points, cam_from_map @ cameras[own[0]])
+        warps[own] = patch_align.similarity_from_motion(points, cam_from_map @ cameras[own[0]])
     return warps

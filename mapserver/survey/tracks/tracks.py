@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import stereo
+from fleetmap import core
+from fleetmap.features import patch_align, stereo
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, Pictures, PosedKeyframes, of_features
 from mapserver.survey.tracks.pairs import PairMatch
-from mapserver.survey.tracks.tracks_kernels import PatchFeatures, align_observations
-from mapserver.survey.tracks.tracks_kernels import join as join_kernel
 
+# Of an image: its pyramid, pixels (M, 2), octaves (M,) and angles (M,) of features, and which of them are chosen (N,).
+_PatchFeatures = tuple[patch_align.Pyramid, Array, NDArray[np.int8], NDArray[np.float32], NDArray[np.int64]]
 _SAME_WARP = (
     0.01  # change of a patch's shape that moves its rim by less than a twentieth of a pixel, to all sides alike
 )
@@ -56,7 +57,7 @@ def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     first = [linked[follows - 1], *((p.i * stride + p.features[:, 0]).astype(np.int32) for p in ordered)]
     second = [linked[follows], *((p.j * stride + p.features[:, 1]).astype(np.int32) for p in ordered)]
     owners = np.arange(count, dtype=np.int32).repeat(stride)
-    roots = join_kernel(np.concatenate(first), np.concatenate(second), owners)
+    roots = core.join_tracks(np.concatenate(first), np.concatenate(second), owners)
     shared = np.flatnonzero(np.bincount(roots, minlength=len(roots))[roots] > 1)
     nodes = shared[np.argsort(roots[shared], kind="stable")]
     starts = np.flatnonzero(np.diff(roots[nodes], prepend=-1))
@@ -219,8 +220,8 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
             cam_from_source = cam_from_map @ batch.map_from_cam[source]
             points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
             theirs = _patch_features(keyframes[source], keyframes[source].pictures, references[inner, 2])
-            ours, refined = _patch_features(own, pictures, features[inner]), np.empty((len(inner), 3))
-            align_observations(theirs, ours, points_source, cam_from_source, limits, refined)
+            ours = _patch_features(own, pictures, features[inner])
+            refined = core.align_observations(theirs, ours, points_source, cam_from_source, *limits)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
@@ -230,6 +231,7 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
     return pixels, sigmas
 
 
-def _patch_features(keyframe: Keyframe, pictures: Pictures, chosen: NDArray[np.int64]) -> PatchFeatures:
-    own, (whole, half, quarter) = keyframe.features, pictures.pyramid
-    return PatchFeatures((whole, half, quarter), own.pixels, own.octaves, own.angles_deg, chosen)
+def _patch_features(keyframe: Keyframe, pictures: Pictures, chosen: NDArray[np.int64]) -> _PatchFeatures:
+    own = keyframe.features
+    pixels, octaves = np.ascontiguousarray(own.pixels, np.float64), np.ascontiguousarray(own.octaves, np.int8)
+    return pictures.pyramid, pixels, octaves, np.ascontiguousarray(own.angles_deg, np.float32), chosen

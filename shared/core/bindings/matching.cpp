@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "matching.h"
+#include "projection.h"
 
 using namespace fleetmap;
 
@@ -43,6 +44,23 @@ auto mutual_within_of(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, con
       unlocked([&] { return mutual_within(descriptors_of(a), nodes_a.data(), descriptors_of(b), nodes_b.data(), max_distance, ratio); }));
 }
 
+auto match_projected_of(const Array<double, -1, 2>& predicted, const Array<double, -1>& radius_px, const Packed& a,
+                        const Array<int64_t, -1, 2>& octave_range, const Array<double, -1, 2>& pixels, const Array<int8_t, -1>& octaves,
+                        const Packed& b, int max_distance, double ratio) {
+  const size_t count = a.shape(0);
+  if (predicted.shape(0) != count || radius_px.shape(0) != count || octave_range.shape(0) != count)
+    throw nb::value_error("predicted, radius_px, octave_range: one for each descriptor of a");
+  if (pixels.shape(0) != b.shape(0) || octaves.shape(0) != b.shape(0))
+    throw nb::value_error("pixels, octaves: one for each descriptor of b");
+  std::vector<int64_t> index(count);
+  std::vector<int32_t> distances(count);
+  unlocked([&] {
+    match_projected({predicted.data(), radius_px.data(), octave_range.data(), descriptors_of(a)},
+                    {pixels.data(), octaves.data(), descriptors_of(b)}, max_distance, ratio, index.data(), distances.data());
+  });
+  return std::make_tuple(as_numpy<int64_t, 1>(std::move(index), {count}), as_numpy<int32_t, 1>(std::move(distances), {count}));
+}
+
 }  // namespace
 
 void bind_matching(nb::module_& module) {
@@ -50,4 +68,6 @@ void bind_matching(nb::module_& module) {
   module.def("nearest_two", &nearest_two_of, a, b);
   module.def("mutual", &mutual_of, a, b, "max_distance"_a, "ratio"_a);
   module.def("mutual_within", &mutual_within_of, a, "nodes_a"_a.noconvert(), b, "nodes_b"_a.noconvert(), "max_distance"_a, "ratio"_a);
+  module.def("match_projected", &match_projected_of, "predicted"_a.noconvert(), "radius_px"_a.noconvert(), a, "octave_range"_a.noconvert(),
+             "pixels"_a.noconvert(), "octaves"_a.noconvert(), b, "max_distance"_a, "ratio"_a);
 }

@@ -10,10 +10,13 @@ namespace nb = nanobind;
 void bind_block_cholesky(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_surfels(nb::module_&);
+void bind_flow(nb::module_&);
 void bind_matching(nb::module_&);
+void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
-void bind_stereo(nb::module_&);
 void bind_preintegration(nb::module_&);
+void bind_stereo(nb::module_&);
+void bind_track_joining(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
 #if defined(__x86_64__)
@@ -37,10 +40,13 @@ NB_MODULE(_core, module) {
 #endif
   bind_block_cholesky(module);
   bind_corners(module);
+  bind_flow(module);
   bind_matching(module);
+  bind_patch_align(module);
   bind_pnp(module);
-  bind_stereo(module);
   bind_preintegration(module);
+  bind_stereo(module);
+  bind_track_joining(module);
   bind_vocabulary(module);
   bind_surfels(module);
 }

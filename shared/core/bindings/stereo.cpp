@@ -11,8 +11,8 @@ auto match_rows_of(const Image& left, const Image& right, const Image& left_half
   if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("right: of the left image's size");
   if (prior_px.shape(0) != pixels.shape(0)) throw nb::value_error("prior_px: one for each pixel");
   if (!(max_disparity_px >= 0.0 && max_disparity_px <= 1e5)) throw nb::value_error("max_disparity_px: 0 to 100,000");
-  if (wide_half > kMostStereoHalf || narrow_half > wide_half || narrow_half < 1)
-    throw nb::value_error("narrow_half, wide_half: 1 to 7, rising");
+  for (const int half : {wide_half, narrow_half})
+    if (half < 1 || half > kMostStereoHalf) throw nb::value_error("wide_half, narrow_half: 1 to 7");
   const size_t count = pixels.shape(0);
   std::vector<double> found(2 * count);
   const StereoLimits limits{max_disparity_px, min_correlation, uniqueness, wide_half, narrow_half, agreement_px};

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import flow_kernels
+from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
@@ -37,17 +37,17 @@ class Flow(NamedTuple):
 
 
 def follow(before: Pyramid, now: Pyramid, pixels: Array, predicted: Array, *, window_px: int, levels: int) -> Flow:
-    """Follows pixels (N, 2) of one image into the next by pyramidal Lucas-Kanade; the source is named in the kernels.
+    """Follows pixels (N, 2) of one image into the next by pyramidal Lucas-Kanade; the core names its sources.
 
     predicted (N, 2): where they are looked for first, from so many levels above the image down.
     """
     places, found = np.array(predicted, np.float64), np.ones(len(pixels), bool)
     start, half = np.ascontiguousarray(pixels, np.float64), window_px // 2
     for level in range(levels, 0, -1):  # what a coarse level does not show, a finer one may
-        flow_kernels.follow(
+        core.follow_windows(
             before.level(level), now.level(level), 0.5**level, half, _STEPS, _SETTLED_PX, start, places, found.copy()
         )
-    flow_kernels.follow(before.level(0), now.level(0), 1.0, half, _STEPS, _SETTLED_PX, start, places, found)
+    core.follow_windows(before.level(0), now.level(0), 1.0, half, _STEPS, _SETTLED_PX, start, places, found)
     return Flow(start, places, found)
 
 
@@ -60,5 +60,5 @@ def forward_backward_check(
     """
     held, ends = flow.found.copy(), (float(within_px), float(margin_px))
     steps = window_px // 2, _STEPS_BACK, _SETTLED_BACK_PX
-    flow_kernels.check_back(before.level(0), now.level(0), *steps, flow.pixels, flow.places, *ends, held)
+    core.check_windows_back(before.level(0), now.level(0), *steps, flow.pixels, flow.places, *ends, held)
     return held

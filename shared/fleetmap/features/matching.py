@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features import matching_kernels
 from fleetmap.features.matching_kernels import FAR, Distances, Indices, Packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
@@ -79,6 +78,4 @@ def match_by_projection(
     octave_range = np.ascontiguousarray(projected.octave_range, np.int64)
     pixels, octaves = np.ascontiguousarray(features.pixels, np.float64), np.ascontiguousarray(features.octaves, np.int8)
     ours, theirs = packed(projected.descriptors), packed(features.descriptors)
-    return matching_kernels.by_projection(
-        *wanted, ours, octave_range, pixels, octaves, theirs, max_distance, float(ratio)
-    )
+    return core.match_projected(*wanted, ours, octave_range, pixels, octaves, theirs, max_distance, ratio)

@@ -24,8 +24,8 @@ class StereoSettings(Section, frozen=True):
     min_disparity_px: float = 0.7  # smaller disparities count as unknown depth
     min_correlation: float = 0.75  # of the two patches
     uniqueness: float = 0.93  # second best over best correlation
-    wide_half_px: int = 5  # half of the wide window
-    narrow_half_px: int = 4  # half of the narrow window
+    wide_half_px: Annotated[int, Meta(ge=1, le=7)] = 5  # half of the wide window
+    narrow_half_px: Annotated[int, Meta(ge=1, le=7)] = 4  # half of the narrow window
     agreement_px: float = 0.25  # largest difference between the windows' disparities
     # The random error of a structured-light sensor's depth is 1.4e-3 z^2 in metres (Khoshelham and Elberink, 2012): this much
     # disparity over the base of 0.08 m that stands for such a sensor, with f = 525 px.
@@ -35,6 +35,6 @@ class StereoSettings(Section, frozen=True):
 class AlignSettings(Section, frozen=True):
     """Window and acceptance of patch alignment."""
 
-    half_window_px: int = 4  # half of the patch
+    half_window_px: Annotated[int, Meta(ge=1, le=15)] = 4  # half of the patch
     max_shift_px: float = 3.0  # from the initial position
     min_correlation: float = 0.8  # of the aligned patches

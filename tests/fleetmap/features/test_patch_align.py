@@ -117,12 +117,12 @@ def test_warp_from_motion_is_the_derivative_of_the_reprojection() -> None:
     camera = StereoCamera(300.0, 160.0, 120.0, 0.1, WIDTH, HEIGHT)
     points = np.array([[0.2, -0.1, 2.0], [-1.0, 0.5, 4.0]])
     current_from_reference = se3_exp(np.array([0.05, -0.1, 0.2, 0.1, 0.05, -0.3]))
-    warp = patch_align.similarity_from_motion(camera, points, current_from_reference)
+    warp = patch_align.similarity_from_motion(points, current_from_reference)
     for k, point in enumerate(points):
         shifts = 1e-4 * point[2] / camera.focal_px * np.eye(3)[:2]
         moved = np.concatenate([point + shifts, point - shifts])
         pixels = camera.pixel_from_point(transform_points(current_from_reference, moved))[:, :2]
         current_from_reference_px = ((pixels[:2] - pixels[2:]) / 2e-4).T
         np.testing.assert_allclose(warp[k] @ current_from_reference_px, np.eye(2), atol=0.02)
-    behind = patch_align.similarity_from_motion(camera, np.array([[0.0, 0.0, -1.0]]), current_from_reference)
+    behind = patch_align.similarity_from_motion(np.array([[0.0, 0.0, -1.0]]), current_from_reference)
     assert np.isnan(behind).all()

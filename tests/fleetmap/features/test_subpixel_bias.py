@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from fleetmap.features import flow, stereo
-from fleetmap.features.patch_align_kernels import align_patches
-from fleetmap.features.settings import StereoSettings
+from fleetmap.features.patch_align import Patches, half_pyramid, refine_matches
+from fleetmap.features.settings import AlignSettings, StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -79,8 +79,9 @@ def test_patches_and_flow_are_right_whatever_the_camera_makes_of_it(name: str) -
     left, right = _processed(name)
     there = np.column_stack([PIXELS[:, 0] - np.rint(TRUE), PIXELS[:, 1]])
     plane = np.array([[1.0 - 0.012, -0.006], [0.0, 1.0]])
-    warps, aligned = np.tile(np.linalg.inv(plane), (len(PIXELS), 1, 1)), np.empty((len(PIXELS), 4))
-    align_patches(left, right, PIXELS, there, warps, 4, 3.0, aligned)
+    warps, octaves = np.tile(np.linalg.inv(plane), (len(PIXELS), 1, 1)), np.zeros(len(PIXELS), np.int8)
+    seen = Patches(half_pyramid(left), PIXELS, octaves), Patches(half_pyramid(right), there, octaves)
+    aligned = refine_matches(*seen, warps, AlignSettings(min_correlation=0.0))
     _check(PIXELS[:, 0] - aligned[:, 0])
     followed = flow.follow(flow.Pyramid(left), flow.Pyramid(right), PIXELS, there, window_px=13, levels=1)
     moved = np.where(followed.found, PIXELS[:, 0] - followed.places[:, 0], np.nan)

@@ -1,0 +1,168 @@
+#include "flow.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+namespace fleetmap {
+namespace {
+
+// Windows are kept as one row of numbers: their right and lower neighbours are the same row begun elsewhere, and wide registers do the
+// work. Columns beyond a window are multiplied by slopes of 0.
+constexpr int kRow = 16, kWideRow = 24;  // numbers in a row of a window, and of one that is larger by a pixel on all sides
+constexpr int kRows = 16;
+constexpr int kCells = kRow * kRows, kWideCells = kWideRow * (kRows + 2) + 8;
+constexpr double kLeastSlope = 0.1;  // mean square per pixel, in grey values, along the direction in which a window shows least
+constexpr double kTurningPx = 0.01;  // two steps that undo each other up to this: between them lies the end
+
+using Window = float[kCells];
+using WideWindow = float[kWideCells];
+
+struct Template {
+  Window grey = {}, right = {}, down = {};  // brightness and its slopes
+};
+
+inline Eight<float> eight(const float* from) {
+  Eight<float> out;
+  std::memcpy(&out, from, sizeof out);
+  return out;
+}
+
+// A line or column of an image that is mirrored beyond its edges.
+inline ptrdiff_t mirrored(ptrdiff_t at, ptrdiff_t size) {
+  at = std::abs(at);
+  return std::clamp<ptrdiff_t>(at >= size ? 2 * (size - 1) - at : at, 0, size - 1);
+}
+
+// Fills rows of cells with whole pixels, the first at (x, y).
+template <int kColumns>
+void cut(GreyImage image, ptrdiff_t x, ptrdiff_t y, int rows, float* __restrict cells) {
+  if (x >= 0 && y >= 0 && x + kColumns <= image.width && y + rows <= image.height) {
+    for (int v = 0; v < rows; ++v) {
+      const uint8_t* row = image.row(y + v) + x;
+      for (int u = 0; u < kColumns; ++u) cells[v * kColumns + u] = float(row[u]);
+    }
+    return;
+  }
+  for (int v = 0; v < rows; ++v) {
+    const uint8_t* row = image.row(mirrored(y + v, image.height));
+    for (int u = 0; u < kColumns; ++u) cells[v * kColumns + u] = float(row[mirrored(x + u, image.width)]);
+  }
+}
+
+// Sum of a b, folded in halves: in the same order on every processor.
+double product(const Window& a, const Window& b) {
+  auto term = [&](int k) { return eight(a + k) * eight(b + k); };
+  using Four [[gnu::vector_size(4 * sizeof(double))]] = double;
+  Four total = {};
+  for (int k = 0; k < 32; k += 8) {
+    const Eight<float> folded =
+        ((term(k) + term(k + 128)) + (term(k + 64) + term(k + 192))) + ((term(k + 32) + term(k + 160)) + (term(k + 96) + term(k + 224)));
+    for (int half = 0; half < 8; half += 4) total += Four{folded[half], folded[half + 1], folded[half + 2], folded[half + 3]};
+  }
+  return (total[0] + total[1]) + (total[2] + total[3]);
+}
+
+// The window around (x, y), and its slopes to the right and downwards, which are 0 outside of the image.
+void describe(GreyImage image, double x, double y, int half, Template& window) {
+  const int size = 2 * half + 1;
+  const ptrdiff_t left = ptrdiff_t(std::floor(x)) - half, top = ptrdiff_t(std::floor(y)) - half;
+  WideWindow cells = {}, wide;
+  cut<kWideRow>(image, left - 1, top - 1, size + 3, cells);
+  const Bilinear<float> at(float(x - std::floor(x)), float(y - std::floor(y)));
+  for (int k = 0; k < (size + 2) * kWideRow; ++k) wide[k] = at(cells + k, cells + k + kWideRow);
+  constexpr float kThree = 3.0f / 32.0f, kTen = 10.0f / 32.0f;
+  for (int v = 0; v < size; ++v) {
+    const float *above = wide + v * kWideRow, *here = above + kWideRow, *below = here + kWideRow;
+    const bool is_line = top + v >= 0 && top + v < image.height;
+    const ptrdiff_t first = is_line ? std::max<ptrdiff_t>(-left, 0) : size, last = std::min<ptrdiff_t>(image.width - left, size);
+    float* __restrict grey = window.grey + v * kRow, * __restrict right = window.right + v * kRow, * __restrict down = window.down + v * kRow;
+    for (int u = 0; u < kRow; ++u) {
+      grey[u] = here[u + 1];
+      const float along = kThree * (above[u + 2] - above[u] + below[u + 2] - below[u]) + kTen * (here[u + 2] - here[u]);
+      const float across = kThree * (below[u] - above[u] + below[u + 2] - above[u + 2]) + kTen * (below[u + 1] - above[u + 1]);
+      right[u] = u >= first && u < last ? along : 0.0f;
+      down[u] = u >= first && u < last ? across : 0.0f;
+    }
+  }
+}
+
+// The gradient matrix of a window.
+struct Gradients {
+  double xx, xy, yy;
+
+  explicit Gradients(const Template& window)
+      : xx(product(window.right, window.right)), xy(product(window.right, window.down)), yy(product(window.down, window.down)) {}
+  double least() const { return 0.5 * (xx + yy - std::sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)); }
+};
+
+// Moves (x, y) to where the window is; whether it stayed in reach of the image on the way there.
+bool find(GreyImage image, const Template& window, const Gradients& g, FlowSteps steps, double& x, double& y) {
+  const int half = steps.half, size = 2 * half + 1;
+  const double scale = 1.0 / (g.xx * g.yy - g.xy * g.xy);
+  float cells[kCells + 2 * kRow] = {};
+  Window off = {};
+  ptrdiff_t held_x = std::numeric_limits<ptrdiff_t>::min(), held_y = 0;
+  double last_x = std::numeric_limits<double>::infinity(), last_y = last_x;
+  for (int step = 0; step < steps.most; ++step) {
+    if (!(x >= -half && x < double(image.width + half) && y >= -half && y < double(image.height + half))) return false;
+    const ptrdiff_t column = ptrdiff_t(std::floor(x)), row = ptrdiff_t(std::floor(y));
+    if (column != held_x || row != held_y) {
+      cut<kRow>(image, column - half, row - half, size + 1, cells);
+      held_x = column, held_y = row;
+    }
+    const Bilinear<float> at(float(x - double(column)), float(y - double(row)));
+    for (int k = 0; k < size * kRow; ++k) off[k] = at(cells + k, cells + k + kRow) - window.grey[k];
+    const double bx = product(off, window.right), by = product(off, window.down);
+    const double step_x = (g.xy * by - g.yy * bx) * scale, step_y = (g.xy * bx - g.xx * by) * scale;
+    x += step_x, y += step_y;
+    if (step_x * step_x + step_y * step_y <= steps.settled_px * steps.settled_px) break;
+    if (std::abs(step_x + last_x) < kTurningPx && std::abs(step_y + last_y) < kTurningPx) {
+      x -= 0.5 * step_x, y -= 0.5 * step_y;
+      break;
+    }
+    last_x = step_x, last_y = step_y;
+  }
+  return true;
+}
+
+}  // namespace
+
+void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, const double* pixels, double* places, bool* found,
+            size_t count) {
+  const int half = steps.half, size = 2 * half + 1;
+  for (size_t n = 0; n < count; ++n) {
+    if (!found[n]) continue;
+    found[n] = false;
+    const double px = pixels[2 * n] * scale, py = pixels[2 * n + 1] * scale;
+    const bool is_in_reach =
+        px > -half - 1 && py > -half - 1 && px < double(before.width + half + 1) && py < double(before.height + half + 1);
+    if (!is_in_reach) continue;  // all slopes are 0
+    Template window;
+    describe(before, px, py, half, window);
+    const Gradients gradients(window);
+    if (!(gradients.least() >= kLeastSlope * size * size)) continue;
+    double x = places[2 * n] * scale, y = places[2 * n + 1] * scale;
+    found[n] = find(now, window, gradients, steps, x, y);
+    if (found[n]) places[2 * n] = x / scale, places[2 * n + 1] = y / scale;
+  }
+}
+
+void check_back(GreyImage before, GreyImage now, FlowSteps steps, const double* pixels, const double* places, double within_px,
+                double margin_px, bool* held, size_t count) {
+  const double right = double(now.width - 1) - margin_px, bottom = double(now.height - 1) - margin_px;
+  for (size_t n = 0; n < count; ++n) {
+    const double x = places[2 * n], y = places[2 * n + 1];
+    held[n] = held[n] && x > margin_px && y > margin_px && x < right && y < bottom;
+  }
+  std::vector<double> back(pixels, pixels + 2 * count);
+  follow(now, before, 1.0, steps, places, back.data(), held, count);
+  for (size_t n = 0; n < count; ++n) {
+    const double off_x = back[2 * n] - pixels[2 * n], off_y = back[2 * n + 1] - pixels[2 * n + 1];
+    held[n] = held[n] && off_x * off_x + off_y * off_y < within_px * within_px;
+  }
+}
+
+}  // namespace fleetmap

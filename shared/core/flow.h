@@ -1,0 +1,34 @@
+// Optical flow: small windows followed from image to image.
+#pragma once
+
+#include <cstddef>
+
+#include "image.h"
+
+namespace fleetmap {
+
+constexpr int kMostFlowHalf = 7;
+
+struct FlowSteps {
+  int half;           // windows have 2 half + 1 pixels
+  int most;           // steps
+  double settled_px;  // a step that short is the last
+};
+
+// Moves places (N, 2), where windows around pixels (N, 2) of one image are thought to be in the other. Both images are `scale` times as
+// large as those that the coordinates are for. found (N,): others are left alone, and those without texture, or that leave the image, are
+// no longer.
+//
+// Each step solves, over a window T of the first image with its slopes (Tx, Ty), for the shift that lets the second image I explain T:
+//   [sum Tx Tx  sum Tx Ty] [dx]     [sum Tx (I - T)]
+//   [sum Tx Ty  sum Ty Ty] [dy] = - [sum Ty (I - T)]
+// Sources: Lucas and Kanade 1981; slopes of the window that is looked for as in Baker and Matthews 2004, by the filter of Scharr 2000.
+void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, const double* pixels, double* places, bool* found,
+            size_t count);
+
+// Of places (N, 2) that pixels (N, 2) were followed to, and that are held (N,), leaves those further than margin_px from the image's
+// edges that lead back to within so many pixels. Source: Kalal et al. 2010.
+void check_back(GreyImage before, GreyImage now, FlowSteps steps, const double* pixels, const double* places, double within_px,
+                double margin_px, bool* held, size_t count);
+
+}  // namespace fleetmap
