@@ -6,20 +6,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts, Tiles, whole_grid
 from mapserver.grid.dense_stereo import BLOCK_PX, nearest_around
-from mapserver.grid.grid_kernels import RAY_STRIDE, add_view, cast_view
 
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
 # speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
 HIT, OCCUPIED, _FREE, AGAINST = 2, 4, 4, 2
 # A pixel's depth may be that of anything in the block that was matched, and its ray stands for the pixels up to the next one.
-REACH_PX = (BLOCK_PX + RAY_STRIDE) // 2
+REACH_PX = (BLOCK_PX + core.GRID_RAY_STRIDE_PX) // 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
 _SAME_STEPS = 10  # heights that differ by less stay as they were
 
@@ -39,8 +39,6 @@ class SessionViews:
     ) -> None:
         """One view. disparity: as of `dense_disparity`; floor_m: how far below the camera the floor is."""
         size = 2 * _RANGE_CELLS + 1
-        points, looks = np.zeros((size, size, SLICES), np.uint16), np.zeros((size, size, SLICES), np.uint8)
-        heights = np.zeros((size, size, 2), np.uint8)
         at_cells = map_from_cam[:2, 3] / CELL_M
         corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
         place = np.array([*(at_cells - corner), floor_m])
@@ -52,11 +50,11 @@ class SessionViews:
             if tile in self.before:
                 was_free[in_window] = self.before[tile][in_tile][..., 1]
         was_free = _all_around(was_free)
-        cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free, points, looks, heights)
+        window = core.cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free)
         for (x, y), _, in_window in parts:
-            if looks[in_window].any() or points[in_window].any():
-                start = np.array([y * TILE_CELLS - corner[1], x * TILE_CELLS - corner[0]])
-                add_view(points, looks, heights, start, *self._tile(x, y))
+            if any(column[in_window].any() for column in window[:2]):
+                row, column = y * TILE_CELLS - int(corner[1]), x * TILE_CELLS - int(corner[0])
+                core.add_view(*window, row, column, *self._tile(x, y))
 
     def add_path(self, cameras_map: Array, floor_m: float) -> None:
         """The way of the camera (K, 2 or more): what carries it has been there, as wide as a person and as high as the camera."""

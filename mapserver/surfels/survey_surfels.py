@@ -15,7 +15,6 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.grid.dense_stereo import nearest_around
-from mapserver.grid.grid_kernels import CLEAR_SIGMAS
 from mapserver.grid.site_grid import AGAINST, HIT, OCCUPIED, REACH_PX
 from mapserver.grid.survey_grid import GridSession, depth_views, measures_depth
 from mapserver.surfels.exposure import Sample, estimate_exposure, squared_tangent
@@ -125,7 +124,7 @@ def _look(
     """Marks, weights and pixels as of `core.look_at` of these surfels."""
     return core.look_at(
         surfels.points_map[rows], surfels.levels[rows], look.nearest_px, _KEPT_STEP_PX, look.sigma_px, camera.lens, look.cam_from_map,
-        CLEAR_SIGMAS, CELL_M,
+        core.GRID_CLEAR_SIGMAS, CELL_M,
     )  # fmt: skip
 
 

@@ -37,9 +37,6 @@ inline int level_at(double depth, double focal) {
   return level;
 }
 
-// A whole number, far outside of any picture where it is large or none.
-inline ptrdiff_t whole(double number) { return std::abs(number) < 1e9 ? ptrdiff_t(number) : number > 0.0 ? 1'000'000'000 : -1'000'000'000; }
-
 // The normal, in the camera and towards it, of the plane through the disparities around a pixel; false without one. A plane is affine in
 // (u, v, disparity), so that its gradient is its normal: least squares over disparities like the middle one.
 bool fit_normal(Picture<const float> disparity, ptrdiff_t u, ptrdiff_t v, StereoLens lens, Vec3& normal) {
@@ -163,7 +160,7 @@ void look_at(const float* points, const uint8_t* levels, size_t count, Picture<c
     const double depth = point[2];
     if (!(depth > kMinRangeM && depth < kMaxRangeM)) continue;
     pixel[0] = float(lens.focal * point[0] / depth + lens.cx), pixel[1] = float(lens.focal * point[1] / depth + lens.cy);
-    const ptrdiff_t u = whole(std::floor(pixel[0] / step_px + 0.5)), v = whole(std::floor(pixel[1] / step_px + 0.5));
+    const ptrdiff_t u = whole_or_outside(std::floor(pixel[0] / step_px + 0.5)), v = whole_or_outside(std::floor(pixel[1] / step_px + 0.5));
     if (u < 0 || u >= nearest_px.width || v < 0 || v >= nearest_px.height || !(nearest_px.row(v)[u] > 0.0f)) continue;
     const double shown = lens.focal_baseline / nearest_px.row(v)[u];
     const double clear = clear_sigmas * shown * shown / lens.focal_baseline * sigma_px + clear_m;
@@ -252,15 +249,15 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
       const size_t i = order[k], n = size_t(numbers[i]);
       const Vec3 centre = vec3(points_cam + 3 * i);
       const double distance = norm(centre), middle_u = pixels[2 * i], middle_v = pixels[2 * i + 1];
-      const ptrdiff_t at_u = std::clamp<ptrdiff_t>(whole(middle_u), 0, columns - 1),
-                      at_v = std::clamp<ptrdiff_t>(whole(middle_v), 0, rows - 1);
+      const ptrdiff_t at_u = std::clamp<ptrdiff_t>(whole_or_outside(middle_u), 0, columns - 1),
+                      at_v = std::clamp<ptrdiff_t>(whole_or_outside(middle_v), 0, rows - 1);
       const double fine = rays.pixels_per_rad[at_v * columns + at_u], edge = edge_of(levels[n]);
       const double radius = std::max(radius_edges * edge, kMinPixels * distance / fine);
       const double reach = std::min(kMargin * radius / distance * fine, kMostPixels);
-      const ptrdiff_t first_u = std::max<ptrdiff_t>(0, whole(std::ceil(middle_u - reach)));
-      const ptrdiff_t first_v = std::max<ptrdiff_t>(0, whole(std::ceil(middle_v - reach)));
-      const ptrdiff_t last_u = std::min(columns, whole(std::floor(middle_u + reach)) + 1);
-      const ptrdiff_t last_v = std::min(rows, whole(std::floor(middle_v + reach)) + 1);
+      const ptrdiff_t first_u = std::max<ptrdiff_t>(0, whole_or_outside(std::ceil(middle_u - reach)));
+      const ptrdiff_t first_v = std::max<ptrdiff_t>(0, whole_or_outside(std::ceil(middle_v - reach)));
+      const ptrdiff_t last_u = std::min(columns, whole_or_outside(std::floor(middle_u + reach)) + 1);
+      const ptrdiff_t last_v = std::min(rows, whole_or_outside(std::floor(middle_v + reach)) + 1);
       if (first_u >= last_u || first_v >= last_v) continue;
       const double thick = kThickEdges * edge + kThickPerM * edge * edge;
       // Nothing of the disc is nearer than this. What float32 rounds away is added.

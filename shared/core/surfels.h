@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "lie.h"
+#include "picture.h"
 
 namespace fleetmap {
 
@@ -16,19 +17,6 @@ constexpr double kEdgeM = 0.01;
 constexpr int kLevels = 5;
 constexpr int kStridePx = 2;  // of the pixels that are merged
 constexpr double kMinRangeM = 0.3, kMaxRangeM = 12.0;
-
-// A rectified stereo pair's focal length and principal point in pixels, and the product of focal length and baseline in px m.
-struct StereoLens {
-  double focal, cx, cy, focal_baseline;
-};
-
-// A picture without gaps between its rows.
-template <typename Number>
-struct Picture {
-  Number* at;
-  ptrdiff_t height, width;
-  Number* row(ptrdiff_t v) const { return at + v * width; }
-};
 
 // The voxel of a point at a level, in 63 bits: 5 km each way at the finest level. What lies farther out is at that border.
 int64_t voxel_key(double x, double y, double z, int level);

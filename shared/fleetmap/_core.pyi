@@ -17,6 +17,7 @@ _Floats = NDArray[np.float32]
 _Flags = NDArray[np.bool_]
 _Octaves = NDArray[np.int8]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
+_Counts = NDArray[np.uint16]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -313,3 +314,31 @@ def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) 
 
 def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
     """(V,) root of each node after the links first-second, none of which puts a keyframe twice into a group."""
+
+# --- grid: windows and tiles of cells, with 8 voxels each (see grid.h) ---
+GRID_RAY_STRIDE_PX: int
+GRID_CLEAR_SIGMAS: float
+
+def cast_view(
+    disparity_px: _Floats,
+    nearest_px: _Floats,
+    sigma_px: float,
+    lens: _Reals,
+    map_from_cam: _Reals,
+    camera: _Reals,
+    was_free: _Grey,
+) -> tuple[_Counts, _Grey, _Grey]:
+    """Pixels (R, C, 8) in voxels, which of them rays pass or would, and codes (R, C, 2) of the lowest and the highest point."""
+
+def add_view(
+    points: _Counts,
+    looks: _Grey,
+    heights: _Grey,
+    row: int,
+    column: int,
+    hits: _Grey,
+    passes: _Grey,
+    hidden: _Grey,
+    tile_heights: _Grey,
+) -> None:
+    """Adds a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column)."""

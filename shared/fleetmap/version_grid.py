@@ -39,7 +39,7 @@ _MAX_TILES, _MAX_CELLS = 1 << 16, 1 << 25
 
 
 class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the tiles' numbers mean (see grid_kernels), and the tiles by place and address; landmarks are 0."""
+    """What the tiles' numbers mean (see grid.h of the core), and the tiles by place and address; landmarks are 0."""
 
     format_version: Positive = GRID_FORMAT
     tile_size_m: float = TILE_SIZE_M

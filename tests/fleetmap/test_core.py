@@ -38,6 +38,7 @@ DTYPES = {
     "_Flags": "bool",
     "_Octaves": "int8",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
+    "_Counts": "uint16",
 }
 
 

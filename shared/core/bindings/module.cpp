@@ -11,6 +11,7 @@ void bind_block_cholesky(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_surfels(nb::module_&);
 void bind_flow(nb::module_&);
+void bind_grid(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
@@ -48,5 +49,6 @@ NB_MODULE(_core, module) {
   bind_stereo(module);
   bind_track_joining(module);
   bind_vocabulary(module);
+  bind_grid(module);
   bind_surfels(module);
 }

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import FLOOR_M, SLICE_M, SLICES, Counts, occupancy
 from mapserver.grid.dense_stereo import floor_distance_m
-from mapserver.grid.grid_kernels import HIDDEN, MAX_HIT_SIGMA_M, PASSED, RAY_STRIDE, cast_view
 from mapserver.grid.site_grid import SessionViews, height_map, updated
 
 CAMERA = StereoCamera(60.0, 31.5, 23.5, 0.12, 64, 48)
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 SIGMA_PX, HEIGHT_M = 0.05, 0.9
+PASSED, HIDDEN, MAX_HIT_SIGMA_M, RAY_STRIDE = 1, 2, 0.08, 4  # as grid.h has them
 
 
 def brute_force(
@@ -70,12 +71,7 @@ def test_rays_as_by_brute_force(seed: int) -> None:
     place = np.array([40.3, 40.7, HEIGHT_M])
     nearest = np.nan_to_num(disparity) * np.where(rng.random((48, 64)) < 0.3, np.float32(1.7), np.float32(1.0))
     was_free = rng.integers(0, 256, (81, 81), np.uint8)
-    points, looks, heights = (
-        np.zeros((81, 81, SLICES), np.uint16),
-        np.zeros((81, 81, SLICES), np.uint8),
-        np.zeros((81, 81, 2), np.uint8),
-    )
-    cast_view(disparity, nearest, SIGMA_PX, CAMERA.lens, turn, place, was_free, points, looks, heights)
+    points, looks, _ = core.cast_view(disparity, nearest, SIGMA_PX, CAMERA.lens, turn, place, was_free)
     wanted_points, wanted = brute_force(disparity, nearest, turn, place, was_free)
     # float32 disparities: a point may fall on the other side of a line.
     assert np.abs(points.astype(int) - wanted_points).sum() <= 4
