@@ -9,4 +9,9 @@ struct StereoLens {
   double focal, cx, cy, focal_baseline;
 };
 
+struct StereoImage {
+  StereoLens lens;
+  double width, height;
+};
+
 }  // namespace fleetmap

@@ -13,8 +13,8 @@ _Numbers = NDArray[np.int32]
 _Indices = NDArray[np.int64]
 _Pixels = NDArray[np.float32]
 _Reals = NDArray[np.float64]
-_Floats = NDArray[np.float32]
 _Flags = NDArray[np.bool_]
+_Floats = NDArray[np.float32]
 _Octaves = NDArray[np.int8]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
@@ -96,6 +96,29 @@ def pnp_with_rotation(
     rotation_sigma_rad: float,
 ) -> tuple[_Reals, _Reals, _Reals] | None:
     """As ransac_pnp where the rotation (3, 3) is nearly known."""
+
+def visible_landmarks(
+    cones: tuple[_Reals, _Floats, _Floats, _Floats],
+    map_from_cam: _Reals,
+    pinhole: _Reals,
+    distance_scale: float,
+    margin_px: float,
+    max_view_angle_rad: float,
+    octave_scale: float,
+) -> tuple[_Indices, _Reals, _Reals]:
+    """Rows (V,), pixels (V, 3) u_left v u_right and octaves (V,) of the landmarks in the image widened by margin_px.
+
+    cones: points_map (N, 3), directions_map (N, 3), half_angles_rad (N,), max_distances_m (N,), these times distance_scale.
+    pinhole: focal, cx, cy, focal * baseline, width, height. max_view_angle_rad: how far outside its cone a landmark may be seen.
+    """
+
+def nearest_cells(descriptors: _Descriptors, centres: _Descriptors, cells: int) -> _Numbers:
+    """(N, cells) numbers of the nearest centres, the nearest first; -1 where there are fewer."""
+
+def near_descriptors(
+    descriptors: _Descriptors, centres: _Descriptors, cells: int, held: _Descriptors, starts: _Indices, max_bits: int
+) -> _Flags:
+    """(M,) which of held are within max_bits of any of descriptors, in so many cells nearest to that; starts (C + 1,) of the cells."""
 
 def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
     """(N, 2) whole-pixel corners, row by row."""

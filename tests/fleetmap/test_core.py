@@ -34,8 +34,8 @@ DTYPES = {
     "_Indices": "int64",
     "_Pixels": "float32",
     "_Reals": "float64",
-    "_Floats": "float32",
     "_Flags": "bool",
+    "_Floats": "float32",
     "_Octaves": "int8",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
@@ -84,6 +84,8 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
 
 POINTS = np.ones((5, 3))
 SEEN = POINTS, POINTS, np.ones((5, 2)), np.ones(4), (4.0, 11.0, (10, 5))  # as PnP takes it
+CONES = POINTS, np.ones((5, 3), np.float32), np.ones(5, np.float32), np.ones(5, np.float32)
+VIEW = 1.0, 10.0, np.pi, 1.2  # scale of distances, margin, angle, scale of octaves
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
 STAMPS, SAMPLES, ZERO = np.arange(3), np.zeros((3, 3)), np.zeros(3)
@@ -109,6 +111,11 @@ CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arang
         (lambda: core.ransac_pnp(*SEEN[:2], np.ones((2, 2)), *SEEN[3:], 1.0, 4, POINTS / 2, 0.9), "weights"),
         (lambda: core.ransac_pnp(*SEEN, 1.0, 4, POINTS, 0.9), "draws"),
         (lambda: core.pnp_with_rotation(POINTS[:2], *SEEN[1:], 1.0, 4, np.eye(3), 0.1), "one row for each point"),
+        (lambda: core.visible_landmarks((POINTS, *CONES[1:3], CONES[3][:2]), np.eye(4), np.ones(6), *VIEW), "cones"),
+        (lambda: core.nearest_cells(WORDS, WORDS, 0), "cells"),
+        (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 1, 3]), 9), "starts: one more"),
+        (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 2, 1, 3]), 9), "starts: rising"),
+        (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 1, 2, 4]), 9), "starts: rising"),
         (lambda: core.fast_corners(IMAGE, 300, 3, None), "threshold"),
         (lambda: core.fast_corners(IMAGE, 20, 2, None), "border_px"),
         (lambda: core.fast_corners(IMAGE, 20, 3, IMAGE[:5]), "free"),
@@ -164,6 +171,7 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
     assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
     for strange in (np.nan, np.inf, 1e200, 0.0):
         points = np.full((5, 3), strange)
+        core.visible_landmarks((points, *CONES[1:]), np.full((4, 4), strange), np.full(6, strange), *VIEW)
         assert core.refine_pnp(points, *SEEN[1:], np.eye(4), None) is None
         assert core.ransac_pnp(POINTS, points, *SEEN[2:], 1.0, 4, np.eye(3) / 2, 0.9) is None
         assert core.pnp_with_rotation(points, *SEEN[1:], 1.0, 4, np.eye(3), 0.1) is None

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
-from fleetmap.relocalization.landmark_visibility_kernels import ViewingCones
+from fleetmap.relocalization.landmark_visibility import ViewingCones
 from mapserver.survey.survey_map import SurveyMap
 
 

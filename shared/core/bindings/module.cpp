@@ -15,8 +15,9 @@ void bind_grid(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
-void bind_preintegration(nb::module_&);
+void bind_relocalization(nb::module_&);
 void bind_stereo(nb::module_&);
+void bind_preintegration(nb::module_&);
 void bind_track_joining(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
@@ -45,8 +46,9 @@ NB_MODULE(_core, module) {
   bind_matching(module);
   bind_patch_align(module);
   bind_pnp(module);
-  bind_preintegration(module);
+  bind_relocalization(module);
   bind_stereo(module);
+  bind_preintegration(module);
   bind_track_joining(module);
   bind_vocabulary(module);
   bind_grid(module);

@@ -10,16 +10,29 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat import Tile
-from fleetmap.relocalization.landmark_visibility_kernels import ViewingCones, visible
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 
 Rows = NDArray[np.int64]
 COLUMNS, ROWS = 8, 6  # the parts of an image over which matches must be spread
+
+
+class ViewingCones(NamedTuple):
+    """The directions and distances from which N landmarks were seen.
+
+    points_map (N, 3); directions_map (N, 3) unit, from the landmark to the cameras that saw it; half_angles_rad (N,) around them;
+    max_distances_m (N,) at which it appears at the finest octave, 0 for one that nothing has seen.
+    """
+
+    points_map: Array
+    directions_map: NDArray[np.float32]
+    half_angles_rad: NDArray[np.float32]
+    max_distances_m: NDArray[np.float32]
 
 
 class VisibleLandmarks(NamedTuple):
@@ -31,14 +44,20 @@ class VisibleLandmarks(NamedTuple):
 
 
 def visible_landmarks(
-    cones: ViewingCones, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
+    cones: ViewingCones,
+    map_from_cam: Array,
+    camera: StereoCamera,
+    margin_px: float,
+    max_view_angle_rad: float,
+    distance_scale: float = 1.0,
 ) -> VisibleLandmarks:
-    """The landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones."""
+    """The landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones.
+
+    distance_scale: the camera's focal length as a multiple of the survey's; a longer lens sees a corner at the same scale from further.
+    """
     pinhole = np.array([*camera.lens, camera.width_px, camera.height_px])
-    place = np.ascontiguousarray(map_from_cam)
-    rows, pixels, distances_m = visible(cones, place, pinhole, margin_px, max_view_angle_rad)
-    octaves = np.log(np.maximum(cones.max_distances_m[rows] / distances_m, 0.5)) / np.log(SCALE_FACTOR)
-    return VisibleLandmarks(rows, pixels, octaves)
+    limits = distance_scale, margin_px, max_view_angle_rad, SCALE_FACTOR
+    return VisibleLandmarks(*core.visible_landmarks(cones, np.ascontiguousarray(map_from_cam), pinhole, *limits))
 
 
 def match_visible(

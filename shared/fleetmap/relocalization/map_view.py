@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.bow import Vocabulary
 from fleetmap.features.matching import Descriptors, packed
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
-from fleetmap.relocalization import descriptor_index_kernels
 from fleetmap.relocalization.landmark_visibility import (
     Rows,
     VisibleLandmarks,
@@ -104,9 +104,8 @@ class MapView:
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
     ) -> VisibleLandmarks:
         """The landmarks that a camera there should see, in its image widened by margin_px."""
-        scale = np.float32(camera.focal_px / self._survey_focal_px)
-        cones = self.cones._replace(max_distances_m=np.asarray(self.cones.max_distances_m * scale, np.float32))
-        return visible_landmarks(cones, map_from_cam, camera, margin_px, max_view_angle_rad)
+        scale = camera.focal_px / self._survey_focal_px
+        return visible_landmarks(self.cones, map_from_cam, camera, margin_px, max_view_angle_rad, scale)
 
     def covisible(self, map_from_cam: Array, camera: StereoCamera) -> tuple[Rows, bool]:
         """Rows of the landmarks in a camera's image that the survey saw from next to it, looking the same way: what racks hide is
@@ -148,18 +147,15 @@ class DescriptorIndex:
     def __init__(self, descriptors: Descriptors, vocabulary: Vocabulary) -> None:
         self._centres = vocabulary.centres[_nodes_at(vocabulary, _LEVEL)]
         bits = packed(descriptors)
-        cells = descriptor_index_kernels.nearest_cells(bits, self._centres, 1)[:, 0]
+        cells = core.nearest_cells(bits, self._centres, 1)[:, 0]
         self._order = np.argsort(cells, kind="stable")
         self._held = bits[self._order]
         self._starts = np.searchsorted(cells[self._order], np.arange(len(self._centres) + 1))
 
     def near(self, descriptors: Descriptors, max_bits: int) -> NDArray[np.bool_]:
         """(M,) which held descriptors are within max_bits of any of some others (N, 32)."""
-        is_near = np.zeros(len(self._held), bool)
-        asked = packed(descriptors)
-        cells = descriptor_index_kernels.nearest_cells(asked, self._centres, _CELLS)
-        descriptor_index_kernels.mark_near(asked, cells, self._held, self._starts, max_bits, is_near)
-        found = np.zeros(len(is_near), bool)
+        found = np.zeros(len(self._held), bool)
+        is_near = core.near_descriptors(packed(descriptors), self._centres, _CELLS, self._held, self._starts, max_bits)
         found[self._order] = is_near
         return found
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.bow import Vocabulary
 from fleetmap.features.matching import packed
-from fleetmap.relocalization.descriptor_index_kernels import nearest_cells
 from fleetmap.relocalization.map_view import DescriptorIndex
 from support.worlds.vocabulary_training import train_vocabulary
 
@@ -34,7 +34,7 @@ def test_the_nearest_cells_are_those_of_a_sort(count: int) -> None:
     centres, asked = rng.integers(0, 256, (7, 32), np.uint8), rng.integers(0, 256, (50, 32), np.uint8)
     order = np.argsort(distances(asked, centres), axis=1, kind="stable")[:, :count]
     expected = np.pad(order, ((0, 0), (0, max(0, count - 7))), constant_values=-1)
-    np.testing.assert_array_equal(nearest_cells(packed(asked), packed(centres), count), expected)
+    np.testing.assert_array_equal(core.nearest_cells(packed(asked), packed(centres), count), expected)
 
 
 def test_where_all_cells_are_asked_nothing_is_missed() -> None:
