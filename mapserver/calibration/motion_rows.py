@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MAP, imu_intervals, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import wheel_between
 from mapserver.calibration.parameters import INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.survey.bundle.factor_kernels import inertial_residual
 from mapserver.survey.bundle.factors import FLOOR_SIGMA, packed_increments
 
 _SLIP_MPS = 0.05  # sideways and upwards, which wheels do not measure
@@ -29,7 +29,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class InertialEdge(Edge):
-    """increments (67,) as the survey's kernels take them."""
+    """increments (67,) as the core takes them."""
 
     increments: Array
 
@@ -122,12 +122,11 @@ def _shares(sample_ns: list[int], start_ns: int, end_ns: int) -> Array:
 
 def inertial_rows(edge: InertialEdge, state: MotionState) -> Rows:
     """Residual and derivatives of an inertial edge."""
-    k, residual, jacobian = edge.first, np.empty(15), np.empty((15, 30))
-    ends = [
-        (np.ascontiguousarray(map_from_body[:3, :3]), np.ascontiguousarray(map_from_body[:3, 3]), motion)
-        for map_from_body, motion in zip(state.map_from_body[k : k + 2], state.motions[k : k + 2], strict=True)
-    ]
-    inertial_residual(ends[0], ends[1], GRAVITY_MAP, edge.increments, residual, jacobian)
+    k = edge.first
+    ends = slice(k, k + 2)
+    residual, jacobian = core.inertial_residual(
+        state.map_from_body[ends], state.motions[ends], GRAVITY_MAP, edge.increments
+    )
     nothing = np.zeros((15, UNKNOWNS))
     return Rows(k, edge.whitening @ residual, edge.whitening @ jacobian, nothing, edge.groups)
 

@@ -365,3 +365,86 @@ def add_view(
     tile_heights: _Grey,
 ) -> None:
     """Adds a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column)."""
+
+def inertial_residual(
+    map_from_body: _Reals, motions: _Reals, gravity: _Reals, increments: _Reals
+) -> tuple[_Reals, _Reals]:
+    """(15,) rotation, velocity, position and biases of the later of two keyframes against what was preintegrated; (15, 30) its derivatives.
+
+    map_from_body (2, 4, 4); motions (2, 9): velocity, gyro bias, accelerometer bias. increments (67,): dt, dR, dv, dp, the five
+    derivatives by the biases, and the biases that they were taken at.
+    """
+
+class BundleSolver:
+    """Bundle adjustment of K keyframes, N landmarks, M observations.
+
+    lens (4,): focal, cx, cy, focal times baseline. motions (K, 9): velocity, gyro bias, accelerometer bias, or (K, 0). free (K, 6 or 15):
+    unknowns that move, of pose and motion. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
+    obs_sigma_px (M, 2): of u and v, and of the disparity. Relative poses i_from_j (R, 4, 4), priors of poses (Q, 4, 4), each with its
+    information (6, 6); inertial edges with increments (E, 67) and information (E, 15, 15); motion_mean (K, 9), motion_weight (K, 9)
+    1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant.
+    """
+
+    def __init__(
+        self,
+        lens: _Reals,
+        body_from_cam: _Reals,
+        map_from_body: _Reals,
+        motions: _Reals,
+        points_map: _Reals,
+        free: _Flags,
+        points_held: bool,
+        obs_keyframe: _Indices,
+        obs_landmark: _Indices,
+        obs_pixels: _Reals,
+        obs_sigma_px: _Reals,
+        relative_ends: _Indices,
+        i_from_j: _Reals,
+        relative_information: _Reals,
+        prior_keyframe: _Indices,
+        prior_map_from_body: _Reals,
+        prior_information: _Reals,
+        edge_ends: _Indices,
+        increments: _Reals,
+        edge_information: _Reals,
+        motion_mean: _Reals,
+        motion_weight: _Reals,
+        gravity: _Reals,
+        huber: float,
+        cutoff: float,
+    ) -> None: ...
+    @property
+    def unknowns(self) -> int:
+        """U, of the reduced system."""
+
+    def nodes(self) -> tuple[_Indices, _Indices]:
+        """Sizes (N,) and couplings (B, 2) of the reduced system's blocks."""
+
+    def factorise_sparsely(self, order: _Indices) -> None:
+        """Sparse factorisation from now on; order (N,): the nodes in an order that fills in little."""
+
+    def cost(self) -> float:
+        """Half the robust sum of squares of everything."""
+
+    def optimize(
+        self, lambda_start: float, max_iterations: int, relative_cost_tolerance: float
+    ) -> tuple[_Reals, int, bool]:
+        """Costs at the start and after every accepted step, the number of iterations, and whether it converged."""
+
+    def reduced(self, damping: float) -> tuple[_Reals, _Reals]:
+        """The reduced system at the current values: (U, U), of which the lower triangle counts, and its right-hand side (U,)."""
+
+    def step(self, damping: float) -> _Reals | None:
+        """(U,) damped step from the current values; None where the system is not positive definite."""
+
+    def map_from_body(self) -> _Reals:
+        """(K, 4, 4)"""
+
+    def motions(self) -> _Reals:
+        """(K, 9) or (K, 0)"""
+
+    def points_map(self) -> _Reals:
+        """(N, 3)"""
+
+    def squared_sigmas(self) -> _Reals:
+        """(M,) squared residuals in sigmas at the last cost, huge for points behind the camera."""

@@ -1,84 +1,36 @@
-"""The terms of a bundle problem besides its images, packed into arrays and linearised."""
+"""The terms of a bundle problem besides its images, as arrays for the core."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.inertial import GRAVITY_MAP, Preintegrated
-from mapserver.survey.bundle.factor_kernels import Measurement, linearise_inertial, linearise_prior, linearise_relative
-from mapserver.survey.bundle.problem import BundleProblem, PriorTerm
-from mapserver.survey.state import RelativeTerm
+from fleetmap.inertial import Preintegrated
+from mapserver.survey.bundle.problem import BundleProblem
 
 # Below this an increment's covariance means nothing: rounding of the sums, and it keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
 
 
-@dataclass
-class State:
-    """Everything that moves: rotations (K, 3, 3), positions_m (K, 3), motions (K, 9) or (K, 0), points_map (N, 3)."""
+class Terms(NamedTuple):
+    """Of R relative poses, Q pose priors, E inertial edges, and what is known of the motion of K keyframes, as the core names them."""
 
-    rotations: Array
-    positions_m: Array
-    motions: Array
-    points_map: Array
-
-    def like(self) -> "State":
-        """Room for another state of the same size."""
-        return State(*(np.empty_like(a) for a in (self.rotations, self.positions_m, self.motions, self.points_map)))
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations of the terms: diagonal blocks and right-hand sides by keyframe, couplings by edge."""
-
-    cost: float
-    relative_blocks: Array
-    relative_rhs: Array
-    prior_blocks: Array
-    prior_rhs: Array
-    edge_blocks: Array
-    edge_rhs: Array
-    motion_diagonal: Array
-    motion_rhs: Array
-
-
-@dataclass(frozen=True)
-class Terms:
-    """Packed BundleProblem terms. ends (E, 2), increments (E, 67), informations (E, 15, 15); motion priors (K, 9)."""
-
-    relative: list[RelativeTerm]
-    priors: list[PriorTerm]
-    ends: AnyArray
+    relative_ends: AnyArray
+    i_from_j: Array
+    relative_information: Array
+    prior_keyframe: AnyArray
+    prior_map_from_body: Array
+    prior_information: Array
+    edge_ends: AnyArray
     increments: Array
-    informations: Array
+    edge_information: Array
     motion_mean: Array
     motion_weight: Array
-
-    def linearise(self, state: State) -> Normal:
-        """Cost and normal equations at `state`."""
-        relative_blocks, relative_rhs = np.zeros((len(self.relative), 12, 12)), np.zeros((len(self.relative), 12))
-        prior_blocks, prior_rhs = np.zeros((len(self.priors), 6, 6)), np.zeros((len(self.priors), 6))
-        edge_blocks, edge_rhs = np.zeros((len(self.ends), 30, 30)), np.zeros((len(self.ends), 30))
-        cost = 0.0
-        for n, term in enumerate(self.relative):
-            measured, output = _measurement(term.i_from_j, term.information), (relative_blocks[n], relative_rhs[n])
-            cost += linearise_relative(state.rotations, state.positions_m, (term.i, term.j), measured, *output)
-        for n, prior in enumerate(self.priors):
-            measured, output = _measurement(prior.map_from_body, prior.information), (prior_blocks[n], prior_rhs[n])
-            cost += linearise_prior(state.rotations[prior.k], state.positions_m[prior.k], measured, *output)
-        if len(self.ends):
-            variables, edges = (state.rotations, state.positions_m, state.motions), (self.increments, self.informations)
-            cost += linearise_inertial(variables, GRAVITY_MAP, self.ends, edges, edge_blocks, edge_rhs)
-        off = state.motions - self.motion_mean
-        cost += 0.5 * float((self.motion_weight * off**2).sum())
-        blocks = relative_blocks, relative_rhs, prior_blocks, prior_rhs, edge_blocks, edge_rhs
-        return Normal(cost, *blocks, self.motion_weight, -self.motion_weight * off)
 
 
 def pack_terms(problem: BundleProblem) -> Terms:
     """The terms of `problem` in arrays."""
-    inertial = problem.inertial
+    relative, priors, inertial = problem.relative, problem.priors, problem.inertial
     edges = [] if inertial is None else inertial.edges
     width = 0 if inertial is None else 9
     mean, weight = np.zeros((len(problem.map_from_body), width)), np.zeros((len(problem.map_from_body), width))
@@ -86,18 +38,22 @@ def pack_terms(problem: BundleProblem) -> Terms:
         mean[prior.k] = np.where(np.isfinite(prior.sigma), prior.mean, 0.0)
         weight[prior.k] = 1.0 / prior.sigma**2
     return Terms(
-        relative=problem.relative,
-        priors=problem.priors,
-        ends=np.array([(i, j) for i, j, _ in edges], np.int64).reshape(-1, 2),
-        increments=np.array([packed_increments(summed) for _, _, summed in edges]).reshape(-1, 67),
-        informations=np.array([_information(summed.cov) for _, _, summed in edges]).reshape(-1, 15, 15),
-        motion_mean=mean,
-        motion_weight=weight,
+        np.array([(term.i, term.j) for term in relative], np.int64).reshape(-1, 2),
+        np.array([term.i_from_j for term in relative], np.float64).reshape(-1, 4, 4),
+        np.array([term.information for term in relative], np.float64).reshape(-1, 6, 6),
+        np.array([prior.k for prior in priors], np.int64),
+        np.array([prior.map_from_body for prior in priors], np.float64).reshape(-1, 4, 4),
+        np.array([prior.information for prior in priors], np.float64).reshape(-1, 6, 6),
+        np.array([(i, j) for i, j, _ in edges], np.int64).reshape(-1, 2),
+        np.array([packed_increments(summed) for _, _, summed in edges]).reshape(-1, 67),
+        _informations(np.array([summed.cov for _, _, summed in edges]).reshape(-1, 15, 15)),
+        mean,
+        weight,
     )
 
 
 def packed_increments(summed: Preintegrated) -> Array:
-    """(67,) as `inertial_residual` takes them."""
+    """(67,): dt, dR, dv, dp, the five derivatives by the biases, and the biases that they were taken at."""
     s = summed
     increments = [s.dt_s], s.delta_rotation, s.delta_velocity_mps, s.delta_position_m
     by_gyro_accel = (
@@ -111,13 +67,9 @@ def packed_increments(summed: Preintegrated) -> Array:
     return np.concatenate([np.ravel(part) for part in parts])
 
 
-def _information(cov: Array) -> Array:
-    """Inverse covariance (15, 15), scaled first: rotation and velocity differ by many orders of magnitude."""
-    sigma = np.sqrt(np.diag(cov) + FLOOR_SIGMA**2)
-    scaled = (cov + np.diag(FLOOR_SIGMA**2)) / np.outer(sigma, sigma)
-    inverse = np.linalg.inv(scaled)
-    return np.asarray(0.5 * (inverse + inverse.T) / np.outer(sigma, sigma))
-
-
-def _measurement(measured: Array, information: Array) -> Measurement:
-    return Measurement(np.ascontiguousarray(measured[:3, :3]), np.ascontiguousarray(measured[:3, 3]), information)
+def _informations(covariances: Array) -> Array:
+    """Inverse covariances (E, 15, 15), scaled first: rotation and velocity differ by many orders of magnitude."""
+    sigma = np.sqrt(np.einsum("eaa->ea", covariances) + FLOOR_SIGMA**2)
+    outer = sigma[:, :, None] * sigma[:, None, :]
+    inverse = np.linalg.inv((covariances + np.diag(FLOOR_SIGMA**2)) / outer)
+    return np.asarray(0.5 * (inverse + inverse.transpose(0, 2, 1)) / outer)

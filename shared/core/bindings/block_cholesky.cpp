@@ -1,5 +1,7 @@
 #include "arrays.h"  // first: Python's header comes before the system's
 
+#include "solvers.h"
+
 #include "block_cholesky.h"
 #include "lapack.h"
 
@@ -26,6 +28,15 @@ void find_lapack() {
   found("scipy.linalg.cython_lapack", "dpotrf", lapack.dpotrf);
 }
 
+void check_order(const Array<int64_t, -1>& order, size_t count) {
+  std::vector<bool> seen(count, false);
+  for (size_t n = 0; n < order.shape(0); ++n) {
+    if (order(n) < 0 || size_t(order(n)) >= count || seen[size_t(order(n))]) throw nb::value_error("order: each node once");
+    seen[size_t(order(n))] = true;
+  }
+  if (order.shape(0) != count) throw nb::value_error("order: each node once");
+}
+
 namespace {
 
 using Indices = Array<int64_t, -1>;
@@ -41,14 +52,9 @@ void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>
   for (size_t n = 0; n < pairs.shape(0); ++n) {
     const int64_t a = pairs(n, 0), b = pairs(n, 1);
     if (a < 0 || b < 0 || a >= count || b >= count) throw nb::value_error("pairs: of nodes");
-    if (a != b) coupled.emplace_back(a, b);
+    coupled.emplace_back(a, b);
   }
-  std::vector<bool> seen(size_t(count), false);
-  for (size_t n = 0; n < order.shape(0); ++n) {
-    if (order(n) < 0 || order(n) >= count || seen[size_t(order(n))]) throw nb::value_error("order: each node once");
-    seen[size_t(order(n))] = true;
-  }
-  if (int64_t(order.shape(0)) != count) throw nb::value_error("order: each node once");
+  check_order(order, size_t(count));
   find_lapack();
   unlocked([&] { new (self) BlockCholesky({sizes.data(), sizes.data() + count}, coupled, {order.data(), order.data() + count}); });
 }

@@ -8,6 +8,7 @@
 namespace nb = nanobind;
 
 void bind_block_cholesky(nb::module_&);
+void bind_bundle(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_surfels(nb::module_&);
 void bind_flow(nb::module_&);
@@ -41,6 +42,7 @@ NB_MODULE(_core, module) {
         "is not; in a virtual machine let it see the host's processor");
 #endif
   bind_block_cholesky(module);
+  bind_bundle(module);
   bind_corners(module);
   bind_flow(module);
   bind_matching(module);

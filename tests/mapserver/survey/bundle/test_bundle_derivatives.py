@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse
-from mapserver.survey.bundle.bundle_adjustment import _Bundle as Bundle
+from mapserver.survey.bundle.bundle_adjustment import solver_of
 from mapserver.survey.bundle.problem import BundleProblem, MotionPrior, PriorTerm
-from mapserver.survey.bundle.reduced_system import SparseLayout, dense_lower, solve_dense
 from mapserver.survey.settings import BundleSettings
 from mapserver.survey.state import RelativeTerm
 from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
@@ -77,26 +77,27 @@ def _eliminated(problem: BundleProblem) -> tuple[Array, Array]:
 def test_reduced_system(inertial: bool) -> None:
     problem = _problem(inertial=inertial)
     matrix, rhs = _eliminated(problem)
-    bundle = Bundle(problem, NO_ROBUSTNESS)
-    bundle.linearise()
-    system = bundle.reduced(0.0)
-    whole = dense_lower(system)
-    whole = np.triu(whole) + np.triu(whole, 1).T
-    free = system.structure.free.ravel()
+    lower, ours_rhs = solver_of(problem, NO_ROBUSTNESS).reduced(0.0)
+    whole, free = np.tril(lower) + np.tril(lower, -1).T, _free(problem)
     ours = whole[np.ix_(free, free)]
     scale = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
     np.testing.assert_allclose(ours / scale, matrix / scale, atol=2e-5)
-    np.testing.assert_allclose(system.rhs.ravel()[free], rhs, atol=2e-5 * np.abs(rhs).max())
+    np.testing.assert_allclose(ours_rhs[free], rhs, atol=2e-5 * np.abs(rhs).max())
 
 
 @pytest.mark.parametrize("inertial", [False, True])
 def test_solvers_agree(inertial: bool) -> None:
     problem = _problem(inertial=inertial)
-    bundle = Bundle(problem, NO_ROBUSTNESS)
-    bundle.linearise()
-    system = bundle.reduced(1e-3)
-    dense, sparse = solve_dense(system), SparseLayout.of(system).solve(system)
+    dense = solver_of(problem, NO_ROBUSTNESS).step(1e-3)
+    sparse = solver_of(problem, BundleSettings(huber_sigmas=1e9, dense_unknowns=0)).step(1e-3)
     assert dense is not None
     assert sparse is not None
     np.testing.assert_allclose(sparse, dense, atol=1e-8 * np.abs(dense).max())
-    assert (dense[~system.structure.free] == 0).all()
+    assert (dense[~_free(problem)] == 0).all()
+
+
+def _free(problem: BundleProblem) -> NDArray[np.bool_]:
+    """(U,) which unknowns of the reduced system move: keyframes without any are not in it."""
+    moves = np.ones((len(problem.fixed), 6 if problem.inertial is None else 15), np.bool_)
+    moves[problem.fixed, :6] = False
+    return moves[moves.any(axis=1)].ravel()

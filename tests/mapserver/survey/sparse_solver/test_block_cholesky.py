@@ -7,11 +7,16 @@ import pytest
 import scipy.sparse
 import scipy.sparse.linalg
 
+from fleetmap import core
 from fleetmap.geometry import AnyArray, Array
-from mapserver.survey.sparse_solver.block_cholesky import block_cholesky
+from mapserver.survey.sparse_solver.block_cholesky import minimum_degree
 
 Pairs = Callable[[np.random.Generator], list[tuple[int, int]]]
 NODES = 60
+
+
+def block_cholesky(sizes: AnyArray, pairs: AnyArray) -> core.BlockCholesky:
+    return core.BlockCholesky(sizes, pairs, minimum_degree(len(sizes), pairs))
 
 
 def grid(width: int) -> list[tuple[int, int]]:

@@ -1,0 +1,187 @@
+#include "arrays.h"  // first: Python's header comes before the system's
+
+#include <cmath>
+
+#include "bundle.h"
+#include "solvers.h"
+
+using namespace fleetmap;
+
+namespace {
+
+template <int64_t... kShape>
+using Reals = Array<double, kShape...>;
+template <int64_t... kShape>
+using Indices = Array<int64_t, kShape...>;
+
+void check(bool holds, const char* message) {
+  if (!holds) throw nb::value_error(message);
+}
+
+template <typename Numbers>
+void check_below(const Numbers& indices, size_t count, const char* message) {
+  for (size_t n = 0; n < indices.size(); ++n) check(indices.data()[n] >= 0 && size_t(indices.data()[n]) < count, message);
+}
+
+std::vector<double> copied(const double* from, size_t count) { return {from, from + count}; }
+
+std::vector<Vec3> points_of(const Reals<-1, 3>& points) {
+  std::vector<Vec3> out;
+  for (size_t n = 0; n < points.shape(0); ++n) out.push_back(vec3(&points(n, 0)));
+  return out;
+}
+
+void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from_cam, const Reals<-1, 4, 4>& map_from_body,
+          const Reals<-1, -1>& motions, const Reals<-1, 3>& points_map, const Array<bool, -1, -1>& free, bool points_held,
+          const Indices<-1>& obs_keyframe, const Indices<-1>& obs_landmark, const Reals<-1, 3>& obs_pixels,
+          const Reals<-1, 2>& obs_sigma_px, const Indices<-1, 2>& relative_ends, const Reals<-1, 4, 4>& i_from_j,
+          const Reals<-1, 6, 6>& relative_information, const Indices<-1>& prior_keyframe, const Reals<-1, 4, 4>& prior_map_from_body,
+          const Reals<-1, 6, 6>& prior_information, const Indices<-1, 2>& edge_ends, const Reals<-1, 67>& increments,
+          const Reals<-1, 15, 15>& edge_information, const Reals<-1, -1>& motion_mean, const Reals<-1, -1>& motion_weight,
+          const Reals<3>& gravity, double huber, double cutoff) {
+  constexpr size_t kMost = size_t(1) << 31;
+  const size_t keyframes = map_from_body.shape(0), landmarks = points_map.shape(0), observations = obs_keyframe.shape(0);
+  const bool inertial = free.shape(1) == 15;
+  const size_t motion_size = inertial ? 9 : 0;
+  check(inertial || free.shape(1) == 6, "free: 6 or 15 unknowns of each keyframe");
+  check(free.shape(0) == keyframes, "free: a row for each keyframe");
+  for (const auto* each : {&motions, &motion_mean, &motion_weight})
+    check(each->shape(0) == keyframes && each->shape(1) == motion_size,
+          "motions, motion_mean, motion_weight: 9 or no columns as free says");
+  check(keyframes * 15 < kMost && landmarks < kMost && observations < kMost, "points_map, obs_keyframe: fewer than 2^31");
+  check(obs_landmark.shape(0) == observations && obs_pixels.shape(0) == observations && obs_sigma_px.shape(0) == observations,
+        "obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe");
+  check(i_from_j.shape(0) == relative_ends.shape(0) && relative_information.shape(0) == relative_ends.shape(0),
+        "i_from_j, relative_information: one for each of relative_ends");
+  check(prior_map_from_body.shape(0) == prior_keyframe.shape(0) && prior_information.shape(0) == prior_keyframe.shape(0),
+        "prior_map_from_body, prior_information: one for each of prior_keyframe");
+  check(increments.shape(0) == edge_ends.shape(0) && edge_information.shape(0) == edge_ends.shape(0),
+        "increments, edge_information: one for each of edge_ends");
+  check(inertial || edge_ends.size() == 0, "edge_ends: of keyframes with motion");
+  check_below(obs_keyframe, keyframes, "obs_keyframe: keyframes");
+  check_below(obs_landmark, landmarks, "obs_landmark: landmarks");
+  check_below(relative_ends, keyframes, "relative_ends: keyframes");
+  check_below(prior_keyframe, keyframes, "prior_keyframe: keyframes");
+  check_below(edge_ends, keyframes, "edge_ends: keyframes");
+
+  BundleProblem problem = {};
+  problem.focal_px = lens(0), problem.cx_px = lens(1), problem.cy_px = lens(2), problem.focal_baseline_px_m = lens(3);
+  problem.body_from_cam = se3(body_from_cam.data());
+  problem.unknowns = int(free.shape(1));
+  problem.free.assign(free.data(), free.data() + free.size());
+  problem.points_held = points_held;
+  for (size_t n = 0; n < observations; ++n)
+    problem.observations.push_back(
+        {int32_t(obs_keyframe(n)), int32_t(obs_landmark(n)), vec3(&obs_pixels(n, 0)), {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
+  for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
+    problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), copied(&prior_information(n, 0, 0), 36)});
+  for (size_t n = 0; n < relative_ends.shape(0); ++n)
+    problem.relatives.push_back(
+        {int32_t(relative_ends(n, 0)), int32_t(relative_ends(n, 1)), se3(&i_from_j(n, 0, 0)), copied(&relative_information(n, 0, 0), 36)});
+  for (size_t n = 0; n < edge_ends.shape(0); ++n)
+    problem.edges.push_back({int32_t(edge_ends(n, 0)), int32_t(edge_ends(n, 1)), copied(&increments(n, 0), kIncrements),
+                             copied(&edge_information(n, 0, 0), 225)});
+  problem.gravity = vec3(gravity.data());
+  problem.motion_mean = copied(motion_mean.data(), motion_mean.size());
+  problem.motion_weight = copied(motion_weight.data(), motion_weight.size());
+  BundleState start = {{}, copied(motions.data(), motions.size()), points_of(points_map)};
+  for (size_t k = 0; k < keyframes; ++k) start.map_from_body.push_back(se3(&map_from_body(k, 0, 0)));
+  find_lapack();
+  unlocked([&] { new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff); });
+}
+
+auto poses_of(const BundleSolver& solver) {
+  const auto& poses = solver.state().map_from_body;
+  std::vector<double> matrices(16 * poses.size());
+  for (size_t k = 0; k < poses.size(); ++k) store(poses[k], &matrices[16 * k]);
+  return as_numpy<double, 3>(std::move(matrices), {poses.size(), 4, 4});
+}
+
+auto motions_of(const BundleSolver& solver) {
+  const size_t count = solver.state().map_from_body.size();
+  return as_numpy<double, 2>(std::vector<double>(solver.state().motions), {count, count ? solver.state().motions.size() / count : 0});
+}
+
+auto points_map_of(const BundleSolver& solver) {
+  return as_numpy<double, 2>(std::vector<Vec3>(solver.state().points), {solver.state().points.size(), 3});
+}
+
+auto squared_sigmas_of(const BundleSolver& solver) {
+  auto squared = solver.squared_sigmas();
+  const size_t count = squared.size();
+  return as_numpy<double, 1>(std::move(squared), {count});
+}
+
+auto nodes_of(const BundleSolver& solver) {
+  auto sizes = solver.node_sizes();
+  auto pairs = solver.node_pairs();
+  const size_t count = sizes.size(), coupled = pairs.size();
+  return std::make_tuple(as_numpy<int64_t, 1>(std::move(sizes), {count}), as_numpy<int64_t, 2>(std::move(pairs), {coupled, 2}));
+}
+
+void factorise_sparsely(BundleSolver& solver, const Indices<-1>& order) {
+  const size_t count = solver.node_sizes().size();
+  check_order(order, count);
+  unlocked([&] { solver.factorise_sparsely({order.data(), order.data() + count}); });
+}
+
+auto optimize(BundleSolver& solver, double lambda_start, int max_iterations, double relative_cost_tolerance) {
+  check(lambda_start > 0.0 && std::isfinite(lambda_start), "lambda_start: above zero");
+  auto interruptible = [] {
+    nb::gil_scoped_acquire held;
+    if (PyErr_CheckSignals() != 0) throw nb::python_error();
+  };
+  auto outcome = unlocked([&] { return solver.optimize({lambda_start, relative_cost_tolerance, max_iterations}, interruptible); });
+  const size_t count = outcome.costs.size();
+  return std::make_tuple(as_numpy<double, 1>(std::move(outcome.costs), {count}), outcome.iterations, outcome.converged);
+}
+
+auto reduced(BundleSolver& solver, double damping) {
+  std::vector<double> lower, b;
+  unlocked([&] { solver.reduced(damping, lower, b); });
+  const size_t count = b.size();
+  return std::make_tuple(as_numpy<double, 2>(std::move(lower), {count, count}), as_numpy<double, 1>(std::move(b), {count}));
+}
+
+std::optional<nb::ndarray<nb::numpy, double, nb::ndim<1>>> step_of(BundleSolver& solver, double damping) {
+  std::vector<double> step;
+  if (!unlocked([&] { return solver.solve(damping, step); })) return {};
+  const size_t count = step.size();
+  return as_numpy<double, 1>(std::move(step), {count});
+}
+
+auto inertial_residual(const Reals<2, 4, 4>& map_from_body, const Reals<2, 9>& motions, const Reals<3>& gravity,
+                       const Reals<67>& increments) {
+  auto moment = [&](size_t k) {
+    return Moment{se3(&map_from_body(k, 0, 0)), vec3(&motions(k, 0)), vec3(&motions(k, 3)), vec3(&motions(k, 6))};
+  };
+  const auto edge = inertial_edge(moment(0), moment(1), vec3(gravity.data()), increments.data());
+  return std::make_tuple(as_numpy<double, 1>(copied(edge.residual, 15), {15}),
+                         as_numpy<double, 2>(copied(edge.jacobian[0], 15 * 30), {15, 30}));
+}
+
+}  // namespace
+
+void bind_bundle(nb::module_& module) {
+  const auto damping = "damping"_a;
+  nb::class_<BundleSolver>(module, "BundleSolver")
+      .def("__init__", &make, "lens"_a.noconvert(), "body_from_cam"_a.noconvert(), "map_from_body"_a.noconvert(), "motions"_a.noconvert(),
+           "points_map"_a.noconvert(), "free"_a.noconvert(), "points_held"_a, "obs_keyframe"_a.noconvert(), "obs_landmark"_a.noconvert(),
+           "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(), "i_from_j"_a.noconvert(),
+           "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(), "prior_map_from_body"_a.noconvert(),
+           "prior_information"_a.noconvert(), "edge_ends"_a.noconvert(), "increments"_a.noconvert(), "edge_information"_a.noconvert(),
+           "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a, "cutoff"_a)
+      .def_prop_ro("unknowns", &BundleSolver::unknowns)
+      .def("nodes", &nodes_of)
+      .def("factorise_sparsely", &factorise_sparsely, "order"_a.noconvert())
+      .def("cost", [](BundleSolver& solver) { return unlocked([&] { return solver.cost(); }); })
+      .def("optimize", &optimize, "lambda_start"_a, "max_iterations"_a, "relative_cost_tolerance"_a)
+      .def("reduced", &reduced, damping)
+      .def("step", &step_of, damping)
+      .def("map_from_body", &poses_of)
+      .def("motions", &motions_of)
+      .def("points_map", &points_map_of)
+      .def("squared_sigmas", &squared_sigmas_of);
+  module.def("inertial_residual", &inertial_residual, "map_from_body"_a.noconvert(), "motions"_a.noconvert(), "gravity"_a.noconvert(),
+             "increments"_a.noconvert());
+}

@@ -1,0 +1,161 @@
+// Bundle adjustment: keyframes, landmarks, motion and biases that explain all observations best.
+//
+// Levenberg-Marquardt on the robust cost; landmarks are eliminated by the Schur complement, and what is left is solved in one piece, by
+// dense or by sparse factorisation. Source: Triggs et al. 2000, Bundle adjustment, a modern synthesis, section 6.1.
+//
+// A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes. So with q = X - p an observation's derivative by the pose is
+// minus that by its point times L(q)^T, where L(q) = [skew(q); I] (6, 3). Everything that an observation n says therefore fits into
+// one symmetric A_n = w J^T J (3, 3), J = dr/dX, and no coupling is stored:
+//   poses             H_pp = sum L A L^T    b_p = sum L w J^T r
+//   points            H_ll = sum A          b_l = -sum w J^T r
+//   coupling          H_pl = -L A
+//   reduced system    S = H_pp - sum_ij (L A)_i H_ll^-1 (A L^T)_j    b = b_p + sum (L A) H_ll^-1 b_l
+//   back-substitution dX = H_ll^-1 (b_l + sum A L^T d)
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <vector>
+
+#include "block_cholesky.h"
+#include "factors.h"
+
+namespace fleetmap {
+
+// What is adjusted, and by which measurements: K keyframes, N landmarks, M observations. What is not named here is as in _core.pyi.
+struct BundleProblem {
+  struct Observation {
+    int32_t keyframe, landmark;
+    Vec3 pixels;         // u and v in the left image, u in the right one, NaN without it
+    double sigma_px[2];  // of u and v, and of the disparity
+  };
+  struct Prior {
+    int32_t keyframe;
+    SE3 map_from_body;
+    std::vector<double> information;  // (6, 6)
+  };
+  struct Relative {
+    int32_t i, j;
+    SE3 i_from_j;
+    std::vector<double> information;  // (6, 6)
+  };
+  struct Edge {
+    int32_t i, j;
+    std::vector<double> increments, information;  // (67,) and (15, 15)
+  };
+
+  double focal_px, cx_px, cy_px, focal_baseline_px_m;
+  SE3 body_from_cam;
+  int unknowns;               // of each keyframe: 6, or 15 with motion
+  std::vector<uint8_t> free;  // (K, unknowns)
+  bool points_held;
+  std::vector<Observation> observations;
+  std::vector<Prior> priors;
+  std::vector<Relative> relatives;
+  std::vector<Edge> edges;
+  Vec3 gravity;
+  std::vector<double> motion_mean, motion_weight;  // (K, 9) or none: 1 / sigma^2
+};
+
+// Everything that moves.
+struct BundleState {
+  std::vector<SE3> map_from_body;
+  std::vector<double> motions;  // (K, 9) or none
+  std::vector<Vec3> points;
+};
+
+class BundleSolver {
+ public:
+  struct Settings {
+    double lambda_start, relative_cost_tolerance;
+    int max_iterations;
+  };
+  struct Outcome {
+    std::vector<double> costs;  // at the start and after every accepted step
+    int iterations;
+    bool converged;
+  };
+
+  // huber, cutoff: the length of an observation's residual in sigmas from which its cost is linear, and constant.
+  BundleSolver(BundleProblem problem, BundleState start, double huber, double cutoff);
+
+  const BundleState& state() const { return state_; }
+  size_t slots() const { return slot_keyframes_.size(); }
+  size_t unknowns() const { return slots() * size_t(problem_.unknowns); }
+
+  // The reduced system's nodes, the pose of each slot and its motion where there is one, and which of them are coupled.
+  std::vector<int64_t> node_sizes() const;
+  std::vector<std::pair<int64_t, int64_t>> node_pairs() const;
+  // Systems are factorised as sparse ones from now on; order: nodes in an order that fills in little.
+  void factorise_sparsely(std::vector<int64_t> order);
+
+  // Half the robust sum of squares of everything.
+  double cost() { return cost_of(state_); }
+  // Of each observation its squared residual in sigmas at the last cost; huge where the point is behind the camera.
+  std::vector<double> squared_sigmas() const;
+
+  // S (U, U), its lower triangle, damped by `damping` times its diagonal, and b (U,). Unknowns that are held have a one on the diagonal.
+  void reduced(double damping, std::vector<double>& lower, std::vector<double>& b);
+  // The damped step (U,), by linearising where the state is; false where S is not positive definite.
+  bool solve(double damping, std::vector<double>& step);
+
+  // The optimum near the state, which becomes it. between: called before each iteration.
+  Outcome optimize(const Settings& settings, const std::function<void()>& between);
+
+ private:
+  struct Seen {  // an observation as the camera sees it; weights: 1 / sigma, of the disparity 0 without a right image
+    int32_t keyframe, landmark;
+    Vec3 pixels, weights;
+  };
+  using Symmetric = std::array<double, 6>;  // xx, xy, xz, yy, yz, zz
+  struct Residual;
+
+  void sort_observations();
+  void find_pattern();
+  size_t block_of(int32_t row, int32_t col) const;
+  void view(const BundleState& state);
+  bool residual(const Seen& seen, const Mat3& cam_from_map, Vec3 q, Residual& out) const;
+  double cost_of(const BundleState& state);
+  Moment moment(const BundleState& state, int32_t keyframe) const;
+  void linearise();
+  void linearise_images();
+  void reduce(double damping);
+  void invert_landmarks(double damping);
+  void eliminate_landmarks();
+  template <typename Add>
+  void for_each_edge_part(const Add& add) const;
+  template <typename Place>
+  void fill(const Place& place, double* values) const;
+  void fill_dense(std::vector<double>& lower) const;
+  bool solve_reduced(std::vector<double>& step);
+  void move(const std::vector<double>& step);
+
+  BundleProblem problem_;
+  BundleState state_, moved_;
+  double huber_, cutoff_;
+  Vec3 body_in_cam_;
+  Mat3 cam_from_body_;
+  // Structure: observations by landmark, of the problem's number order_; slots of the keyframes with unknowns, -1 for others.
+  std::vector<Seen> seen_;
+  std::vector<size_t> order_, landmark_starts_, slot_starts_;
+  std::vector<int32_t> slot_observations_, slots_, slot_keyframes_;
+  std::vector<uint8_t> free_;  // (P, unknowns)
+  // Blocks of S: those of row p are row_starts_[p] to [p + 1], of columns cols_, rising, the last of them p itself.
+  std::vector<size_t> row_starts_;
+  std::vector<int32_t> cols_;
+  std::unique_ptr<BlockCholesky> sparse_;
+  // At a state.
+  std::vector<Mat3> cam_from_map_;
+  std::vector<double> squared_;
+  // Normal equations.
+  std::vector<Symmetric> obs_info_, point_info_, point_inverse_;
+  std::vector<Vec3> point_rhs_;
+  std::vector<double> pose_info_, pose_rhs_, edge_blocks_, edge_rhs_;
+  // The reduced system: blocks (B, 6, 6), diagonal and rhs (P, unknowns), damp: what is added to the diagonal.
+  std::vector<double> blocks_, diagonal_, damp_, rhs_, factor_;  // the last: S, then its factor
+};
+
+}  // namespace fleetmap

@@ -1,0 +1,113 @@
+"""The core's solvers refuse what cannot be, and give values for numbers that are not finite."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from fleetmap import core
+from fleetmap.geometry import Array
+
+CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arange(3))
+POSES, EYES, NONE = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (1, 1, 1)), np.zeros((0, 4, 4))
+# Three keyframes with motion, four landmarks, each seen by two keyframes, and one of every other measurement.
+BUNDLE: dict[str, Any] = {
+    "lens": np.array([500.0, 320.0, 240.0, 50.0]),
+    "body_from_cam": np.eye(4),
+    "map_from_body": POSES,
+    "motions": np.zeros((3, 9)),
+    "points_map": np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 5.0], [1.0, 1.0, 6.0]]),
+    "free": np.ones((3, 15), np.bool_),
+    "points_held": False,
+    "obs_keyframe": np.array([0, 1, 1, 2, 2, 0, 0, 1]),
+    "obs_landmark": np.array([0, 0, 1, 1, 2, 2, 3, 3]),
+    "obs_pixels": np.full((8, 3), 300.0),
+    "obs_sigma_px": np.ones((8, 2)),
+    "relative_ends": np.array([[0, 2]]),
+    "i_from_j": POSES[:1],
+    "relative_information": EYES,
+    "prior_keyframe": np.array([1]),
+    "prior_map_from_body": POSES[:1],
+    "prior_information": EYES,
+    "edge_ends": np.array([[0, 1]]),
+    "increments": np.full((1, 67), 0.1),
+    "edge_information": np.eye(15)[None],
+    "motion_mean": np.zeros((3, 9)),
+    "motion_weight": np.ones((3, 9)),
+    "gravity": np.array([0.0, 0.0, -9.81]),
+    "huber": 2.5,
+    "cutoff": 9.0,
+}
+
+
+def bundle(**other: object) -> core.BundleSolver:
+    return core.BundleSolver(**(BUNDLE | other))
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: core.BlockCholesky(np.array([1, 0]), np.array([[0, 1]]), np.arange(2)), "sizes"),
+        (lambda: core.BlockCholesky(np.array([1 << 30, 1]), np.array([[0, 1]]), np.arange(2)), "sizes"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 2]]), np.arange(2)), "pairs"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 1]]), np.zeros(2, np.int64)), "order"),
+        (lambda: core.BlockCholesky(np.full(2, 1), np.array([[0, 1]]), np.arange(1)), "order"),
+        (lambda: CHAIN.places(np.array([0]), np.array([2])), "coupled"),
+        (lambda: CHAIN.places(np.array([-1]), np.array([2])), "nodes"),
+        (lambda: CHAIN.places(np.array([0, 1]), np.array([2])), "cols"),
+        (lambda: CHAIN.factorise(np.zeros(CHAIN.size - 1)), "values"),
+        (lambda: CHAIN.solve(np.zeros(CHAIN.size), np.zeros(5)), "rhs"),
+        (lambda: bundle(free=np.ones((3, 9), np.bool_)), "free: 6 or 15"),
+        (lambda: bundle(free=np.ones((2, 15), np.bool_)), "free: a row"),
+        (lambda: bundle(motions=np.zeros((3, 0))), "motions"),
+        (lambda: bundle(motion_mean=np.zeros((2, 9))), "motion_mean"),
+        (lambda: bundle(obs_landmark=np.array([0])), "obs_landmark"),
+        (lambda: bundle(obs_landmark=np.full(8, 4)), "obs_landmark: landmarks"),
+        (lambda: bundle(obs_keyframe=np.full(8, -1)), "obs_keyframe: keyframes"),
+        (lambda: bundle(relative_ends=np.array([[0, 3]])), "relative_ends: keyframes"),
+        (lambda: bundle(i_from_j=NONE), "i_from_j"),
+        (lambda: bundle(prior_keyframe=np.array([1 << 40])), "prior_keyframe: keyframes"),
+        (lambda: bundle(prior_information=np.zeros((2, 6, 6))), "prior_information"),
+        (lambda: bundle(edge_ends=np.array([[-1, 0]])), "edge_ends: keyframes"),
+        (lambda: bundle(increments=np.zeros((0, 67))), "increments"),
+        (
+            lambda: bundle(
+                free=np.ones((3, 6), np.bool_),
+                **dict.fromkeys(("motions", "motion_mean", "motion_weight"), np.zeros((3, 0))),
+            ),
+            "edge_ends: of keyframes with motion",
+        ),
+        (lambda: bundle().factorise_sparsely(np.arange(5)), "order"),
+        (lambda: bundle().optimize(0.0, 9, 1e-4), "lambda_start"),
+        (lambda: bundle().optimize(float("nan"), 9, 1e-4), "lambda_start"),
+    ],
+)
+def test_what_cannot_be_is_refused(call: Any, told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        call()
+
+
+HOSTILE = st.one_of(
+    st.floats(-2.0, 2.0), st.floats(width=64), st.sampled_from([0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, 5e-324])
+)
+NUMBERS = [name for name, value in BUNDLE.items() if isinstance(value, np.ndarray) and value.dtype == np.float64]
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    name=st.sampled_from(NUMBERS),
+    numbers=arrays(np.float64, 40, elements=HOSTILE),
+    sparse=st.booleans(),
+    held=st.booleans(),
+)
+def test_hostile_numbers_give_values(name: str, numbers: Array, sparse: bool, held: bool) -> None:
+    solver = bundle(**{name: np.resize(numbers, BUNDLE[name].shape)}, points_held=held)
+    if sparse:
+        solver.factorise_sparsely(np.arange(6))
+    costs, iterations, _ = solver.optimize(1e-4, 5, 1e-6)
+    assert 1 <= len(costs) <= iterations + 1 <= 6
+    assert solver.points_map().shape == (4, 3)
+    assert solver.squared_sigmas().shape == (8,)
