@@ -16,6 +16,8 @@ _Reals = NDArray[np.float64]
 _Flags = NDArray[np.bool_]
 _Floats = NDArray[np.float32]
 _Octaves = NDArray[np.int8]
+# Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), whether the disparities are measured.
+_Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
 
@@ -334,6 +336,27 @@ def align_observations(
 
 def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) -> _Reals:
     """(N, 2, 2) reference_from_current of pixel offsets, NaN where degenerate."""
+
+def match_guided(
+    a: _Features,
+    b: _Features,
+    b_from_a: _Reals,
+    lens: _Reals,
+    size_px: tuple[float, float],
+    sigma_px: float,
+    refinement: tuple[float, float, tuple[int, int]],
+    max_distance: int,
+    radii_px: _Reals,
+    least_inliers: int,
+    least_share: float,
+) -> tuple[int, _Numbers, _Reals, _Reals]:
+    """How often matches of a keyframe into another near a motion gave the motion, once for each radius; the matches (P, 2) both ways
+    where they always did, the motion b_from_a (4, 4), its information (6, 6)."""
+
+def share_in_view(
+    b_from_a: _Reals, points_a: _Reals, disparities_a: _Reals, lens: _Reals, size_px: tuple[float, float]
+) -> float:
+    """Share of a's points (N, 3) with a disparity (N, 2) that b sees, at a similar distance."""
 
 def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
     """(V,) root of each node after the links first-second, none of which puts a keyframe twice into a group."""

@@ -37,6 +37,7 @@ DTYPES = {
     "_Flags": "bool",
     "_Floats": "float32",
     "_Octaves": "int8",
+    "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
 }
@@ -95,6 +96,8 @@ STEREO_LIMITS = 8.0, 0.75, 0.93, 5, 4, 0.25
 OCTAVES = np.zeros(4, np.int8)
 NEAR = PLACES[:3], PLACES[:3, 0].copy(), WORDS, np.zeros((3, 2), np.int64), PLACES[:3], OCTAVES[:3], WORDS, 64, 0.9
 PATCHES = (IMAGE, IMAGE, IMAGE), PLACES, OCTAVES
+PAIRED = PLACES[:3], OCTAVES[:3], WORDS, PLACES[:3], np.ones((3, 3)), True
+GUIDANCE = np.ones(4), (30.0, 20.0), 1.5, (4.0, 11.0, (10, 5)), 60
 CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
 
 
@@ -139,6 +142,9 @@ CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
         (lambda: core.align_observations(CHOSEN, CHOSEN, np.ones((3, 3)), np.eye(4), 4, 3.0, 0.8), "points_reference"),
         (lambda: core.align_observations(CHOSEN, (*CHOSEN[:4], CHOSEN[4] - 1), np.ones((4, 3)), np.eye(4), 4, 3.0, 0.8), "chosen"),
         (lambda: core.join_tracks(NUMBERS, NUMBERS[:1], NUMBERS), "second"),
+        (lambda: core.match_guided(PAIRED, (PLACES, *PAIRED[1:]), np.eye(4), *GUIDANCE, np.ones(2), 3, 0.4), "as many pixels"),
+        (lambda: core.match_guided(PAIRED, PAIRED, np.eye(4), *GUIDANCE, np.ones(2), -1, 0.4), "least_inliers"),
+        (lambda: core.share_in_view(np.eye(4), SAMPLES, PLACES, np.ones(4), (9.0, 9.0)), "disparities_a"),
         (lambda: core.join_tracks(NUMBERS, NUMBERS - 1, NUMBERS), "first, second"),
         (lambda: core.join_tracks(NUMBERS, NUMBERS, NUMBERS + 3), "keyframes"),
         (lambda: core.imu_intervals(STAMPS, SAMPLES, SAMPLES[:2], 0, 9), "accel_mps2"),
@@ -185,6 +191,15 @@ HOSTILE = {
         2,
         np.inf,
         -1.0,
+    ),
+    "match_guided": lambda places: core.match_guided(
+        (places, OCTAVES - np.int8(9), EMPTY, places, np.column_stack([places, places[:, 0]]), True),
+        (places[::-1].copy(), OCTAVES, EMPTY, places, np.column_stack([places, places[:, 1]]), True),
+        np.eye(4),
+        *GUIDANCE,
+        places[:, 0].copy(),
+        1,
+        0.0,
     ),
     "match_projected": lambda places: core.match_projected(
         places,

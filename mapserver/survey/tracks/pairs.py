@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import match_mutual, packed
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array
 from fleetmap.pnp.pnp import REFINEMENT, Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.settings import PairSettings
 from mapserver.survey.state import Keyframe
-from mapserver.survey.tracks.pairs_kernels import Guidance, PairFeatures, follow_motion, match_both_ways, share_in_view
 
 Indices = NDArray[np.int64]
 _SCALES = 1.2 ** np.minimum(np.arange(128), 4).astype(np.float64)  # of the pixels on an octave
@@ -72,34 +72,38 @@ def match_task(shared: MatchInputs, task: PairTask) -> list[PairMatch | None]:
 
 def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:
     """The verified match of two keyframes, None where too little agrees."""
-    a, b, settings = _features(inputs.keyframes[i]), _features(inputs.keyframes[j]), inputs.settings
-    lens, camera, radius_px = _lens(inputs.camera), inputs.camera.lens, settings.guided_radius_px
-    guidance = Guidance(lens, camera, _SCALES, settings.match_sigma_px, REFINEMENT, settings.guided_distance)
-    steps, done, motion, hessian = 2, 0, np.empty((4, 4)), np.empty((6, 6))
+    a, b, settings = inputs.keyframes[i], inputs.keyframes[j], inputs.settings
+    match, radii_px = None, [settings.search_px, settings.guided_radius_px, settings.guided_radius_px]
     if predicted is not None and predicted.is_known:
-        motion = np.array(predicted.j_from_i, np.float64, order="C")
-        radii_px = np.array([settings.search_px, radius_px, radius_px])
-        done, forward = follow_motion(
-            a, b, guidance, radii_px, (settings.min_inliers, _PROJECTED_SHARE), (motion, hessian)
-        )
-        steps = 3
-    if done == 0:
-        found = _from_descriptors(inputs.keyframes[i], inputs.keyframes[j], inputs, predicted)
+        match = _match_guided(a, b, inputs, predicted.j_from_i, radii_px, _PROJECTED_SHARE)
+    if match is None or match[0] == 0:
+        found = _from_descriptors(a, b, inputs, predicted)
         if found is None:
             return None
-        motion, radii_px, steps = found.cam_from_source, np.full(2, radius_px), 2
-        done, forward = follow_motion(a, b, guidance, radii_px, (settings.min_inliers, 0.0), (motion, hessian))
-    if done < steps:
+        radii_px = radii_px[1:]
+        match = _match_guided(a, b, inputs, found.cam_from_source, radii_px, 0.0)
+    done, features, motion, hessian = match
+    if done < len(radii_px):
         return None
-    features = match_both_ways(a, b, guidance, se3_inverse(motion), radius_px, forward)
     return PairMatch(i, j, features, motion, np.asarray(np.linalg.inv(hessian + 1e-9 * np.eye(6))))
 
 
-def _features(keyframe: Keyframe) -> PairFeatures:
+def _match_guided(
+    a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array, radii_px: list[float], least_share: float
+) -> tuple[int, NDArray[np.int32], Array, Array]:
+    """How often matches near a motion gave the motion, the matches at last, the motion and its information."""
+    settings, camera = inputs.settings, inputs.camera
+    motion, size_px = np.ascontiguousarray(b_from_a, np.float64), (camera.width_px, camera.height_px)
+    limits = camera.lens, size_px, settings.match_sigma_px, REFINEMENT, settings.guided_distance
+    wanted = np.array(radii_px, np.float64), settings.min_inliers, least_share
+    return core.match_guided(_features(a), _features(b), motion, *limits, *wanted)
+
+
+def _features(keyframe: Keyframe) -> tuple[Array, NDArray[np.int8], NDArray[np.uint64], Array, Array, bool]:
     own = keyframe.features
     pixels, octaves = np.ascontiguousarray(own.pixels, np.float64), np.ascontiguousarray(own.octaves, np.int8)
     places = np.ascontiguousarray(keyframe.disparities), np.ascontiguousarray(keyframe.points_cam)
-    return PairFeatures(pixels, octaves, packed(own.descriptors), *places, not keyframe.from_views)
+    return pixels, octaves, packed(own.descriptors), *places, not keyframe.from_views
 
 
 def _from_descriptors(
@@ -129,10 +133,8 @@ def _from_descriptors(
     return found if found is not None and found.inliers.sum() >= 0.2 * len(pairs) else None
 
 
-def _lens(camera: StereoCamera) -> Array:
-    return np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px], np.float64)
-
-
 def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:
     """Share of a's points with depth that b would see, at a similar distance."""
-    return share_in_view(b_from_a, a.points_cam, a.disparities[:, 0], _lens(camera))
+    motion, size_px = np.ascontiguousarray(b_from_a, np.float64), (camera.width_px, camera.height_px)
+    places = np.ascontiguousarray(a.points_cam), np.ascontiguousarray(a.disparities)
+    return core.share_in_view(motion, *places, camera.lens, size_px)

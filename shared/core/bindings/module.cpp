@@ -14,6 +14,7 @@ void bind_surfels(nb::module_&);
 void bind_flow(nb::module_&);
 void bind_grid(nb::module_&);
 void bind_matching(nb::module_&);
+void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
 void bind_relocalization(nb::module_&);
@@ -46,6 +47,7 @@ NB_MODULE(_core, module) {
   bind_corners(module);
   bind_flow(module);
   bind_matching(module);
+  bind_pair_matching(module);
   bind_patch_align(module);
   bind_pnp(module);
   bind_relocalization(module);
