@@ -471,3 +471,54 @@ class BundleSolver:
 
     def squared_sigmas(self) -> _Reals:
         """(M,) squared residuals in sigmas at the last cost, huge for points behind the camera."""
+
+# --- the simulator's pictures (render.h), and rays against boxes (rays.h) ---
+
+class ScenePainter:
+    """Paints what one camera sees: plane (6,) fx fy cx cy width height, rays (H, W, 4) of a lens or none."""
+
+    def __init__(self, plane: _Reals, rays: _Floats) -> None: ...
+    def add(
+        self,
+        faces: tuple[_Reals, _Reals, _Numbers, _Floats, _Reals],
+        chunks: tuple[_Numbers, _Reals],
+        textures: tuple[_Grey, _Numbers, _Numbers, _Numbers],
+        cam_from_map: _Reals,
+        centre_map: _Reals,
+        samples: int,
+        shift_px: tuple[float, float],
+        weight: float,
+        most_taps: int,
+        reflectance: float,
+        shadows: _Reals,
+        wants_truth: bool,
+        radiance: _Reals,
+        depth_m: _Floats,
+        face_of: _Numbers,
+    ) -> None:
+        """Adds an instant to a picture (H, W): faces as of `Faces` with light and strengths of groups; textures as of `Atlas`."""
+
+def develop(
+    radiance: _Reals, gain: float, shot: float, read: float, normals: _Floats, key: int, vignetting: _Floats
+) -> _Grey:
+    """A picture (H, W) of grey levels with shot noise (variance per grey level) and read noise (standard deviation)."""
+
+class BoxGrid:
+    """Boxes (B, 8) as of `Faces` in a grid between two corners (3,)."""
+
+    def __init__(self, boxes: _Reals, low: _Reals, high: _Reals, cell_m: float) -> None: ...
+    def cast(self, origin: _Reals, directions: _Reals, farthest: float) -> tuple[_Reals, _Indices]:
+        """(N,) parameters of the nearest hits, up to farthest, and (N, 2) box and side, -1 for none."""
+
+    def bake(
+        self,
+        quads: _Reals,
+        numbers: _Numbers,
+        owners: _Numbers,
+        owner_shift: int,
+        lamps: _Reals,
+        reach_m: float,
+        has_shadows: bool,
+        light: _Floats,
+    ) -> None:
+        """Adds the lamps' (L, 5) direct light to light (groups, samples) of faces; their own boxes come owner_shift later."""

@@ -1,11 +1,10 @@
-"""Every pixel of the painter against a ray caster that shares no code with it but the list of boxes."""
+"""Every pixel of the painter against a ray caster that shares nothing with it but the list of boxes."""
 
 import numpy as np
 import pytest
-from numba import njit
 
+from fleetmap import core
 from fleetmap.sensors.calibration import CameraCalibration
-from fleetsim.render import ray_kernels
 from fleetsim.render.optics import make_optics
 from fleetsim.render.painter import Look, Painter
 from fleetsim.scene.light import Exposure
@@ -14,16 +13,6 @@ from support.worlds.simulated_views import Array, map_from_cam, small_world
 
 WIDTH, HEIGHT = 200, 150
 NOTHING = 1e6
-
-
-@njit(cache=False)
-def _cast_all(rays, grid, centre):  # type: ignore[no-untyped-def]
-    parameters = np.empty(len(rays))
-    hits = np.empty((len(rays), 2), np.int64)
-    for i in range(len(rays)):
-        t, box, side = ray_kernels.cast_ray(grid, centre, rays[i], NOTHING, False, -1)
-        parameters[i], hits[i, 0], hits[i, 1] = t, box, side
-    return parameters, hits
 
 
 def _camera(lens: str) -> CameraCalibration:
@@ -64,7 +53,7 @@ def test_no_pixel_without_explanation(lens: str) -> None:
     chunk_of = np.searchsorted(firsts, np.arange(len(scene)), side="right") - 1
     box_of_face = np.where(owners[:, 0] >= 0, owners[:, 0] + box_firsts[chunk_of], -1)
     low, size = np.array([-1.0, -1.0, -1.0]), np.array([world.layout.length_m, world.layout.width_m, 8.0])
-    grid = ray_kernels.box_grid(boxes, low, size + 1.0, 0.7)
+    grid = core.BoxGrid(boxes, low, size + 1.0, 0.7)
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
     rays_cam = camera.ray_from_pixel(np.stack([u.ravel(), v.ravel()], 1))
     rays_cam /= rays_cam[:, 2:]
@@ -73,7 +62,7 @@ def test_no_pixel_without_explanation(lens: str) -> None:
         placed = map_from_cam(x, y, z, yaw, pitch)
         shot = painter.shoot(scene, np.ones(3), lambda _, placed=placed: placed, 0.0, Exposure(0.003, 1.0), 1)
         rays, centre = np.ascontiguousarray(rays_cam @ placed[:3, :3].T), placed[:3, 3].copy()
-        depth, hits = _cast_all(rays, grid, centre)
+        depth, hits = grid.cast(centre, rays, NOTHING)
         nearest = np.minimum(depth, _shell_distance(centre, rays))
         face, painted = shot.faces.ravel(), shot.depth_m.ravel().astype(np.float64)
         assert (face >= 0).all()

@@ -1,9 +1,6 @@
 """The commands: recordings that both formats' readers open, faults in the pictures, equal bytes for equal seeds."""
 
 import hashlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -112,30 +109,6 @@ def test_hidden_errors_are_in_the_pictures_and_not_in_the_calibration(tmp_path: 
     assert (true.frame_stamps_ns - spoiled.frame_stamps_ns == 20_000_000).all()
     assert spoiled.calibration.cameras[0].imu_minus_cam_s == 0.0
     assert not np.array_equal(spoiled.read_frame(2).left, true.read_frame(2).left)
-
-
-_PICTURES = """
-import hashlib
-from fleetsim.recorder import Order, prepare
-session = prepare(Order("clip", seed=4, robot="tote-1", lens="equidistant", size_px=(160, 120)))
-shots = [session.renderer.shoot(t) for t in (1.2, 1.9)]
-print(hashlib.sha256(b"".join(s.left.tobytes() + s.right.tobytes() for s in shots)).hexdigest())
-session.renderer.close()
-"""
-
-
-def test_the_same_bytes_on_an_older_machine(tmp_path: Path) -> None:
-    """Compiled for a processor without AVX and FMA the pictures are the same to the bit."""
-    digests = []
-    for name in ("", "x86-64-v2"):
-        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path))
-        if name:
-            environment |= {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-c", _PICTURES], env=environment, capture_output=True, text=True, check=True
-        )
-        digests.append(done.stdout.strip())
-    assert digests[0] == digests[1]
 
 
 def test_camera_faults_are_in_the_pictures() -> None:

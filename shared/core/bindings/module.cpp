@@ -18,6 +18,8 @@ void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
 void bind_relocalization(nb::module_&);
+void bind_preintegration(nb::module_&);
+void bind_render(nb::module_&);
 void bind_stereo(nb::module_&);
 void bind_preintegration(nb::module_&);
 void bind_track_joining(nb::module_&);
@@ -51,6 +53,8 @@ NB_MODULE(_core, module) {
   bind_patch_align(module);
   bind_pnp(module);
   bind_relocalization(module);
+  bind_preintegration(module);
+  bind_render(module);
   bind_stereo(module);
   bind_preintegration(module);
   bind_track_joining(module);

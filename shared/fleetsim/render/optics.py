@@ -29,24 +29,6 @@ class Optics:
     rays: NDArray[np.float32]
     vignetting: NDArray[np.float32]
 
-    @property
-    def has_lens(self) -> bool:
-        """Whether samples go through a look-up."""
-        return len(self.rays) > 0
-
-    def plane_indices(self, samples: int) -> NDArray[np.int32]:
-        """(H S, W S) flat index of each sample in the plane's buffer (plane height S, plane width S), -1 outside."""
-        offsets = (np.arange(samples) + 0.5) / samples - 0.5
-        xn = self.rays[:, None, :, None, 0] + offsets[None, None, None, :] * self.rays[:, None, :, None, 2]
-        yn = self.rays[:, None, :, None, 1] + offsets[None, :, None, None] * self.rays[:, None, :, None, 3]
-        fx, fy, cx, cy, width, height = self.pinhole
-        xn, yn = np.broadcast_arrays(xn, yn)
-        with np.errstate(invalid="ignore"):
-            column, row = np.floor((xn * fx + cx + 0.5) * samples), np.floor((yn * fy + cy + 0.5) * samples)
-            inside = (column >= 0) & (column < width * samples) & (row >= 0) & (row < height * samples)
-        flat = np.where(inside, row * (width * samples) + column, -1).astype(np.int32)
-        return np.ascontiguousarray(flat.reshape(self.height_px * samples, self.width_px * samples))
-
 
 def make_optics(camera: CameraCalibration) -> Optics:
     """The optics of a calibrated camera. Raises CalibrationError where its lens sees nothing that can be painted."""

@@ -7,12 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Image
-from fleetsim.render import sensor_kernels, shading_kernels, visibility_kernels
 from fleetsim.render.optics import Optics
-from fleetsim.render.shading_kernels import Canvas, Instant, Surfaces, Visible
-from fleetsim.scene.faces import MATERIAL_FLOOR
 from fleetsim.scene.light import Exposure
 from fleetsim.scene.movers import AnyMover, add_movers, mover_light
 from fleetsim.scene.world import Scene, World
@@ -51,6 +49,15 @@ class Shot:
     subframes: int
 
 
+class _Instant(NamedTuple):
+    """One instant of an exposure: samples per pixel side, shift of the samples in pixels, weight in the picture."""
+
+    samples: int
+    shift_px: tuple[float, float]
+    weight: float
+    wants_truth: bool
+
+
 class Painter:
     """Holds one camera's buffers; not for several threads."""
 
@@ -61,23 +68,22 @@ class Painter:
         self._movers = movers
         self._scene: Scene | None = None
         self._groups = np.zeros(3)
-        self._buffers: dict[int, _Buffer] = {}
-        self._indices: dict[int, NDArray[np.int32]] = {}
+        self._scenes = core.ScenePainter(optics.pinhole, optics.rays)
         self._normals = np.random.default_rng(99).standard_normal(_NOISE_TABLE).astype(np.float32)
 
     def shoot(self, scene: Scene, groups: Array, path: Path, t_s: float, exposure: Exposure, noise_key: int) -> Shot:
         """The picture whose exposure is centred at t; `groups` are the strengths of the lamp groups."""
         self._prepare(scene, groups, t_s)
         height, width = self._optics.height_px, self._optics.width_px
-        canvas = Canvas.empty(height, width)
+        shape = (height, width)
+        canvas = _Canvas(np.zeros(shape), np.zeros(shape, np.float32), np.full(shape, -1, np.int32))
         count = self.subframes(path, t_s, exposure) if self._look.has_blur else 1
-        samples, look = self._look.samples if count == 1 else 1, self._look
+        samples = self._look.samples if count == 1 else 1
         for number in range(count):
             moment = t_s + ((number + 0.5) / count - 0.5) * exposure.time_s
             # Sub-pixel shifts of a low-discrepancy sequence smooth the edges of blurred pictures at no cost.
             shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
-            is_middle = number == count // 2
-            instant = Instant(samples, shift, 1.0 / count, look.most_taps, look.reflectance, is_middle)
+            instant = _Instant(samples, (float(shift[0]), float(shift[1])), 1.0 / count, number == count // 2)
             self._add(canvas, instant, path(moment), moment)
         return Shot(self._develop(canvas.radiance, exposure, noise_key), canvas.depth_m, canvas.faces, count)
 
@@ -90,14 +96,12 @@ class Painter:
         return int(np.clip(wanted, 1, _MOST_SUBFRAMES))
 
     def _develop(self, radiance: Array, exposure: Exposure, noise_key: int) -> Image:
-        image = np.empty(radiance.shape, np.uint8)
         shot, read = 0.0, 0.0
         if self._look.has_noise:
             shot = exposure.gain / _ELECTRONS_PER_GREY
             read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
-        noise = sensor_kernels.Noise(shot, read, self._normals, noise_key * 2 + self._number)
-        sensor_kernels.develop(radiance, exposure.grey_per_radiance, noise, self._optics.vignetting, image)
-        return image
+        noise = (shot, read, self._normals, noise_key * 2 + self._number)
+        return core.develop(radiance, exposure.grey_per_radiance, *noise, self._optics.vignetting)
 
     def _prepare(self, scene: Scene, groups: Array, t_s: float) -> None:
         """Own copies of the scene's columns with room for the movers at the end; light for this moment."""
@@ -116,9 +120,6 @@ class Painter:
             self._bounds = np.concatenate([scene.bounds_m, np.array([[-1e5, -1e5, -1e5, 1e5, 1e5, 1e5]])])
             mixed = groups.astype(np.float32) @ scene.light + np.float32(self._world.lamps.ambient(groups))
             self._light = np.concatenate([mixed, np.zeros(moving.light_samples, np.float32)])
-            total = len(self._quads)
-            self._plan = _Plan.sized(total)
-            self._mirror_plan = _Plan.sized(total)
             self._scene, self._groups = scene, groups.copy()
         if self._movers:
             places = [mover.place(t_s) for mover in self._movers]
@@ -134,77 +135,22 @@ class Painter:
         self._quads[-len(self._mover_faces) :] = builder.finish().quads
         return shadows
 
-    def _buffer(self, samples: int, *, is_mirror: bool = False) -> "_Buffer":
-        key = -1 if is_mirror else samples
-        if key not in self._buffers:
-            width, height = int(self._optics.pinhole[4]) * samples, int(self._optics.pinhole[5]) * samples
-            nearness, owner = np.zeros((height, width), np.float32), np.zeros((height, width), np.int32)
-            self._buffers[key] = _Buffer(nearness, owner, samples)
-        self._buffers[key].nearness.fill(0.0)
-        self._buffers[key].owner.fill(-1)
-        return self._buffers[key]
-
-    def _through_lens(self, owner: NDArray[np.int32], samples: int) -> NDArray[np.int32]:
-        if not self._optics.has_lens:
-            return owner
-        if samples not in self._indices:
-            self._indices[samples] = self._optics.plane_indices(samples)
-        seen = np.empty_like(self._indices[samples])
-        visibility_kernels.gather(owner, self._indices[samples], seen)
-        return seen
-
-    def _add(self, canvas: Canvas, instant: Instant, map_from_cam: Array, t_s: float) -> None:
+    def _add(self, canvas: "_Canvas", instant: _Instant, map_from_cam: Array, t_s: float) -> None:
         shadows = self._move(t_s)
-        pinhole, world, plan, mirror = self._optics.pinhole, self._world, self._plan, self._mirror_plan
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
-        centre = np.ascontiguousarray(map_from_cam[:3, 3])
-        buffer, mirror_buffer = self._buffer(instant.samples), self._buffer(1, is_mirror=True)
-        count = self._project(plan, cam_from_map, centre, is_mirrored=False)
-        plan.paint(count, pinhole, instant.shift, 0, buffer)
-        first_row = visibility_kernels.first_floor_row(
-            buffer.owner, plan.face_of, self._numbers, MATERIAL_FLOOR, instant.samples
+        centre, world, atlas = np.ascontiguousarray(map_from_cam[:3, 3]), self._world, self._world.textures.atlas
+        faces = (self._quads, self._values, self._numbers, self._light, self._groups)
+        textures = (atlas.texels, atlas.table, world.decals, world.floor_numbers)
+        chunks = (self._ranges, self._bounds)
+        look = (self._look.most_taps, self._look.reflectance, shadows)
+        self._scenes.add(
+            faces, chunks, textures, cam_from_map, centre, *instant[:3], *look, instant.wants_truth, *canvas
         )
-        if instant.reflectance > 0 and first_row < mirror_buffer.owner.shape[0]:
-            count = self._project(mirror, cam_from_map, centre, is_mirrored=True)
-            mirror.paint(count, pinhole, np.zeros(2), max(0, first_row - 6), mirror_buffer)
-        visible = Visible(self._through_lens(buffer.owner, instant.samples), plan.homographies, plan.face_of)
-        mirrored = Visible(mirror_buffer.owner, mirror.homographies, mirror.face_of)
-        atlas = (world.textures.atlas.texels, world.textures.atlas.table, world.decals, world.floor_numbers)
-        surfaces = Surfaces(self._quads, self._values, self._numbers, self._light, self._groups, *atlas)
-        view = (pinhole, self._optics.rays, float(centre[2]))
-        shading_kernels.shade_image(surfaces, visible, mirrored, instant, *view, shadows, canvas)
-
-    def _project(self, plan: "_Plan", cam_from_map: Array, centre_map: Array, *, is_mirrored: bool) -> int:
-        chunks = (self._quads, self._ranges, self._bounds)
-        arguments = (*chunks, cam_from_map, centre_map, self._optics.pinhole, is_mirrored)
-        columns = (plan.homographies, plan.polygons, plan.corner_counts, plan.face_of)
-        return visibility_kernels.project_faces(*arguments, *columns)
 
 
-class _Buffer(NamedTuple):
-    """1/z and visible polygon of each sample, samples x samples per pixel."""
+class _Canvas(NamedTuple):
+    """A picture in the making (H, W): radiance, depth along the optical axis, face of each pixel (-1 for nothing)."""
 
-    nearness: NDArray[np.float32]
-    owner: NDArray[np.int32]
-    samples: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    """Room for the visible polygons of one view, see project_faces."""
-
-    homographies: Array
-    polygons: Array
-    corner_counts: NDArray[np.int32]
-    face_of: NDArray[np.int32]
-
-    @classmethod
-    def sized(cls, faces: int) -> "_Plan":
-        polygons = np.zeros((faces, visibility_kernels.MOST_CORNERS, 2))
-        return cls(np.zeros((faces, 9)), polygons, np.zeros(faces, np.int32), np.zeros(faces, np.int32))
-
-    def paint(self, count: int, pinhole: Array, shift: Array, first_row: int, buffer: _Buffer) -> None:
-        nearness, owner, samples = buffer
-        polygons = (self.polygons, self.corner_counts, self.homographies)
-        first_row *= samples
-        visibility_kernels.paint_polygons(count, *polygons, pinhole, samples, shift, first_row, nearness, owner)
+    radiance: Array
+    depth_m: NDArray[np.float32]
+    faces: NDArray[np.int32]

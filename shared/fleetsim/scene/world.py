@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array
-from fleetsim.render import ray_kernels
 from fleetsim.scene.building import HallMaker, Lamp
 from fleetsim.scene.faces import FaceBuilder, Faces
 from fleetsim.scene.layout import Layout
@@ -148,7 +148,7 @@ class World:
 
     def _lamps_near(self, key: tuple[int, int]) -> Array:
         lamps: list[Lamp] = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
-        return np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in lamps])
+        return np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in lamps]).reshape(-1, 5)
 
     def _light_detailed(self, key: tuple[int, int]) -> LitFaces:
         """Light with shadows from the boxes of the chunk and the eight around it; further lamps are not counted."""
@@ -161,13 +161,13 @@ class World:
         rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])
         low = np.array([rectangles[:, 0].min(), rectangles[:, 1].min(), 0.0]) - 0.5
         high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
-        grid = ray_kernels.box_grid(boxes, low, high, _CELL_M)
+        grid = core.BoxGrid(boxes, low, high, _CELL_M)
         light = np.zeros((LAMP_GROUPS, faces.light_samples), np.float32)
         lamps = self._lamps_near(key)
 
         def bake(first: int, last: int) -> None:
             columns = (faces.quads[first:last], faces.numbers[first:last], faces.owners[first:last])
-            ray_kernels.bake_faces(*columns, shift, grid, lamps, LAMP_REACH_M, has_shadows, light)
+            grid.bake(*columns, shift, lamps, LAMP_REACH_M, has_shadows, light)
 
         cuts = np.searchsorted(faces.numbers[:, 3], faces.light_samples * np.arange(1, 4) / 4)
         edges = [0, *(int(cut) for cut in cuts), len(faces)]
