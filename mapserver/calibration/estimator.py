@@ -7,13 +7,15 @@ variance components.
 """
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+from fleetmap import core
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import ImuNoise
-from mapserver.calibration.image_rows import Observations, image_residuals, image_rows, robust_cost
+from mapserver.calibration.image_rows import ImageRows, Observations, image_residuals, image_rows, robust_cost
 from mapserver.calibration.motion_rows import (
     MOTION,
     ROTATION,
@@ -29,13 +31,6 @@ from mapserver.calibration.motion_rows import (
 )
 from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.calibration.schur_kernels import (
-    BorderedLandmarks,
-    ImageRows,
-    landmark_steps,
-    reduce_landmarks,
-    reduce_residuals,
-)
 
 _ROUNDS = 5  # in each the sizes of the errors are estimated anew, and the samples integrated at the new biases
 _MAX_STEPS = 12
@@ -82,6 +77,14 @@ class Adjusted:
     observations: int
     lens: Array
     focal_by_lens: float
+
+
+class BorderedLandmarks(NamedTuple):
+    """Of N landmarks: inverse (N, 3, 3) of their information, rhs (N, 3), coupling (N, 3, C) to the calibration."""
+
+    inverse: Array
+    rhs: Array
+    coupling: Array
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,7 @@ class _Problem:
         info, rhs = np.zeros((self.size, self.size)), np.zeros(self.size)
         marks, columns = len(self.starts) - 1, UNKNOWNS
         gone = BorderedLandmarks(np.empty((marks, 3, 3)), np.empty((marks, 3)), np.empty((marks, 3, columns)))
-        reduce_landmarks(images, self.keyframes, self.starts, (self.stride, damping), (info, rhs), gone)
+        core.reduce_landmarks(images, self.keyframes, self.starts, self.stride, damping, info, rhs, gone)
         border = self.size - columns
         for each in edges:
             at = slice(each.first * self.stride, (each.first + 2) * self.stride)
@@ -221,7 +224,7 @@ class _Problem:
         """The system for other residuals (M, 4) of images and of each edge, with the same derivatives and without the gauge's pull."""
         rows, rhs = system.images._replace(residuals=images), np.zeros(self.size)
         gone = system.eliminated._replace(rhs=np.empty_like(system.eliminated.rhs))
-        reduce_residuals(rows, self.keyframes, self.starts, self.stride, rhs, gone)
+        core.reduce_residuals(rows, self.keyframes, self.starts, self.stride, rhs, gone)
         others = [replace(each, residual=residual) for each, residual in zip(system.edges, edges, strict=True)]
         self._add_edges(others, rhs)
         return _System(system.information, rhs, rows, others, gone)
@@ -229,11 +232,7 @@ class _Problem:
     def solve(self, system: _System, factor: tuple[Array, bool]) -> tuple[Array, Array]:
         """Step of the unknowns (D,) and of the landmarks (N, 3)."""
         step = scipy.linalg.cho_solve(factor, system.rhs, check_finite=False)
-        moved = np.empty((len(self.starts) - 1, 3))
-        border = self.size - UNKNOWNS
-        by_keyframe = np.ascontiguousarray(step[:border].reshape(self.count, self.stride))
-        steps = by_keyframe, np.ascontiguousarray(step[border:])
-        landmark_steps(system.images, self.keyframes, self.starts, system.eliminated, steps, moved)
+        moved = core.landmark_steps(system.images, self.keyframes, self.starts, system.eliminated, self.stride, step)
         return step, moved
 
     def _factor(self, system: _System, damping: float) -> tuple[Array, bool]:

@@ -6,9 +6,11 @@ scale a longer focal length would shrink the errors, and so seem likelier than i
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
@@ -23,7 +25,6 @@ from mapserver.calibration.parameters import (
     right_camera,
 )
 from mapserver.calibration.problem import CalibrationData, MotionState
-from mapserver.calibration.schur_kernels import ImageRows, weigh
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
@@ -34,6 +35,15 @@ _LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PA
 _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION), 1e-5)
 _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.01)
 HUBER_SIGMAS, CUTOFF_SIGMAS = 3.0, 8.0  # of an observation's four rows together
+
+
+class ImageRows(NamedTuple):
+    """Whitened rows of M observations: residuals (M, 4), derivatives by pose (M, 4, 6), point (M, 4, 3) and calibration (M, 4, C)."""
+
+    residuals: Array
+    by_keyframe: Array
+    by_point: Array
+    by_calibration: Array
 
 
 @dataclass(frozen=True)
@@ -184,7 +194,7 @@ def image_rows(
     factor[view.in_left[:, 2] <= _MIN_DEPTH_M] = 0.0
     derivatives = [np.ascontiguousarray(by) for by in (by_keyframe, by_point, by_calibration)]
     for by in derivatives:
-        weigh(by, factor)
+        core.weigh(by, factor)
     return ImageRows(rows * np.sqrt(weight)[:, None], *derivatives)
 
 

@@ -322,12 +322,9 @@ void BundleSolver::invert_landmarks(double damping) {
       point_inverse_[n] = {};
       continue;
     }
-    const double a = info[0] * (1.0 + damping) + floor, d = info[3] * (1.0 + damping) + floor, f = info[5] * (1.0 + damping) + floor;
-    const double b = info[1], c = info[2], e = info[4];
-    const double minor_a = d * f - e * e, minor_b = c * e - b * f, minor_c = b * e - c * d;
-    const double scale = 1.0 / (a * minor_a + b * minor_b + c * minor_c);
-    point_inverse_[n] = {minor_a * scale,         minor_b * scale,         minor_c * scale,
-                         (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale};
+    Mat3 damped = full(info);
+    for (int a = 0; a < 3; ++a) damped[a][a] = damped[a][a] * (1.0 + damping) + floor;
+    point_inverse_[n] = inverse_symmetric(damped);
   }
 }
 
@@ -341,7 +338,7 @@ void BundleSolver::eliminate_landmarks() {
       const size_t k = size_t(slot_observations_[entry]), landmark = size_t(seen_[k].landmark);
       const Symmetric& info = obs_info_[k];
       if (info[0] + info[3] + info[5] == 0.0) continue;
-      const Mat3 y = full(info) * full(point_inverse_[landmark]);  // A H_ll^-1
+      const Mat3 y = full(info) * point_inverse_[landmark];  // A H_ll^-1
       const Vec3 point = state_.points[landmark], q = point - position;
       add_lifted(q, y * point_rhs_[landmark], &rhs_[p * size_t(problem_.unknowns)]);
       for (size_t n = landmark_starts_[landmark]; n < landmark_starts_[landmark + 1]; ++n) {
@@ -478,7 +475,7 @@ void BundleSolver::move(const std::vector<double>& step) {
       const Vec3 t = {d[3] + d[1] * q[2] - d[2] * q[1], d[4] + d[2] * q[0] - d[0] * q[2], d[5] + d[0] * q[1] - d[1] * q[0]};
       pull = pull + full(obs_info_[n]) * t;
     }
-    const Vec3 d = full(point_inverse_[landmark]) * pull;
+    const Vec3 d = point_inverse_[landmark] * pull;
     const double length = norm(d), limit = 0.5 * std::sqrt(nearest);
     moved_.points[landmark] = point + (length > limit ? limit / length : 1.0) * d;
   }

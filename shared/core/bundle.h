@@ -151,7 +151,8 @@ class BundleSolver {
   std::vector<Mat3> cam_from_map_;
   std::vector<double> squared_;
   // Normal equations.
-  std::vector<Symmetric> obs_info_, point_info_, point_inverse_;
+  std::vector<Symmetric> obs_info_, point_info_;
+  std::vector<Mat3> point_inverse_;
   std::vector<Vec3> point_rhs_;
   std::vector<double> pose_info_, pose_rhs_, edge_blocks_, edge_rhs_;
   // The reduced system: blocks (B, 6, 6), diagonal and rhs (P, unknowns), damp: what is added to the diagonal.

@@ -65,6 +65,15 @@ inline Mat3 operator/(const Mat3& a, double s) {
 inline Mat3 transposed(const Mat3& a) { return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}}; }
 inline double trace(const Mat3& a) { return a[0][0] + a[1][1] + a[2][2]; }
 
+// The inverse of a symmetric matrix, by its cofactors.
+inline Mat3 inverse_symmetric(const Mat3& m) {
+  const double a = m[0][0], b = m[0][1], c = m[0][2], d = m[1][1], e = m[1][2], f = m[2][2];
+  const double minor_a = d * f - e * e, minor_b = c * e - b * f, minor_c = b * e - c * d;
+  const double scale = 1.0 / (a * minor_a + b * minor_b + c * minor_c);
+  const double xy = minor_b * scale, xz = minor_c * scale, yz = (b * c - a * e) * scale;
+  return {{{minor_a * scale, xy, xz}, {xy, (a * f - c * c) * scale, yz}, {xz, yz, (a * d - b * b) * scale}}};
+}
+
 // The upper left corner of a matrix in memory whose rows are `stride` numbers apart.
 inline Mat3 mat3(const double* from, int stride = 3) {
   Mat3 out;

@@ -20,6 +20,8 @@ _Octaves = NDArray[np.int8]
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
+_ImageRows = tuple[_Reals, _Reals, _Reals, _Reals]
+_Landmarks = tuple[_Reals, _Reals, _Reals]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -522,3 +524,33 @@ class BoxGrid:
         light: _Floats,
     ) -> None:
         """Adds the lamps' (L, 5) direct light to light (groups, samples) of faces; their own boxes come owner_shift later."""
+
+def reduce_landmarks(
+    images: _ImageRows,
+    keyframes: _Indices,
+    starts: _Indices,
+    stride: int,
+    damping: float,
+    information: _Reals,
+    rhs: _Reals,
+    landmarks: _Landmarks,
+) -> None:
+    """Adds what images say of poses and calibration to information (D, D), its upper triangle of blocks, and rhs (D,); fills `landmarks`.
+
+    images: whitened rows of M observations, landmark by landmark: residuals (M, 4), derivatives by pose (M, 4, 6), point (M, 4, 3) and
+    calibration (M, 4, C); keyframes (M,); starts (N + 1,) of each landmark. landmarks: inverse (N, 3, 3) of their information, rhs (N, 3),
+    coupling (N, 3, C) to the calibration. stride: unknowns per keyframe; the calibration is the last C. damping: of the landmarks.
+    """
+
+def reduce_residuals(
+    images: _ImageRows, keyframes: _Indices, starts: _Indices, stride: int, rhs: _Reals, landmarks: _Landmarks
+) -> None:
+    """The part of `reduce_landmarks` that residuals change: rhs (D,), and that of `landmarks`, which holds the rest."""
+
+def landmark_steps(
+    images: _ImageRows, keyframes: _Indices, starts: _Indices, landmarks: _Landmarks, stride: int, step: _Reals
+) -> _Reals:
+    """Back-substitution: (N, 3) steps of the landmarks for a step (D,) of the poses and of the calibration."""
+
+def weigh(slopes: _Reals, factors: _Reals) -> None:
+    """Multiplies derivatives (M, 4, n) by factors (M, 4) in place; NaN counts as zero, and what is infinite as the largest number."""

@@ -40,6 +40,8 @@ DTYPES = {
     "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
+    "_ImageRows": "tuple[dtype=float64, dtype=float64, dtype=float64, dtype=float64]",
+    "_Landmarks": "tuple[dtype=float64, dtype=float64, dtype=float64]",
 }
 
 

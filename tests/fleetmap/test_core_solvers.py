@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleetmap import core
-from fleetmap.geometry import Array
+from fleetmap.geometry import AnyArray, Array
 
 CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arange(3))
 POSES, EYES, NONE = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (1, 1, 1)), np.zeros((0, 4, 4))
@@ -47,6 +47,16 @@ def bundle(**other: object) -> core.BundleSolver:
     return core.BundleSolver(**(BUNDLE | other))
 
 
+# Two keyframes and a calibration of three see two landmarks, twice each.
+IMAGES = np.ones((4, 4)), np.ones((4, 4, 6)), np.ones((4, 4, 3)), np.ones((4, 4, 3))
+KEYFRAMES, STARTS = np.array([0, 1, 0, 1]), np.array([0, 2, 4])
+LANDMARKS = np.zeros((2, 3, 3)), np.zeros((2, 3)), np.zeros((2, 3, 3))
+
+
+def border(keyframes: AnyArray = KEYFRAMES, starts: AnyArray = STARTS, stride: int = 6, size: int = 15) -> None:
+    core.reduce_landmarks(IMAGES, keyframes, starts, stride, 0.1, np.zeros((15, 15)), np.zeros(size), LANDMARKS)
+
+
 @pytest.mark.parametrize(
     ("call", "told"),
     [
@@ -80,6 +90,15 @@ def bundle(**other: object) -> core.BundleSolver:
             ),
             "edge_ends: of keyframes with motion",
         ),
+        (lambda: border(keyframes=np.array([0, 1, 0, 2])), "keyframes: those"),
+        (lambda: border(keyframes=np.array([0, 1, 0])), "images, keyframes"),
+        (lambda: border(starts=np.array([0, 2, 5])), "starts"),
+        (lambda: border(starts=np.array([0, 3, 2, 4])), "starts"),
+        (lambda: border(starts=np.array([0, 4])), "landmarks"),
+        (lambda: border(stride=5), "stride"),
+        (lambda: border(size=14), "information"),
+        (lambda: core.landmark_steps(IMAGES, KEYFRAMES, STARTS, LANDMARKS, 6, np.zeros(2)), "rhs"),
+        (lambda: core.weigh(IMAGES[1].copy(), np.ones((3, 4))), "factors"),
         (lambda: bundle().factorise_sparsely(np.arange(5)), "order"),
         (lambda: bundle().optimize(0.0, 9, 1e-4), "lambda_start"),
         (lambda: bundle().optimize(float("nan"), 9, 1e-4), "lambda_start"),

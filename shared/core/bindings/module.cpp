@@ -9,6 +9,7 @@ namespace nb = nanobind;
 
 void bind_block_cholesky(nb::module_&);
 void bind_bundle(nb::module_&);
+void bind_calibration(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_surfels(nb::module_&);
 void bind_flow(nb::module_&);
@@ -46,6 +47,7 @@ NB_MODULE(_core, module) {
 #endif
   bind_block_cholesky(module);
   bind_bundle(module);
+  bind_calibration(module);
   bind_corners(module);
   bind_flow(module);
   bind_matching(module);

@@ -2,15 +2,17 @@
 
 import numpy as np
 
-from fleetmap.geometry import Array
-from mapserver.calibration.schur_kernels import BorderedLandmarks, ImageRows, reduce_landmarks, reduce_residuals, weigh
+from fleetmap import core
+from fleetmap.geometry import AnyArray, Array
+from mapserver.calibration.estimator import BorderedLandmarks
+from mapserver.calibration.image_rows import ImageRows
 
 KEYFRAMES, LANDMARKS, COLUMNS = 4, 7, 5
 STRIDE = 6
 SIZE = STRIDE * KEYFRAMES + COLUMNS
 
 
-def scene(seed: int) -> tuple[ImageRows, Array, Array]:
+def scene(seed: int) -> tuple[ImageRows, AnyArray, AnyArray]:
     rng = np.random.default_rng(seed)
     seen = [rng.permutation(KEYFRAMES)[: 2 + n % 3] for n in range(LANDMARKS)]
     keyframes = np.concatenate(seen).astype(np.int64)
@@ -19,10 +21,10 @@ def scene(seed: int) -> tuple[ImageRows, Array, Array]:
     return ImageRows(*(rng.standard_normal((len(keyframes), *shape)) for shape in shapes)), keyframes, starts
 
 
-def reduced(rows: ImageRows, keyframes: Array, starts: Array) -> tuple[Array, Array, BorderedLandmarks]:
+def reduced(rows: ImageRows, keyframes: AnyArray, starts: AnyArray) -> tuple[Array, Array, BorderedLandmarks]:
     info, rhs = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     out = BorderedLandmarks(*(np.empty((LANDMARKS, *shape)) for shape in ((3, 3), (3,), (3, COLUMNS))))
-    reduce_landmarks(rows, keyframes, starts, (STRIDE, 0.0), (info, rhs), out)
+    core.reduce_landmarks(rows, keyframes, starts, STRIDE, 0.0, info, rhs, out)
     return info, rhs, out
 
 
@@ -51,7 +53,7 @@ def test_other_residuals_change_the_right_hand_side_alone() -> None:
     _, rhs, expected = reduced(other, keyframes, starts)
     _, _, out = reduced(rows, keyframes, starts)
     found = np.zeros(SIZE)
-    reduce_residuals(other, keyframes, starts, STRIDE, found, out)
+    core.reduce_residuals(other, keyframes, starts, STRIDE, found, out)
     assert np.array_equal(found, rhs)
     assert np.array_equal(out.rhs, expected.rhs)
 
@@ -61,5 +63,5 @@ def test_derivatives_without_a_value_weigh_nothing() -> None:
     slopes, factors = rng.standard_normal((6, 4, 3)), rng.uniform(size=(6, 4))
     slopes[0, 1, 2], slopes[3, 0, 0], slopes[5, 3, 1] = np.nan, np.inf, -np.inf
     expected = np.nan_to_num(slopes) * factors[:, :, None]
-    weigh(slopes, factors)
+    core.weigh(slopes, factors)
     assert np.array_equal(slopes, expected)
