@@ -65,7 +65,7 @@ def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, n
             data.imu, int(stamps[k]), int(stamps[k + 1]), state.motions[k, 3:6], state.motions[k, 6:], noise
         )
         factor = np.linalg.cholesky(summed.cov + np.diag(FLOOR_SIGMA**2))
-        edges.append(InertialEdge(k, np.linalg.inv(factor), groups, packed_increments(summed)))
+        edges.append(InertialEdge(k, np.linalg.inv(factor), groups, packed_increments([summed])[0]))
     return edges
 
 

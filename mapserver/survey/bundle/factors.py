@@ -1,5 +1,6 @@
 """The terms of a bundle problem besides its images, as arrays for the core."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,21 @@ from mapserver.survey.bundle.problem import BundleProblem
 
 # Below this an increment's covariance means nothing: rounding of the sums, and it keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
+
+# Parts of an increment as the core takes it, and how many numbers each has.
+_INCREMENTS = {
+    "dt_s": 1,
+    "delta_rotation": 9,
+    "delta_velocity_mps": 3,
+    "delta_position_m": 3,
+    "d_rotation_d_gyro": 9,
+    "d_velocity_d_gyro": 9,
+    "d_velocity_d_accel": 9,
+    "d_position_d_gyro": 9,
+    "d_position_d_accel": 9,
+    "gyro_bias_radps": 3,
+    "accel_bias_mps2": 3,
+}
 
 
 class Terms(NamedTuple):
@@ -45,26 +61,17 @@ def pack_terms(problem: BundleProblem) -> Terms:
         np.array([prior.map_from_body for prior in priors], np.float64).reshape(-1, 4, 4),
         np.array([prior.information for prior in priors], np.float64).reshape(-1, 6, 6),
         np.array([(i, j) for i, j, _ in edges], np.int64).reshape(-1, 2),
-        np.array([packed_increments(summed) for _, _, summed in edges]).reshape(-1, 67),
+        packed_increments([summed for _, _, summed in edges]),
         _informations(np.array([summed.cov for _, _, summed in edges]).reshape(-1, 15, 15)),
         mean,
         weight,
     )
 
 
-def packed_increments(summed: Preintegrated) -> Array:
-    """(67,): dt, dR, dv, dp, the five derivatives by the biases, and the biases that they were taken at."""
-    s = summed
-    increments = [s.dt_s], s.delta_rotation, s.delta_velocity_mps, s.delta_position_m
-    by_gyro_accel = (
-        s.d_rotation_d_gyro,
-        s.d_velocity_d_gyro,
-        s.d_velocity_d_accel,
-        s.d_position_d_gyro,
-        s.d_position_d_accel,
-    )
-    parts = *increments, *by_gyro_accel, s.gyro_bias_radps, s.accel_bias_mps2
-    return np.concatenate([np.ravel(part) for part in parts])
+def packed_increments(summed: Sequence[Preintegrated]) -> Array:
+    """(E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases that they were taken at."""
+    parts = [np.array([getattr(each, name) for each in summed]).reshape(-1, size) for name, size in _INCREMENTS.items()]
+    return np.concatenate(parts, axis=1)
 
 
 def _informations(covariances: Array) -> Array:
