@@ -6,8 +6,8 @@ Furgale 2014 for compounding, Hertzberg et al. 2013 for boxplus and boxminus.
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, turn_both
-from locclient.localization.pose_covariance_kernels import compose
 
 
 def boxminus(measured: Array, predicted: Array) -> Array:
@@ -43,7 +43,8 @@ def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
 
 def compose_cov(map_from_body: Array, covariance: Array, body_from_next: Array, cov_step: Array) -> tuple[Array, Array]:
     """map_from_next and its covariance. cov_step: of the step, a left perturbation in the body's axes about the body."""
-    return compose(*map(np.ascontiguousarray, (map_from_body, covariance, body_from_next, cov_step)))
+    a, b, c, d = map(np.ascontiguousarray, (map_from_body, covariance, body_from_next, cov_step))
+    return core.compose_pose(a, b, c, d)
 
 
 def compose_end_cov(

@@ -1,6 +1,7 @@
 // Small dense linear algebra on matrices row by row. Sums go in the order of their terms: the same bits everywhere.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <vector>
@@ -39,6 +40,55 @@ inline void multiply(const double* a, const double* b, double* __restrict out, s
       if (x == 0.0) continue;
       for (size_t j = 0; j < m; ++j) row[j] += x * b[at * m + j];
     }
+  }
+}
+
+inline void multiply(const Matrix& a, const Matrix& b, Matrix& out) {
+  out.resize(a.rows, b.columns);
+  multiply(a.values.data(), b.values.data(), out.values.data(), a.rows, a.columns, b.columns);
+}
+
+inline void transpose(const Matrix& a, Matrix& out) {
+  out.resize(a.columns, a.rows);
+  for (size_t i = 0; i < a.rows; ++i)
+    for (size_t j = 0; j < a.columns; ++j) out[j][i] = a[i][j];
+}
+
+// a <- (a + a^T) / 2.
+inline void symmetrise(Matrix& a) {
+  for (size_t i = 0; i < a.rows; ++i)
+    for (size_t j = 0; j < i; ++j) a[i][j] = a[j][i] = 0.5 * (a[i][j] + a[j][i]);
+}
+
+// Solves a x = b in place by Gaussian elimination with the largest pivot of each column; a (n, n) is destroyed, b (n, m) becomes x.
+// What is singular gives numbers that are not finite.
+inline void solve_in_place(Matrix& a, Matrix& b) {
+  const size_t n = a.rows, m = b.columns;
+  for (size_t k = 0; k < n; ++k) {
+    size_t pivot = k;
+    for (size_t i = k + 1; i < n; ++i)
+      if (std::abs(a[i][k]) > std::abs(a[pivot][k])) pivot = i;
+    if (pivot != k) {
+      std::swap_ranges(a[k], a[k] + n, a[pivot]);
+      std::swap_ranges(b[k], b[k] + m, b[pivot]);
+    }
+    for (size_t i = k + 1; i < n; ++i) {
+      if (a[i][k] == 0.0) continue;
+      const double factor = a[i][k] / a[k][k];
+      double* const __restrict row = a[i], * const __restrict right = b[i];
+      const double* const __restrict top = a[k], * const __restrict top_right = b[k];
+      for (size_t j = k + 1; j < n; ++j) row[j] -= factor * top[j];
+      for (size_t j = 0; j < m; ++j) right[j] -= factor * top_right[j];
+    }
+  }
+  for (size_t k = n; k-- > 0;) {
+    double* const __restrict row = b[k];
+    for (size_t i = k + 1; i < n; ++i) {
+      const double factor = a[k][i];
+      const double* const __restrict below = b[i];
+      for (size_t j = 0; j < m; ++j) row[j] -= factor * below[j];
+    }
+    for (size_t j = 0; j < m; ++j) row[j] /= a[k][k];
   }
 }
 

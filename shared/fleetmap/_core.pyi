@@ -474,6 +474,211 @@ class BundleSolver:
     def squared_sigmas(self) -> _Reals:
         """(M,) squared residuals in sigmas at the last cost, huge for points behind the camera."""
 
+# --- inertial samples before they are used; poses ---
+
+def drop_spikes(stamps_ns: _Indices, gyro_radps: _Reals, accel_mps2: _Reals, known: int) -> int:
+    """End of the samples once spikes are gone from the rows behind the known ones, in place: what is far from both neighbours.
+
+    The last sample is judged by one neighbour alone; the very first one has none and stays.
+    """
+
+def longest_gap_ns(stamps_ns: _Indices, start_ns: int, end_ns: int) -> int:
+    """The longest time between start and end, both included, without a sample."""
+
+def is_steady(gyro_radps: _Reals, accel_mps2: _Reals, limits: tuple[float, float, float, float, float]) -> bool:
+    """Whether means of tenths of a window agree, and are those of a body at rest or rolling evenly.
+
+    limits: largest standard deviation of the means of gyro and of accel, largest mean of gyro, gravity and by how much it may be missed.
+    """
+
+def latest_steady(
+    stamps_ns: _Indices,
+    gyro_radps: _Reals,
+    accel_mps2: _Reals,
+    first_ns: int,
+    until_ns: int,
+    window_ns: int,
+    limits: tuple[float, float, float, float, float],
+) -> int:
+    """End of the latest steady window that begins at first_ns or later; a stamp before first_ns where there is none."""
+
+def compose_pose(
+    map_from_body: _Reals, covariance: _Reals, body_from_next: _Reals, cov_step: _Reals
+) -> tuple[_Reals, _Reals]:
+    """map_from_next (4, 4) and its covariance (6, 6), see `pose_covariance.compose_cov`."""
+
+# --- tracks of points through cameras: views (n,) of odom_from_cam (M, 4, 4), pixels (n, 3) u_left v u_right, NaN none; lens (4,) ---
+
+def triangulate(
+    odom_from_cam: _Reals,
+    views: _Indices,
+    pixels: _Reals,
+    lens: _Reals,
+    pixel_weight: float,
+    disparity_weight: float,
+    start: _Reals,
+) -> _Reals:
+    """The point (3,) of one track by least squares from a start (3,); NaN where it does not settle in front of every camera."""
+
+def linearise_track(
+    point: _Reals,
+    odom_from_cam: _Reals,
+    views: _Indices,
+    pixels: _Reals,
+    lens: _Reals,
+    pixel_weight: float,
+    disparity_weight: float,
+) -> _Reals:
+    """(R, 3 + 6 n + 6) weighted rows of one track: derivatives by point, bodies, disparity's errors and slips; last the residual."""
+
+def share_that_passes(limit: float, mean_square: float) -> float:
+    """Of a normal error's variance, what is left among those whose square stays below the limit."""
+
+class Filter:
+    """The right-invariant multi-state constraint filter. Errors: rotation, velocity, position, biases of gyro and accelerometer, time
+    offset, then rotation and position of each clone; in true_error_cov four considered ones come first.
+
+    true = Exp(error) * estimate, in `odom` axes. A clone_id that is not held is a ValueError.
+    """
+
+    def __init__(
+        self,
+        rotation: _Reals,
+        velocity: _Reals,
+        position: _Reals,
+        gyro_bias: _Reals,
+        accel_bias: _Reals,
+        nav_covariance: _Reals,
+        nav_true_error: _Reals,
+        lens: _Reals,
+        body_from_cam: _Reals,
+        settings: object,
+        gate_quantile: float,
+        gravity_mps2: float,
+    ) -> None:
+        """Covariances (15, 15). settings has the fields of FilterSettings; gate_quantile: the normal distribution's, at the gate."""
+
+    def predict_inertial(
+        self,
+        stamps_ns: _Indices,
+        gyro_radps: _Reals,
+        accel_mps2: _Reals,
+        start_ns: int,
+        end_ns: int,
+        noise: tuple[float, float, float, float],
+        true_noise: tuple[float, float, float, float],
+    ) -> _Reals:
+        """Moves the state through inertial samples; the last angular rate (3,), bias removed. noise weighs, true_noise is real."""
+
+    def predict_random_walk(
+        self,
+        body_from_next: _Reals,
+        rotation_sigma_rad: float,
+        translation_sigma_m: float,
+        duration_s: float = 0.0,
+        measured_cov: _Reals | None = None,
+    ) -> None:
+        """Moves the state by a relative transform that is known only to the sigmas.
+
+        measured_cov (6, 6), in the next body's axes, rotation first, is added information where it is given.
+        """
+
+    def add_clone(self, clone_id: int, rate_body_radps: _Reals) -> None:
+        """Keeps the current body transform in the window; the rate ties it to the time offset."""
+
+    def remove_clone(self, clone_id: int) -> None:
+        """Forgets a clone (marginalises it)."""
+
+    def return_to_clone(self, clone_id: int) -> None:
+        """Takes rotation and position of the state back to a clone's, as certain as that is."""
+
+    def begin_frame_anew(self) -> _Reals:
+        """new_odom_from_old_odom (4, 4): the frame now begins at the newest clone, and errors count from there.
+
+        Motions between clones, and what is known of them, stay. Velocity and biases must be idle.
+        """
+
+    def update_by_tracks(
+        self,
+        starts: _Indices,
+        clone_ids: _Indices,
+        pixels: _Reals,
+        anchors: _Indices,
+        points_cam: _Reals,
+        iterations: int,
+        newest_odom_from_body: _Reals | None,
+        sigma_scale: float,
+    ) -> NDArray[np.int8]:
+        """See `InvariantFilter.update`; starts (T + 1,) delimits each track's rows of clone_ids and pixels."""
+
+    def correct_by_wheels(
+        self,
+        velocity_base_mps: _Reals,
+        yaw_rate_radps: float,
+        sigma_mps: float,
+        sigma_radps: float,
+        gyro_radps: _Reals,
+        base_from_body: _Reals,
+        gate: float,
+    ) -> float:
+        """Corrects by forward speed, none sideways and upwards, and yaw rate; squared Mahalanobis distance by true_error_cov.
+
+        Nothing is changed where that exceeds the gate.
+        """
+
+    def correct_by_rest(self, gyro_mean_radps: _Reals, gyro_sigma_radps: float, gate: float) -> float:
+        """Corrects by standing still: the gyro shows its bias alone. Otherwise as correct_by_wheels."""
+
+    def inflate(self, clone_id: int, seen_odom_from_body: _Reals, gap_s: float) -> bool:
+        """Inflates position and velocity where vision contradicts the prediction since a clone; True where it did.
+
+        To be called before the clone of this moment is added.
+        """
+
+    def inflate_velocity(self, sigma_mps: float) -> None:
+        """Adds the variance of an unknown change of velocity."""
+
+    def motion_between(self, earlier_id: int, later_id: int) -> _Reals:
+        """earlier_from_later (4, 4) between two clones."""
+
+    def body_since(self, clone_id: int) -> _Reals:
+        """earlier_from_now (4, 4) between a clone and the newest one."""
+
+    def motion_since(self, clone_id: int) -> tuple[_Reals, _Reals]:
+        """As body_since, and its covariance (6, 6), of a left perturbation in axes of the earlier body."""
+
+    def cam_from_earlier(self, clone_id: int, cam_from_body: _Reals) -> _Reals:
+        """(4, 4) from a clone's camera to that of the state."""
+
+    def odom_from_clone(self, clone_id: int) -> _Reals:
+        """(4, 4) odom_from_body of a clone."""
+
+    def odom_from_body(self) -> _Reals:
+        """(4, 4) of the state."""
+
+    def body_covariance(self) -> _Reals:
+        """cov_rot_trans (6, 6) of odom_from_body: rotation error in odom axes, then position error."""
+
+    def nav_state(self) -> tuple[_Reals, _Reals, _Reals, _Reals, _Reals]:
+        """Rotation, velocity, position, gyro bias, accelerometer bias."""
+
+    @property
+    def clone_ids(self) -> list[int]:
+        """Oldest first."""
+
+    @property
+    def covariance(self) -> _Reals:
+        """What weighs and gates measurements; a copy."""
+
+    @property
+    def true_error_cov(self) -> _Reals:
+        """That of the true error; a copy."""
+
+    @property
+    def offset_sigma_s(self) -> float:
+        """Standard deviation of the time offset's true error."""
+    imu_minus_cam_s: float
+
 # --- the simulator's pictures (render.h), and rays against boxes (rays.h) ---
 
 class ScenePainter:

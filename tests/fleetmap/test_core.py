@@ -15,6 +15,10 @@ from hypothesis.extra.numpy import arrays
 
 from fleetmap import _core, core  # type: ignore[attr-defined]
 from fleetmap.geometry import Array
+from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.settings import FilterSettings
+from fleetmap.sensors.rectification import StereoCamera
 from support.fleet.contracts_documents import text
 
 MODULE = ast.parse(text("shared/fleetmap/_core.pyi")).body
@@ -60,14 +64,15 @@ def compiled(name: str) -> tuple[list[tuple[str, str]], str]:
     found = re.fullmatch(rf"{name.rpartition('.')[2]}\((?:self(?:, )?)?(.*)\) -> (.*)", signature.splitlines()[0])
     assert found, signature
     arguments = [part.split(": ", 1) for part in re.split(r", (?=\w+: )", found[1]) if part]
-    return [(argument, kind) for argument, kind in arguments], found[2]
+    return [(argument, kind.partition(" = ")[0]) for argument, kind in arguments], found[2]
 
 
 def test_the_stub_names_everything() -> None:
     functions = {name for name in STUB if "." not in name}
     assert functions | set(CLASSES) | CONSTANTS == {name for name in dir(_core) if not name.startswith("_")}
     for name, held in CLASSES.items():
-        members = {method.name for method in held.body if isinstance(method, ast.FunctionDef)} - {"__init__"}
+        members = {member.name for member in held.body if isinstance(member, ast.FunctionDef)} - {"__init__"}
+        members |= {ast.unparse(member.target) for member in held.body if isinstance(member, ast.AnnAssign)}
         assert members == {member for member in dir(getattr(_core, name)) if not member.startswith("_")}
 
 
@@ -101,6 +106,10 @@ PATCHES = (IMAGE, IMAGE, IMAGE), PLACES, OCTAVES
 PAIRED = PLACES[:3], OCTAVES[:3], WORDS, PLACES[:3], np.ones((3, 3)), True
 GUIDANCE = np.ones(4), (30.0, 20.0), 1.5, (4.0, 11.0, (10, 5)), 60
 CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
+POSES, ONE = np.tile(np.eye(4), (2, 1, 1)), np.zeros(1, np.int64)
+FILTER = InvariantFilter(
+    NavState(), np.eye(15), FilterSettings(), StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4)
+)
 
 
 @pytest.mark.parametrize(
@@ -150,6 +159,20 @@ CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
         (lambda: core.join_tracks(NUMBERS, NUMBERS - 1, NUMBERS), "first, second"),
         (lambda: core.join_tracks(NUMBERS, NUMBERS, NUMBERS + 3), "keyframes"),
         (lambda: core.imu_intervals(STAMPS, SAMPLES, SAMPLES[:2], 0, 9), "accel_mps2"),
+        (lambda: core.drop_spikes(STAMPS, SAMPLES, SAMPLES, 4), "known"),
+        (lambda: core.drop_spikes(STAMPS, SAMPLES, SAMPLES[:2], 0), "accel_mps2"),
+        (lambda: core.is_steady(SAMPLES, SAMPLES[:2], (1.0,) * 5), "accel_mps2"),
+        (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 9, 3, (1.0,) * 5), "window_ns"),
+        (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 2**40, 9, (1.0,) * 5), "window_ns"),
+        (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 2**62, 9, (1.0,) * 5), "until_ns"),
+        (lambda: core.triangulate(POSES, np.arange(3), SAMPLES, np.ones(4), 1.0, 1.0, ZERO), "views"),
+        (lambda: core.triangulate(POSES, np.arange(2), SAMPLES, np.ones(4), 1.0, 1.0, ZERO), "pixels"),
+        (lambda: FILTER.odom_from_clone(1), "clone_id"),
+        (FILTER.begin_frame_anew, "a clone is needed"),
+        (lambda: FILTER.update_by_tracks(np.array([0, 4]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 1, None, 1.0), "starts"),
+        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 0, None, 1.0), "iterations"),
+        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 1, None, 1.0), "clone_id"),
+        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES[:2], ONE, SAMPLES[:1], 1, None, 1.0), "pixels"),
         (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
     ],
 )  # fmt: skip
@@ -235,7 +258,28 @@ def test_absurd_stamps_of_samples_give_values(stamps: list[int], start_ns: int, 
     start_ns, end_ns = min(start_ns, end_ns), max(start_ns, end_ns)
     imu = np.array(stamps, np.int64), np.full((len(stamps), 3), np.nan), np.full((len(stamps), 3), np.inf)
     assert len(core.imu_intervals(*imu, start_ns, end_ns)) == 3
+    assert core.longest_gap_ns(imu[0], start_ns, end_ns) is not None
+    assert core.drop_spikes(*(rows.copy() for rows in imu), len(stamps) // 2) >= len(stamps) // 2
     assert core.preintegrate(*imu, start_ns, end_ns, ZERO, ZERO, (1.0, np.nan, np.inf, -1.0))[0].shape == (3, 3)
+
+
+HOSTILE_NUMBERS = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e300, np.inf, np.nan, 320.0])
+
+
+@given(arrays(np.float64, (6, 3), elements=HOSTILE_NUMBERS), st.lists(st.integers(0, 2), min_size=6, max_size=6))
+def test_no_number_of_a_track_or_sample_harms_the_filter(numbers: Array, seen: list[int]) -> None:
+    window = InvariantFilter(
+        NavState(), np.eye(15), FilterSettings(), StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4)
+    )
+    for clone in range(3):
+        window.add_clone(clone, numbers[clone])
+        window.predict_random_walk(np.eye(4), *numbers[0])
+    tracks = np.array([0, 1, 3, 6]), np.array(seen), numbers, np.arange(3), numbers[:3].copy()
+    assert len(window.update_by_tracks(*tracks, 2, np.eye(4), 1.0)) == 3
+    window.predict_inertial(np.arange(6), numbers, numbers, 0, 9, (1.0, np.nan, np.inf, 0.0), (0.0,) * 4)
+    window.correct_by_wheels(numbers[0], 1.0, 1.0, 0.0, numbers[1], np.eye(4), 10.0)
+    window.correct_by_rest(numbers[0], 0.0, np.inf)
+    assert window.motion_since(0)[1].shape == (6, 6)
 
 
 @pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])

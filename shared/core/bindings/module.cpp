@@ -14,6 +14,8 @@ void bind_corners(nb::module_&);
 void bind_surfels(nb::module_&);
 void bind_flow(nb::module_&);
 void bind_grid(nb::module_&);
+void bind_filter(nb::module_&);
+void bind_imu_checks(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
@@ -48,8 +50,11 @@ NB_MODULE(_core, module) {
   bind_block_cholesky(module);
   bind_bundle(module);
   bind_calibration(module);
+  nb::set_leak_warnings(false);  // a process that ends while it holds a filter has no fault to report
   bind_corners(module);
   bind_flow(module);
+  bind_filter(module);
+  bind_imu_checks(module);
   bind_matching(module);
   bind_pair_matching(module);
   bind_patch_align(module);

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap.core import longest_gap_ns
 from fleetmap.geometry import Array, so3_log
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
-from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.sensors.samples import ImuSamples
 
 _STEP_S, _STEPS = 0.01, 30

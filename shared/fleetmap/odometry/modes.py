@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.core import longest_gap_ns
 from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.msckf import wheel_odometry, zero_velocity
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
@@ -18,7 +18,6 @@ from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause
-from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import PAUSE_NS, Trajectory
@@ -151,9 +150,9 @@ class WindowMode(Mode):
             frame_index=frame_index,
             odom_from_body=state.odom_from_body,
             cov_rot_trans=window_filter.body_covariance(),
-            velocity_odom_mps=state.velocity_mps.copy(),
-            gyro_bias_radps=state.gyro_bias_radps.copy(),
-            accel_bias_mps2=state.accel_bias_mps2.copy(),
+            velocity_odom_mps=state.velocity_mps,
+            gyro_bias_radps=state.gyro_bias_radps,
+            accel_bias_mps2=state.accel_bias_mps2,
             status=status,
             track_ids=tracked.ids,
             scene_depth_m=self.window.scene_depth_m,
@@ -209,7 +208,7 @@ class VisualMode(WindowMode):
             self._cam_from_previous = tracked.cam_from_previous
         elif (seen := window.matched_body(tracked)) is not None:
             cam_from_odom = rig.cam_from_body @ se3_inverse(seen[1])
-            self._cam_from_previous = cam_from_odom @ window.filter.state.odom_from_body @ rig.body_from_cam
+            self._cam_from_previous = cam_from_odom @ window.filter.odom_from_body() @ rig.body_from_cam
         body_from_next = rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ rig.cam_from_body
         duration_s = window.seconds_since(window.filter.clone_ids[-1])
         sigmas = self._rotation_sigma_rad(body_from_next, duration_s), settings.free_translation_sigma_m
@@ -306,7 +305,7 @@ class StartingMode(GyroMode):
         step = VisualMode.process(self, frame_index, tracked)
         if self._show(self._imu, self.stamp_ns, tracked):
             return step._replace(mode=_without_fault(self.window, self._imu, self._cam_from_previous))
-        stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.state.odom_from_body
+        stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.odom_from_body()
         if tracked.lost:
             self._trajectory.clear()
         self._trajectory.append((stamp_ns, old_odom_from_body))
@@ -316,7 +315,7 @@ class StartingMode(GyroMode):
         mode = InertialMode.started(self.window, self._imu, start)
         mode.predict(stamp_ns)
         mode.window.seed(frame_index, tracked)
-        change = np.asarray(mode.window.filter.state.odom_from_body @ se3_inverse(old_odom_from_body))
+        change = np.asarray(mode.window.filter.odom_from_body() @ se3_inverse(old_odom_from_body))
         begun = step.new_odom_from_old_odom
         return Step(mode, step.used, change if begun is None else change @ begun)
 
@@ -373,7 +372,7 @@ class InertialMode(WindowMode):
         settings, self._imu = self._rig.settings.filter, imu
         self._zero_velocity = ZeroVelocityDetector(settings.still_window_s, settings.still_flow_px)
         self._frame_ns = window.stamp_ns
-        self._last_odom_from_body = window.filter.state.odom_from_body  # at the frame before
+        self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
         self._seen: Array | None = None  # the last motion that images showed
         self._is_pause = False
 
@@ -384,7 +383,7 @@ class InertialMode(WindowMode):
 
     def predict(self, stamp_ns: int) -> None:
         window, imu = self.window, self._imu
-        self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.state.odom_from_body
+        self._frame_ns, self._last_odom_from_body = stamp_ns, window.filter.odom_from_body()
         end_ns = stamp_ns + int(window.filter.imu_minus_cam_s * 1e9)
         if is_pause(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns):
             self._is_pause, self.rotation_sigma_rad = True, None
@@ -419,8 +418,7 @@ class InertialMode(WindowMode):
         self._update_zero_velocity(tracked)
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
         if wheel is not None:
-            by_wheels = wheel_odometry(window.filter.state, *wheel, self._rig.base_from_body, self._rig.settings.filter)
-            window.filter.correct_with(by_wheels, gate=_GATE_4)
+            window.filter.correct_by_wheel_sample(*wheel, self._rig.base_from_body, _GATE_4)
         used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, self.cam_from_earlier(frame_index - 1), seen):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
@@ -455,9 +453,7 @@ class InertialMode(WindowMode):
             return
         duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
-        state, gyro_radps = self.window.filter.state, since.gyro_radps.mean(axis=0)
-        at_rest = zero_velocity(state, gyro_radps, float(sigma_radps), self._rig.settings.filter)
-        self.window.filter.correct_with(at_rest, gate=_GATE_6)
+        self.window.filter.correct_by_rest(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
         """Without the accelerometer from where the last frame was, until gravity is known anew.

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.inertial import preintegrate
-from fleetmap.odometry import sensor_kernels
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, ImuSamples, Stamps, WheelSample
 
@@ -17,7 +17,7 @@ _FOR_EVER_NS = 1 << 62
 
 def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
     """True if no motion is carried from one moment to another, both on the IMU's clock: samples that are all there carry it longer."""
-    is_missing = sensor_kernels.longest_gap_ns(imu_stamps_ns, start_ns, end_ns) > IMU_GAP_NS
+    is_missing = core.longest_gap_ns(imu_stamps_ns, start_ns, end_ns) > IMU_GAP_NS
     return end_ns - start_ns > (PAUSE_NS if is_missing else INTEGRATED_NS)
 
 
@@ -47,7 +47,7 @@ class SensorBuffer:
             stamps_ns = np.concatenate([part.stamps_ns for part in parts])
             gyro_radps = np.concatenate([part.gyro_radps for part in parts])
             accel_mps2 = np.concatenate([part.accel_mps2 for part in parts])
-            end = sensor_kernels.drop_spikes(stamps_ns, gyro_radps, accel_mps2, len(self.imu))
+            end = core.drop_spikes(stamps_ns, gyro_radps, accel_mps2, len(self.imu))
             self.imu = ImuSamples(stamps_ns[:end], gyro_radps[:end], accel_mps2[:end])
             self._pending.clear()
         oldest = needed_from_ns - int(memory_s * 1e9)
@@ -59,7 +59,7 @@ class SensorBuffer:
 
     def rotation_between(self, start_ns: int, end_ns: int, noise: ImuNoise) -> Array | None:
         """earlier_from_later (3, 3) of the body by the gyro, its bias included; None where samples are missing."""
-        if sensor_kernels.longest_gap_ns(self.imu.stamps_ns, start_ns, end_ns) > IMU_GAP_NS:
+        if core.longest_gap_ns(self.imu.stamps_ns, start_ns, end_ns) > IMU_GAP_NS:
             return None
         return preintegrate(self.imu, start_ns, end_ns, np.zeros(3), np.zeros(3), noise).delta_rotation
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import consistency, estimator_loop
+from fleetmap.geometry import se3
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import FilterSettings
@@ -93,8 +94,10 @@ def test_over_a_gap_of_the_imu_a_corrected_estimate_is_no_speed(site: consistenc
     mode = odometry._mode
     assert isinstance(mode, InertialMode)
     before = mode._seen
-    mode.window.filter.state.position_m += 0.5
-    mode.window.filter._positions[-1] += 0.5
+    off = se3(np.eye(3), mode.window.filter.state.rotation.T @ np.full(3, 0.5))
+    mode.window.filter.predict_random_walk(off, 1e-6, 1e-6)
+    mode.window.filter.remove_clone(last)
+    mode.window.filter.add_clone(last, np.zeros(3))
     mode.predict(session.stamps_ns[last + 1] + int(nominal.cameras[0].imu_minus_cam_s * 1e9))
     predicted = mode.cam_from_earlier(last)
     assert before is not None

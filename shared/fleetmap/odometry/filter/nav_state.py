@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleetmap.geometry import Array, se3
-from fleetmap.odometry.filter.state_kernels import State
 
 
 @dataclass
@@ -24,9 +23,9 @@ class NavState:
         return se3(self.rotation, self.position_m)
 
     @property
-    def arrays(self) -> State:
-        """As kernels take it, and change it in place."""
-        return State(self.rotation, self.velocity_mps, self.position_m, self.gyro_bias_radps, self.accel_bias_mps2)
+    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
+        """In this order."""
+        return self.rotation, self.velocity_mps, self.position_m, self.gyro_bias_radps, self.accel_bias_mps2
 
     def copy(self) -> "NavState":
         """One that shares no array with this one."""

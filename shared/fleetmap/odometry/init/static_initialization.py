@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array, rotation_between_vectors
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
-from fleetmap.odometry.init import static_initialization_kernels
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings, StartSettings
 from fleetmap.sensors.samples import ImuSamples
 
@@ -21,7 +21,7 @@ def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySett
     if not len(imu):
         return None
     first_ns = max(int(imu.stamps_ns[0]), until_ns - int(_MAX_LOOK_BACK_S * 1e9))
-    end_ns = static_initialization_kernels.latest_steady(
+    end_ns = core.latest_steady(
         imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, first_ns, until_ns, window_ns, _limits(settings.start)
     )
     if end_ns < first_ns:
@@ -34,7 +34,7 @@ def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
 
     Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
     """
-    return static_initialization_kernels.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
+    return core.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
 
 
 def polynomial_rate(samples: Sequence[tuple[int, Array]], degree: int) -> Array | None:
@@ -49,9 +49,10 @@ def polynomial_rate(samples: Sequence[tuple[int, Array]], degree: int) -> Array 
     return np.asarray(degree * fitted[degree], np.float64)
 
 
-def _limits(settings: StartSettings) -> Array:
+def _limits(settings: StartSettings) -> tuple[float, float, float, float, float]:
+    """As the core takes them."""
     spreads = settings.steady_gyro_sigma_radps, settings.steady_accel_sigma_mps2
-    return np.array([*spreads, settings.steady_gyro_mean_radps, GRAVITY_MPS2, settings.max_gravity_error_mps2])
+    return *spreads, settings.steady_gyro_mean_radps, GRAVITY_MPS2, settings.max_gravity_error_mps2
 
 
 def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -> InitialState:

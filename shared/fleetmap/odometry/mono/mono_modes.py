@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter import msckf_kernels
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
@@ -65,9 +65,7 @@ class MonocularWindow(SlidingWindow):
         camera, settings = self.rig.camera, self.rig.settings
         lens = camera.lens
         odom_from_cam = np.array([self.filter.odom_from_clone(c) for c in held]) @ self.rig.body_from_cam
-        rotations = np.ascontiguousarray(odom_from_cam[:, :3, :3])
-        positions = np.ascontiguousarray(odom_from_cam[:, :3, 3])
-        weights = np.array([1.0 / settings.filter.pixel_sigma_px, 1.0])
+        rotations, positions = odom_from_cam[:, :3, :3], odom_from_cam[:, :3, 3]
         max_cosine = np.cos(np.radians(settings.monocular.point_angle_deg))
         for n, track_id in enumerate(ids.tolist()):
             seen = [(held[c], p) for c, p in self._sightings.get(track_id, []) if c in held]
@@ -79,8 +77,9 @@ class MonocularWindow(SlidingWindow):
             if (rotations[views[0]] @ rays[0]) @ (rotations[views[-1]] @ rays[1]) > max_cosine:
                 continue
             point = positions[views[-1]] + self.scene_depth_m * rotations[views[-1]] @ rays[1]
-            if msckf_kernels.triangulate(rotations, positions, views, pixels, lens, weights, point):
-                out[n] = point
+            out[n] = core.triangulate(
+                odom_from_cam, views, pixels, lens, 1.0 / settings.filter.pixel_sigma_px, 1.0, point
+            )
         points = transform_points(se3_inverse(odom_from_cam[-1]), out)
         with np.errstate(invalid="ignore"):
             known = (points[:, 2] > 0) & (points[:, 2] < _FAR_M)
@@ -270,7 +269,7 @@ class MonocularMode(Mode):
         """
         mode.predict(self._stamp_ns)
         mode.window.seed(frame_index, tracked)
-        here, newest = mode.window.filter.state.odom_from_body, self._unscaled[-1].vision_from_cam
+        here, newest = mode.window.filter.odom_from_body(), self._unscaled[-1].vision_from_cam
         revised: list[tuple[int, Array]] = []
         for number, seen_ns, there in self._unscaled[:-1]:
             if metres_per_unit is None:

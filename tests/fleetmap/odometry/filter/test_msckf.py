@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
-from fleetmap.odometry.filter.msckf import InvariantFilter, wheel_odometry, zero_velocity
+from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, skew, so3_exp
+from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample
-from support.worlds.inertial_motion import analytic_motion
+from support.worlds.inertial_motion import analytic_motion, sample_motion
 from support.worlds.point_world import (
     BODY_FROM_CAM,
     CAMERA,
@@ -247,20 +248,89 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     error = np.concatenate([np.zeros(3), 0.02 * np.array([1.0, -2.0, 1.5]), np.zeros(9)])
     covariance = np.diag(np.repeat([1e-9, 0.05, 1e-9, 1e-9, 1e-9], 3) ** 2)
     estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERA, BODY_FROM_CAM)
-    rolled = wheel_odometry(estimate.state, sample, motion.gyro_radps, base_from_body, settings)
-    assert estimate.correct_with(rolled, gate=100.0) < 100.0
+    assert estimate.correct_by_wheel_sample(sample, motion.gyro_radps, base_from_body, 100.0) < 100.0
     np.testing.assert_allclose(estimate.state.velocity_mps, truth.velocity_mps, atol=1e-4)
     slipped = WheelSample(0, 1.6 * sample.velocity_base_mps, sample.yaw_rate_radps, 1e-4, 1e-4)
     before = estimate.covariance.copy()
-    rolled = wheel_odometry(estimate.state, slipped, motion.gyro_radps, base_from_body, settings)
-    assert estimate.correct_with(rolled, gate=100.0) > 100.0
+    assert estimate.correct_by_wheel_sample(slipped, motion.gyro_radps, base_from_body, 100.0) > 100.0
     np.testing.assert_array_equal(estimate.covariance, before)
     standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
     estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
-    still = zero_velocity(estimate.state, np.array([0.004, 0.0, -0.003]), 1e-5, SETTINGS)
-    assert estimate.correct_with(still, gate=22.0) < 22.0
+    assert estimate.correct_by_rest(np.array([0.004, 0.0, -0.003]), 1e-5, 22.0) < 22.0
     assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
     np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)
+
+
+def some_filter(rng: np.random.Generator, settings: FilterSettings = SETTINGS) -> InvariantFilter:
+    """With covariances that have no zeros, and three clones of which one is gone."""
+    roots = START_SIGMAS[:, None] * rng.normal(size=(2, 15, 15))
+    covariance, true_error_cov = (np.asarray(root @ root.T) for root in roots)
+    estimate = InvariantFilter(true_state(0.5), covariance, settings, CAMERA, BODY_FROM_CAM, true_error_cov)
+    imu = sample_motion(rate_hz=100.0, duration_s=2.0)
+    for k in range(4):
+        rate = estimate.propagate(imu, 500_000_000 + k * 10**8, 600_000_000 + k * 10**8, NOISE)
+        estimate.add_clone(k, rate)
+    estimate.remove_clone(1)
+    return estimate
+
+
+def test_a_clone_is_the_state_moved_by_the_time_offset() -> None:
+    estimate = some_filter(np.random.default_rng(7))
+    before, rate = (estimate.covariance, estimate.true_error_cov), np.array([0.3, -0.2, 0.1])
+    state = estimate.state
+    turn = state.rotation @ rate
+    estimate.add_clone(9, rate)
+    for covariance, grown, first in zip(before, (estimate.covariance, estimate.true_error_cov), (0, 4), strict=True):
+        jacobian = np.zeros((6, len(covariance)))
+        jacobian[:3, first : first + 3] = jacobian[3:, first + 6 : first + 9] = np.eye(3)
+        jacobian[:, first + 15] = np.concatenate([turn, state.velocity_mps + np.cross(state.position_m, turn)])
+        both = np.vstack([np.eye(len(covariance)), jacobian])
+        np.testing.assert_allclose(grown, both @ covariance @ both.T, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(grown, grown.T)
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])  # of the distance at the gate
+@pytest.mark.parametrize("by", ["rest", "wheels"])
+def test_a_correction_is_kalmans_and_what_its_gate_refuses_changes_nothing(by: str, share: float) -> None:
+    """The covariance that is weighed by, and that of the true error after the same gain."""
+    rng = np.random.default_rng(8)
+    settings = replace(SETTINGS, still_sigma_mps=0.3, wheel_slip_mps=0.4)
+    estimate = some_filter(rng, settings)
+    state, white, true = estimate.state, estimate.covariance, estimate.true_error_cov
+    gyro, sigmas = rng.normal(size=3), np.array([0.2, 0.4, 0.4, 0.3])
+    if by == "rest":
+        full, sigmas, scale = np.zeros((6, len(true))), np.repeat([0.3, 0.2], 3), 1.0
+        full[:3, 4:7], full[:3, 7:10], full[3:, 13:16] = -skew(state.velocity_mps), np.eye(3), np.eye(3)
+        residual = np.concatenate([-state.velocity_mps, gyro - state.gyro_bias_radps])
+    else:
+        full, scale = np.zeros((4, len(true))), settings.wheel_sigma_scale
+        speed = state.rotation.T @ state.velocity_mps  # the base is the body
+        full[:3, 7:10], full[3, 15] = state.rotation.T, -1.0
+        full[0, 2], full[3, 3] = speed[0], gyro[2] - state.gyro_bias_radps[2]
+        residual = np.append(rng.normal(size=3) - speed, 0.7 - full[3, 3])
+        sample = WheelSample(0, residual[:3] + speed, 0.7, 0.2, 0.3)
+
+    def corrected(gate: float) -> float:
+        if by == "rest":
+            return estimate.correct_by_rest(gyro, 0.2, gate)
+        return estimate.correct_by_wheel_sample(sample, gyro, np.eye(4), gate)
+
+    noise, seen = np.diag(sigmas**2), full[:, 4:]
+    distance = residual @ np.linalg.solve(full @ true @ full.T + noise, residual)
+    assert corrected(distance / share) == pytest.approx(distance, rel=1e-8)
+    if share > 1.0:
+        np.testing.assert_array_equal(estimate.covariance, white)
+        np.testing.assert_array_equal(estimate.true_error_cov, true)
+        return
+    gain = white @ seen.T @ np.linalg.inv(seen @ white @ seen.T + scale**2 * noise)
+    left = np.eye(len(true))
+    left[4:] -= gain @ full
+    expected = left @ true @ left.T
+    expected[4:, 4:] += gain @ noise @ gain.T
+    np.testing.assert_allclose(estimate.covariance, white - gain @ seen @ white, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(estimate.true_error_cov, expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_array_equal(estimate.true_error_cov, estimate.true_error_cov.T)
+    assert estimate.state.gyro_bias_radps == pytest.approx(state.gyro_bias_radps + (gain @ residual)[9:12], rel=1e-8)
 
 
 def test_a_frame_that_begins_anew_changes_nothing_between_clones() -> None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from fleetmap.core import longest_gap_ns
 from fleetmap.odometry.sensor_buffer import SensorBuffer
-from fleetmap.odometry.sensor_kernels import longest_gap_ns
 from fleetmap.odometry.tracking.tracks import Observations
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.point_world import CAMERA

@@ -3,64 +3,60 @@
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.inertial import imu_intervals
-from fleetmap.odometry.filter import msckf_kernels, propagation_kernels
+from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, sample_motion
-from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, error_of, perturbed, true_state
+from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, SETTINGS, error_of, perturbed, true_state
 
-GRAVITY = np.array([0.0, 0.0, -9.81])
-INTRINSICS = np.array([CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px, CAMERA.focal_px * CAMERA.baseline_m])
-WEIGHTS = np.array([1 / 0.6, 1 / 0.35])
-DENSITIES = np.array(
-    [NOISE.gyro_noise_radps_rthz, NOISE.accel_noise_mps2_rthz, NOISE.gyro_walk_radps2_rthz, NOISE.accel_walk_mps3_rthz]
-)
+WEIGHTS = 1 / 0.6, 1 / 0.35
+EXACT = ImuNoise(0.0, 0.0, 0.0, 0.0)
+SPAN = 3_000_000, 503_000_000
 
 
-def moved(state: NavState, steps_s: Array, gyro: Array, accel: Array) -> tuple[NavState, Array, Array]:
-    """The state after the intervals, transition and process noise."""
-    s = state.copy()
-    phi, processes = np.empty((15, 15)), np.empty((1, 15, 15))
-    propagation_kernels.propagate(s.arrays, GRAVITY, steps_s, gyro, accel, DENSITIES[None], phi, processes)
-    return s, phi, processes[0]
+def moved(state: NavState, covariance: Array, imu: ImuSamples, noise: ImuNoise) -> InvariantFilter:
+    """A filter after half a second."""
+    estimate = InvariantFilter(state, covariance, SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate.propagate(imu, *SPAN, noise)
+    return estimate
 
 
-@pytest.fixture(scope="module")
-def intervals() -> tuple[Array, Array, Array]:
-    return imu_intervals(sample_motion(rate_hz=200.0, duration_s=1.0), 3_000_000, 503_000_000)
-
-
-def test_transition_is_the_derivative_of_the_invariant_error(intervals: tuple[Array, Array, Array]) -> None:
+def test_transition_is_the_derivative_of_the_invariant_error() -> None:
+    """The error of one number alone, and what becomes of it: its covariance is a column of the transition times itself."""
+    imu, nothing = sample_motion(rate_hz=200.0, duration_s=1.0), np.zeros((15, 15))
     truth = true_state(0.003, np.array([0.02, -0.01, 0.03]), np.array([0.1, 0.2, -0.1]))
-    end, phi, _ = moved(truth, *intervals)
-    step = 1e-5
-    for k in range(15):
-        error = step * np.eye(15)[k]
-        sides = [moved(perturbed(truth, so3_exp(sign * error[:3]), sign * error), *intervals)[0] for sign in (1, -1)]
-        numeric = (error_of(sides[0], end) - error_of(sides[1], end)) / (2 * step)
-        np.testing.assert_allclose(phi[:, k], numeric, atol=2e-4 if k >= 9 else 1e-8, err_msg=f"column {k}")
+    end, step = moved(truth, nothing, imu, EXACT).state, 1e-5
+    for k, unit in enumerate(np.eye(15)):
+        sides = [perturbed(truth, so3_exp(sign * step * unit[:3]), sign * step * unit) for sign in (1, -1)]
+        plus, minus = (error_of(moved(side, nothing, imu, EXACT).state, end) for side in sides)
+        numeric = (plus - minus) / (2 * step)
+        found = moved(truth, np.outer(unit, unit), imu, EXACT).covariance[:15, :15]
+        accuracy = 2e-4 if k >= 9 else 1e-8
+        np.testing.assert_allclose(found, np.outer(numeric, numeric), atol=accuracy, err_msg=f"column {k}")
 
 
-def test_process_noise_is_the_scatter_of_noisy_runs(intervals: tuple[Array, Array, Array]) -> None:
+def test_process_noise_is_the_scatter_of_noisy_runs() -> None:
     """Mean normalised error squared of 300 runs and 15 dof: 1 within 0.065 at three sigmas."""
-    rng = np.random.default_rng(5)
-    steps_s, gyro, accel = (a[:40] for a in intervals)
-    start = true_state(0.003)
-    clean, _, process = moved(start, steps_s, gyro, accel)
-    inverse = np.linalg.inv(process)
-    root = np.sqrt(steps_s)[:, None]
-    total = 0.0
+    rng, rate_hz = np.random.default_rng(5), 200.0
+    imu, start = sample_motion(rate_hz=rate_hz, duration_s=1.0), true_state(0.003)
+    clean = moved(start, np.zeros((15, 15)), imu, NOISE)
+    inverse, first, end = np.linalg.inv(clean.covariance[:15, :15]), *np.searchsorted(imu.stamps_ns, SPAN)
+    total, shape = 0.0, imu.gyro_radps.shape
     for _ in range(300):
-        white = [rng.normal(size=gyro.shape) for _ in range(4)]
-        walks = [np.cumsum(density * root * w, axis=0) for density, w in zip(DENSITIES[2:], white[2:], strict=True)]
-        noisy_gyro = gyro + DENSITIES[0] / root * white[0] + np.vstack([np.zeros(3), walks[0][:-1]])
-        noisy_accel = accel + DENSITIES[1] / root * white[1] + np.vstack([np.zeros(3), walks[1][:-1]])
-        state, _, _ = moved(start, steps_s, noisy_gyro, noisy_accel)
-        truth = NavState(clean.rotation, clean.velocity_mps, clean.position_m, walks[0][-1], walks[1][-1])
+        white = np.sqrt(rate_hz) * rng.normal(size=(2, *shape))
+        walks = np.cumsum(rng.normal(size=(2, *shape)) / np.sqrt(rate_hz), axis=1)
+        walks -= walks[:, first, None]
+        gyro_walk, accel_walk = NOISE.gyro_walk_radps2_rthz * walks[0], NOISE.accel_walk_mps3_rthz * walks[1]
+        gyro = imu.gyro_radps + NOISE.gyro_noise_radps_rthz * white[0] + gyro_walk
+        accel = imu.accel_mps2 + NOISE.accel_noise_mps2_rthz * white[1] + accel_walk
+        state = moved(start, np.zeros((15, 15)), ImuSamples(imu.stamps_ns, gyro, accel), NOISE).state
+        motion = clean.state.arrays[:3]
         # here the samples' true biases walked away from the state's, which stayed at zero
-        error = error_of(state, truth)
+        error = error_of(state, NavState(*motion, gyro_walk[end - 1], accel_walk[end - 1]))
         total += error @ inverse @ error / 15
     assert 0.9 < total / 300 < 1.1
 
@@ -77,13 +73,9 @@ def test_track_jacobians_are_numeric_derivatives(with_mono: bool) -> None:
         pixels = np.tile([300.0, 200.0, 280.0], (3, 1))
         if with_mono:
             pixels[1, 2] = np.nan
-        by_clone, by_point, residual = np.zeros((9, 18)), np.zeros((9, 3)), np.zeros(9)
-        rows = msckf_kernels.linearize_track(
-            at, np.ascontiguousarray(cams[:, :3, :3]), np.ascontiguousarray(cams[:, :3, 3]), clones, pixels,
-            INTRINSICS, WEIGHTS, by_clone, by_point, residual,
-        )  # fmt: skip
-        assert rows == (8 if with_mono else 9)
-        return residual, by_clone, by_point
+        rows = core.linearise_track(at, cams, clones, pixels, CAMERA.lens, *WEIGHTS)
+        assert len(rows) == (8 if with_mono else 9)
+        return rows[:, -1], rows[:, 3:21], rows[:, :3]
 
     _, by_clone, by_point = residuals(bodies, point)
     step = 1e-6
@@ -105,18 +97,17 @@ def test_track_jacobians_are_numeric_derivatives(with_mono: bool) -> None:
 def test_error_sources_are_what_they_do_to_pixels() -> None:
     """Columns times an error against what the error makes of the whitened rows, a monocular view among them."""
     exact = np.array([[300.0, 200.0, 280.0], [310.0, 204.0, np.nan], [330.0, 190.0, 306.0]])
-    disparities = np.array([20.0, 22.0, 24.0])
-    columns = np.zeros((9, 5))
-    msckf_kernels.add_error_sources(exact, disparities, WEIGHTS, columns)
-    errors = np.array([0.3, 0.02, 0.05, -0.03, -0.4])
-    rows = []
-    for pixel, disparity in zip(exact, disparities, strict=True):
+    cams, point = np.tile(np.eye(4), (3, 1, 1)), np.array([0.1, 0.2, 1.5])
+    cams[:, 2, 3] = 0.0, 0.1, 0.2
+    rows = core.linearise_track(point, cams, np.arange(3), exact, CAMERA.lens, *WEIGHTS)
+    errors, expected = np.array([0.3, 0.02, 0.05, -0.03, -0.4]), []
+    for pixel, disparity in zip(exact, CAMERA.lens[3] / (point[2] - cams[:, 2, 3]), strict=True):
         way = pixel[:2] - exact[0, :2]
         slipped = errors[2] * way + errors[3] * np.array([-way[1], way[0]])
-        rows += list(slipped * WEIGHTS[0])
+        expected += list(slipped * WEIGHTS[0])
         if np.isfinite(pixel[2]):
-            rows.append((errors[0] + errors[1] * disparity + errors[4]) * WEIGHTS[1])
-    np.testing.assert_allclose(columns[:8] @ errors, rows)
+            expected.append((errors[0] + errors[1] * disparity + errors[4]) * WEIGHTS[1])
+    np.testing.assert_allclose(rows[:, 21:26] @ errors, expected)
 
 
 def test_triangulation_finds_the_point_from_a_poor_start() -> None:
@@ -129,10 +120,7 @@ def test_triangulation_finds_the_point_from_a_poor_start() -> None:
         if mono:
             given[:, 2] = np.nan
         found = cams[0, :3, 3] + cams[0, :3, :3] @ np.array([0.25, -0.15, 2.5])
-        assert msckf_kernels.triangulate(
-            np.ascontiguousarray(cams[:, :3, :3]), np.ascontiguousarray(cams[:, :3, 3]), np.arange(3), given, INTRINSICS,
-            WEIGHTS, found,
-        )  # fmt: skip
+        found = core.triangulate(cams, np.arange(3), given, CAMERA.lens, *WEIGHTS, found)
         np.testing.assert_allclose(found, target, atol=1e-3)
 
 
@@ -154,4 +142,4 @@ def test_what_passes_a_gate_is_a_truncated_normal(sigma: float) -> None:
     x = np.linspace(-edge, edge, 200_001)
     density = np.exp(-0.5 * (x / sigma) ** 2)
     left = (x**2 * density).sum() / density.sum() / sigma**2
-    np.testing.assert_allclose(msckf_kernels.share_that_passes(edge**2, sigma**2), left, rtol=1e-3)
+    np.testing.assert_allclose(core.share_that_passes(edge**2, sigma**2), left, rtol=1e-3)

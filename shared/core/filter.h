@@ -1,0 +1,138 @@
+// The right-invariant multi-state constraint filter: a state that inertial samples move, a window of past bodies (clones), and two
+// covariances of both. Source: Mourikis and Roumeliotis 2007 for the filter, Barrau and Bonnabel 2017 for the error, which
+// track_constraints.h states.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "dense.h"
+#include "lie.h"
+#include "preintegration.h"
+#include "track_constraints.h"
+
+namespace fleetmap {
+
+// In `odom`; m, s, rad.
+struct NavState {
+  Mat3 rotation;
+  Vec3 velocity, position, gyro_bias, accel_bias;
+  SE3 body() const { return {rotation, position}; }
+};
+
+// Sigmas are those of FilterSettings in Python.
+struct FilterModel {
+  PixelModel pixels;
+  SE3 body_from_cam;
+  double gravity;  // m/s^2, downwards
+  double time_offset_sigma_s;
+  double disparity_offset_sigma_px, depth_scale_sigma, pair_memory_s;  // the pair's errors, and for how long they stay
+  double wheel_speed_scale_sigma, wheel_yaw_scale_sigma;               // of one robot's wheels
+  double wheel_slip_mps, wheel_sigma_scale;                            // sideways and upwards; factor on sigmas, for weighing
+  double still_sigma_mps;
+};
+
+// Two covariances are kept. `covariance` weighs and gates measurements: its noise is white, the same for all pixels, and wide, so that
+// errors without a model do no harm. `true_error_cov` is the covariance of the true error after the same corrections, from a full error
+// model: points that slip along their way, disparities that stay wrong, a pair that is slightly off. Only this one is reported. Its
+// first four errors are considered, never estimated: the pair's disparity offset and depth scale, the scales of the wheels' speed and
+// yaw rate. Source: covariance analysis of suboptimal filters, Maybeck 1979, chapter 6.
+class Filter {
+ public:
+  // Numbers of the errors: the state's, the clock's, then six for each clone, rotation and position.
+  static constexpr size_t kRotation = 0, kVelocity = 3, kPosition = 6, kGyroBias = 9, kAccelBias = 12, kNav = 15, kOffset = 15,
+                          kClones = 16;
+  static constexpr size_t kPair = 2, kConsidered = 4;
+
+  // nav_covariance and nav_true_error (15, 15).
+  Filter(const NavState& start, const double* nav_covariance, const double* nav_true_error, const FilterModel& model);
+
+  // Moves the state from start to end; the last angular rate, bias removed. noise weighs the prediction, true_noise is real.
+  Vec3 propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, const ImuNoise& noise, const ImuNoise& true_noise);
+
+  // Moves the state by a relative transform that is known only to the sigmas. measured (6, 6), in the next body's axes, rotation first,
+  // is added information where it is given.
+  void predict_random_walk(const SE3& body_from_next, double rotation_sigma, double translation_sigma, double duration_s,
+                           const double* measured);
+
+  // Keeps the current body in the window; its rate (rad/s) ties it to the time offset.
+  void add_clone(int64_t id, Vec3 rate_body);
+  // Forgets a clone: marginalises it.
+  void remove_clone(size_t index);
+  // Takes rotation and position of the state back to a clone's, as certain as that is; what moved them since is forgotten.
+  void return_to_clone(size_t index);
+  // The frame now begins at the newest clone, and errors count from there; where it lies in the old one. Motions between clones, and
+  // what is known of them, stay as they are. Of the frame before only that is forgotten which none of them shows: how far it may be off
+  // altogether. With the distance from its origin that grows without bound, until the motion between two clones is a difference of
+  // numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
+  Vec3 begin_frame_anew();
+
+  // Uses each track once; used (T,) as of TrackConstraints. More than one iteration relinearises (iterated Kalman filter), for large
+  // corrections; newest_odom_from_body is then where the newest clone is linearised first, when vision knows it better than the
+  // prediction. It adds no information. sigma_scale widens the noise, for matches that are less exact than flow.
+  void update(const Tracks& tracks, int iterations, const std::optional<SE3>& newest_odom_from_body, double sigma_scale, int8_t* used);
+
+  // By the motion of `base` on its wheels: forward speed, no other, and yaw rate; gyro measured at the same time. Each returns the
+  // squared Mahalanobis distance by true_error_cov; nothing is changed where that exceeds the gate.
+  double correct_by_wheels(Vec3 velocity_base, double yaw_rate, double sigma_mps, double sigma_radps, Vec3 gyro, const SE3& base_from_body,
+                           double gate);
+  // By standing still: neither speed nor turn, the gyro's mean shows its bias alone (ZUPT).
+  double correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate);
+
+  // Inflates position and velocity where vision contradicts the prediction since a clone beyond its covariance; true where it did.
+  // After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every image never recovers.
+  bool inflate(size_t index, Vec3 seen_position, double gap_s);
+  void inflate_velocity(double sigma_mps);
+
+  // earlier_from_later between two clones.
+  SE3 motion_between(size_t earlier, size_t later) const { return inverse(clones_[earlier]) * clones_[later]; }
+  // Covariance (6, 6) of the motion from a clone to the newest one, of a left perturbation in axes of the earlier body: from the joint
+  // covariance of both, so that what they share cancels.
+  void motion_covariance(size_t index, double* out) const;
+  // Covariance (6, 6) of odom_from_body: rotation error in odom axes, then position error.
+  void body_covariance(double* out) const;
+
+  const std::vector<int64_t>& clone_ids() const { return clone_ids_; }
+  const SE3& clone(size_t index) const { return clones_[index]; }
+  const SE3& body_from_cam() const { return model_.body_from_cam; }
+
+  NavState state;
+  double imu_minus_cam_s = 0.0;
+  Matrix covariance, true_error_cov;
+
+ private:
+  // A covariance, and the number of the state's first error in it.
+  using Errors = std::pair<Matrix*, size_t>;
+  std::array<Errors, 2> both() { return {Errors{&covariance, 0}, Errors{&true_error_cov, kConsidered}}; }
+
+  // residual = jacobian error + noise, for the state's errors. The covariances, of uncorrelated rows: noise weighs the measurement;
+  // true_noise and by_considered, derivatives by the considered errors, go into the true error's covariance.
+  struct Measurement {
+    explicit Measurement(size_t rows)
+        : jacobian(rows, kNav), by_considered(rows, kConsidered), residual(rows), noise(rows), true_noise(rows) {}
+    Matrix jacobian, by_considered;
+    std::vector<double> residual, noise, true_noise;
+  };
+  double correct_with(const Measurement& measurement, double gate);
+
+  void move_origin(Vec3 by);
+  void forget_pair(double duration_s);
+  void apply(const double* error);
+  void remove_common_motion(Matrix& gain_turned);
+  void learn(const Matrix& gain_turned);
+
+  FilterModel model_;
+  std::vector<int64_t> clone_ids_;
+  std::vector<SE3> clones_;
+  TrackConstraints constraints_;
+  // Kept so that nothing is allocated in a frame.
+  std::vector<SE3> cameras_, prior_clones_;
+  std::vector<double> moved_, correction_;
+  Matrix spare_, inner_, by_clones_, weighing_, gain_turned_, gain_, seen_, spread_, taken_, part_, turned_;
+};
+
+}  // namespace fleetmap

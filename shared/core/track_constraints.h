@@ -1,0 +1,97 @@
+// What tracks of points say about the clones of the filter that saw them, the points themselves projected out.
+//
+// Error convention: true = Exp(error) * estimate, in `odom` axes. For a rotation R, a velocity v and a position p and the error
+// (r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho, to first order. Source: Barrau and Bonnabel 2017.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "camera.h"
+#include "dense.h"
+#include "lie.h"
+
+namespace fleetmap {
+
+// A row of a track: the clone that saw the point, and where: left pixel, and column in the right image, NaN where that is unknown.
+struct Sighting {
+  size_t clone;
+  double u, v, u_right;
+  bool has_disparity() const { return u_right == u_right; }
+};
+
+// Each is 1 / sigma of a measurement.
+struct PixelWeights {
+  double pixel, disparity;
+};
+
+// The point (in place, `odom`) of one track, by least squares; false where it does not settle in front of every camera. point must
+// hold a start.
+bool triangulate(const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens, const PixelWeights& weights,
+                 Vec3& point);
+
+// Of a normal error's variance, what is left among those whose square stays below the limit: of a truncated normal.
+double share_that_passes(double limit, double mean_square);
+
+// How large errors of pixels are. The weights are wide and treat all as white noise; the rest says what the errors really are.
+struct PixelModel {
+  StereoLens lens;
+  PixelWeights weights;
+  double noise_variance;           // that the weighted rows really have
+  double slip_along, slip_across;  // sigmas of what one track keeps for itself: the shares of its way by which it slips along it
+  double track_disparity;          // and across it, and its disparity's offset in pixels
+  double gate_quantile;            // of the normal distribution, at the share of right tracks that pass the gate
+};
+
+// The rows of one track and their derivatives: by the point, the clones' errors (rotation and position each, in the track's order), the
+// rig's disparity offset and depth scale, what the track keeps for itself (slips along and across, disparity's offset); last the residual.
+struct TrackRows {
+  Matrix values;
+  size_t rows, clone_columns;
+  size_t pair_column() const { return 3 + clone_columns; }
+  size_t own_column() const { return pair_column() + 2; }
+  size_t residual_column() const { return own_column() + 3; }
+};
+
+void linearise_track(Vec3 point, const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens,
+                     const PixelWeights& weights, TrackRows& out);
+
+// T tracks, one after the other; where each begins among the sightings, (T + 1,). first_points: where triangulation starts, in the
+// camera of the anchors' clones.
+struct Tracks {
+  std::vector<int64_t> starts;
+  std::vector<Sighting> sightings;
+  std::vector<size_t> anchors;
+  std::vector<Vec3> first_points;
+  size_t count() const { return anchors.size(); }
+};
+
+// vector (6 M,) = information (6 M, 2 + 6 M) (disparity offset, depth scale, clones' errors) + noise of covariance scatter (6 M, 6 M).
+struct NormalEquations {
+  Matrix information, scatter;
+  std::vector<double> vector;
+};
+
+// Adds up tracks that pass their gates. It keeps its memory.
+class TrackConstraints {
+ public:
+  // From the tracks and M cameras; covariance (6 M, 6 M) of the clones' errors, rotation then position. moved (6 M,): how far the clones
+  // stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track that was taken, 0 for one that
+  // could not be triangulated and -1 for one that failed its gate.
+  // Source: Mourikis and Roumeliotis 2007, equations 23 to 26 (null space of the point).
+  void accumulate(const std::vector<SE3>& odom_from_cam, const Tracks& tracks, const PixelModel& model, const Matrix& covariance,
+                  const std::vector<double>& moved, int8_t* used);
+
+  NormalEquations equations;
+
+ private:
+  int8_t add(const std::vector<SE3>& odom_from_cam, const Sighting* track, size_t count, Vec3 point, const PixelModel& model,
+             const Matrix& covariance, const std::vector<double>& moved);
+
+  TrackRows rows_;
+  Matrix by_clone_, by_clone_turned_, by_state_, own_, prior_, spread_, innovation_, gained_, carried_;
+  std::vector<double> left_, whitened_;
+};
+
+}  // namespace fleetmap
