@@ -11,10 +11,10 @@ from fleetmap import core
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from fleetmap.inertial import GRAVITY_MAP
+from mapserver.survey.bundle.elimination_order import minimum_degree
 from mapserver.survey.bundle.factors import pack_terms
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult
 from mapserver.survey.settings import BundleSettings
-from mapserver.survey.sparse_solver.block_cholesky import minimum_degree
 
 
 def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:

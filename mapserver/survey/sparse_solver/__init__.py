@@ -1,1 +1,0 @@
-"""Cholesky factorisation of large sparse matrices of poses."""
