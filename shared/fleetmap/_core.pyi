@@ -714,8 +714,8 @@ class BoxGrid:
     """Boxes (B, 8) as of `Faces` in a grid between two corners (3,)."""
 
     def __init__(self, boxes: _Reals, low: _Reals, high: _Reals, cell_m: float) -> None: ...
-    def cast(self, origin: _Reals, directions: _Reals, farthest: float) -> tuple[_Reals, _Indices]:
-        """(N,) parameters of the nearest hits, up to farthest, and (N, 2) box and side, -1 for none."""
+    def cast(self, origin: _Reals, directions: _Reals, farthest: _Reals) -> tuple[_Reals, _Indices]:
+        """(N,) parameters of the nearest hits, up to farthest (N,), and (N, 2) box and side, -1 for none."""
 
     def bake(
         self,

@@ -109,6 +109,7 @@ def test_products_are_rounded_before_they_are_added() -> None:
         (lambda: core.develop(CENTRES, 1.0, 0.1, 0.1, NORMALS[:7], 1, POINTS), "normals"),
         (lambda: core.develop(CENTRES, 1.0, 0.1, 0.1, NORMALS, 1, POINTS[:2]), "vignetting"),
         (lambda: core.BoxGrid(np.zeros((1, 8)), np.zeros(3), np.ones(3), 1e-3), "cells"),
+        (lambda: GRID.cast(CENTRES[0], CENTRES, np.ones(2)), "farthest"),
         (lambda: GRID.bake(*BAKED, np.zeros((1, 5)), 9.0, True, np.zeros((1, 7), np.float32)), "numbers"),
         (lambda: GRID.bake(*BAKED, np.ones((1, 5)), 9.0, True, np.zeros((1, 8), np.float32)), "lamps"),
         (lambda: core.voxel_keys(POINTS, LEVELS + np.uint8(5)), "levels"),
@@ -159,7 +160,7 @@ def test_hostile_numbers_lead_nowhere(seed: int) -> None:
         core.add_view(*window, row, column, *TILE)
     painted(quads=reals(2, 9), values=reals(2, 6), pose=reals(3, 3), bounds=reals(1, 6), rays=floats(20, 30, 4))
     grid = core.BoxGrid(reals(4, 8), np.zeros(3), np.ones(3), 0.3)
-    grid.cast(reals(3), reals(5, 3), one())
+    grid.cast(reals(3), reals(5, 3), reals(5))
     lamps = np.column_stack([reals(3, 4), np.zeros(3)])
     grid.bake(reals(2, 9), *BAKED[1:], lamps, one(), True, np.zeros((1, 8), np.float32))
     core.develop(reals(3, 3), one(), one(), one(), floats(8), int(rng.integers(-(1 << 63), 1 << 63)), floats(3, 3))

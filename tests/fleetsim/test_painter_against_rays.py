@@ -62,7 +62,7 @@ def test_no_pixel_without_explanation(lens: str) -> None:
         placed = map_from_cam(x, y, z, yaw, pitch)
         shot = painter.shoot(scene, np.ones(3), lambda _, placed=placed: placed, 0.0, Exposure(0.003, 1.0), 1)
         rays, centre = np.ascontiguousarray(rays_cam @ placed[:3, :3].T), placed[:3, 3].copy()
-        depth, hits = grid.cast(centre, rays, NOTHING)
+        depth, hits = grid.cast(centre, rays, np.full(len(rays), NOTHING))
         nearest = np.minimum(depth, _shell_distance(centre, rays))
         face, painted = shot.faces.ravel(), shot.depth_m.ravel().astype(np.float64)
         assert (face >= 0).all()

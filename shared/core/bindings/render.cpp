@@ -127,13 +127,14 @@ BoxGrid box_grid_of(const Array<double, -1, 8>& boxes, const Triple& low, const 
   return unlocked([&] { return BoxGrid(std::move(all), vec3(low.data()), vec3(high.data()), cell_m); });
 }
 
-auto cast_of(const BoxGrid& grid, const Triple& origin, const Array<double, -1, 3>& directions, double farthest) {
+auto cast_of(const BoxGrid& grid, const Triple& origin, const Array<double, -1, 3>& directions, const Reals& farthest) {
   const size_t count = directions.shape(0);
+  if (farthest.shape(0) != count) throw nb::value_error("farthest: one for each of directions");
   std::vector<double> at(count);
   std::vector<int64_t> hits(2 * count);
   unlocked([&] {
     for (size_t i = 0; i < count; ++i) {
-      const Hit hit = grid.cast(vec3(origin.data()), vec3(directions.data() + 3 * i), farthest, false, -1);
+      const Hit hit = grid.cast(vec3(origin.data()), vec3(directions.data() + 3 * i), farthest(i), false, -1);
       at[i] = hit.at, hits[2 * i] = hit.box, hits[2 * i + 1] = hit.side;
     }
   });
@@ -169,7 +170,7 @@ void bind_render(nb::module_& module) {
              "vignetting"_a.noconvert());
   nb::class_<BoxGrid>(module, "BoxGrid")
       .def(nb::new_(&box_grid_of), "boxes"_a.noconvert(), "low"_a.noconvert(), "high"_a.noconvert(), "cell_m"_a)
-      .def("cast", &cast_of, "origin"_a.noconvert(), "directions"_a.noconvert(), "farthest"_a)
+      .def("cast", &cast_of, "origin"_a.noconvert(), "directions"_a.noconvert(), "farthest"_a.noconvert())
       .def("bake", &bake_of, "quads"_a.noconvert(), "numbers"_a.noconvert(), "owners"_a.noconvert(), "owner_shift"_a, "lamps"_a.noconvert(),
            "reach_m"_a, "has_shadows"_a, "light"_a.noconvert());
 }

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.core import BoxGrid
 from fleetmap.geometry import Array, se3_inverse
-from fleetsim.render.ray_kernels import BoxGrid, box_grid
 from fleetsim.scene.world import NEAR_COLUMNS, NEAR_ROWS, World
-from support.estimator import landmark_kernels
+from support.estimator.landmark_lattice import Viewpoint, seed_landmarks, visible_from
 from support.estimator.statistics import PITCH_PX
 
 CELLS_M = np.array([0.08, 0.16, 0.32, 0.64, 1.28])  # lattice spacings: with distance coarser ones take over
@@ -63,7 +63,7 @@ class LandmarkField:
         if key not in self._chunks:
             faces = self._world.detailed_faces(column, row)
             columns = (faces.quads, faces.values, faces.numbers, self._weights)
-            parts = [landmark_kernels.seed_landmarks(*columns, cell_m) for cell_m in CELLS_M.tolist()]
+            parts = [seed_landmarks(*columns, cell_m) for cell_m in CELLS_M.tolist()]
             firsts = np.cumsum([0] + [len(part[0]) for part in parts[:-1]])
             points, normals, sizes, keys = (np.concatenate(column) for column in zip(*parts, strict=True))
             self._chunks[key] = Landmarks(points, normals, sizes, keys, firsts)
@@ -87,7 +87,7 @@ class LandmarkField:
     def _look_from(self, map_from_cam: Array, focal_px: float, widest: Array) -> Landmarks:
         centre, reach_per_m = np.ascontiguousarray(map_from_cam[:3, 3]), focal_px / PITCH_PX
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
-        view = landmark_kernels.Viewpoint(cam_from_map, centre, reach_per_m, widest, _OCTAVE_SPAN)
+        view = Viewpoint(cam_from_map, centre, reach_per_m, widest, _OCTAVE_SPAN)
         keys, grid = self._boxes_around(centre)
         found: list[Landmarks] = []
         for key in keys:
@@ -96,10 +96,8 @@ class LandmarkField:
             reaching = np.flatnonzero(CELLS_M * _LARGEST * reach_per_m > gap_m)
             if not len(chunk) or not len(reaching):
                 continue
-            rows = np.empty(len(chunk), np.int32)
             first, columns = int(chunk.firsts[reaching[0]]), (chunk.points_map, chunk.normals_map, chunk.sizes_m)
-            count = landmark_kernels.visible_from(first, *columns, view, grid, rows)
-            found.append(chunk.take(rows[:count]))
+            found.append(chunk.take(visible_from(first, *columns, view, grid)))
         return _joined(found)
 
     def _boxes_around(self, centre: Array) -> tuple[list[tuple[int, int]], BoxGrid]:
@@ -117,7 +115,7 @@ class LandmarkField:
             high = np.array([layout.length_m, layout.width_m, layout.ceiling_m]) + 1.0
             near_low = np.maximum(-1.0, np.append(centre[:2] - 40.0, -1.0))
             near_high = np.minimum(high, np.append(centre[:2] + 40.0, high[2]))
-            self._grids[middle] = keys, box_grid(boxes, near_low, near_high, _GRID_M)
+            self._grids[middle] = keys, BoxGrid(boxes, near_low, near_high, _GRID_M)
             if len(self._grids) > _MOST_GRIDS:
                 self._grids.popitem(last=False)
         return self._grids[middle]

@@ -11,12 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetsim.recorder import Session
-from support.estimator import landmark_kernels, noise_kernels
+from support.estimator.landmark_lattice import project
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.mover_landmarks import MoverLandmarks
+from support.estimator.noise import clutter, detect, flow_noise
 from support.estimator.statistics import PITCH_PX, FeatureStatistics, FlowStatistics
 
 _STATION_M, _STATION_RAD = 0.5, 0.15
@@ -121,12 +123,10 @@ class EstimatorSession:
         seen = self.sighting(frame)
         at = np.minimum(np.searchsorted(seen.ids, ids), max(len(seen.ids) - 1, 0))
         kept = seen.ids[at] == ids if len(seen.ids) else np.zeros(len(ids), bool)
-        pixels, held = np.full((len(ids), 3), np.nan), np.zeros(int(kept.sum()), bool)
-        measured = np.empty((int(kept.sum()), 3))
+        pixels = np.full((len(ids), 3), np.nan)
         exact, is_floor = seen.pixels[at[kept]], seen.points_map[at[kept], 2] < _FLOOR_M
         instant = (frame, self._seed, self._flow, self._table)
-        noise_kernels.flow_noise(ids[kept], exact, begun_px[kept], is_floor, *instant, measured, held)
-        pixels[kept] = measured
+        pixels[kept], held = flow_noise(ids[kept], exact, begun_px[kept], is_floor, *instant)
         kept[kept] = held
         return pixels, kept
 
@@ -141,47 +141,41 @@ class EstimatorSession:
         room = np.minimum(pixels, (camera.width_px - 1, camera.height_px - 1) - pixels).min(axis=1)
         order = np.flatnonzero((room > _FLOW_BORDER_PX) & (seen.octaves < _FINEST_OCTAVES))
         order = order[np.argsort(seen.keys[order, 0], kind="stable")]
-        near = np.ascontiguousarray(taken[:, :2])
-        chosen = noise_kernels.spread(pixels, order, near, min_distance_px, count, self._size_px)
+        spots, near = pixels.astype(np.float32), np.ascontiguousarray(taken[:, :2], np.float32)
+        size_px = camera.width_px, camera.height_px
+        chosen = core.select_spread(spots, order, near, min_distance_px, count, *size_px)
         return seen.ids[chosen], pixels[chosen]
 
     def features(self, frame: int) -> Found:
         """Features that a detector finds in a frame's left picture: landmarks first, then clutter."""
         seen, model = self.sighting(frame), self._features
-        room = max(len(seen.ids), model.total)
-        rows, words = np.full(room, -1, np.int32), np.empty((room, 4), np.uint64)
-        found = noise_kernels.FeatureBuffers(rows, np.empty((room, 3)), np.empty(room, np.int8), words)
         centre = (self.map_from_body[frame] @ self.body_from_cam)[:3, 3]
         toward = centre - seen.points_map
         level = np.hypot(toward[:, 0], toward[:, 1])
         directions = np.stack([np.arctan2(toward[:, 1], toward[:, 0]), np.arctan2(toward[:, 2], level)], axis=1)
         instant = (frame, self._seed, model, self._table)
-        count = noise_kernels.detect(seen.keys, seen.pixels, seen.octaves, directions, *instant, found)
-        count = min(count, model.total)
+        found = detect(seen.keys, seen.pixels, seen.octaves, directions, *instant)
         total = model.total if len(seen.ids) else 0
-        key = np.uint64((self._seed * 1000003 + frame) & ((1 << 63) - 1))
-        noise_kernels.add_clutter(count, total, key, self._size_px, model.disparity_known_share, found)
-        rows[count:total] = -1
-        descriptors = words[:total].view(np.uint8).reshape(total, 32)
-        return Found(rows[:total], found.pixels[:total], found.octaves[:total], descriptors)
+        first, key = min(len(found[0]), total), (self._seed * 1000003 + frame) & ((1 << 63) - 1)
+        others = clutter(first, total, key, self._size_px, model.disparity_known_share)
+        columns = [np.concatenate([mine[:total], other]) for mine, other in zip(found, others, strict=True)]
+        rows, pixels, octaves, words = columns
+        return Found(rows.astype(np.int32), pixels, octaves, words.view(np.uint8).reshape(total, 32))
 
     def _look(self, frame: int) -> Sighting:
         landmarks, camera, time_s = self._landmarks(frame), self.camera, self.session.frame_times_s[frame]
         landmarks = self._movers.around(time_s, (self.map_from_body[frame] @ self.body_from_cam)[:3, 3], landmarks)
         if any(self.session.renderer.faults.has(fault, time_s) for fault in ("camera-dark", "over-exposure")):
             landmarks = landmarks.take(np.zeros(0, np.int64))
-        size = len(landmarks)
-        pixels, octaves, distances = np.empty((size, 3)), np.empty(size), np.empty(size)
-        rows = np.empty(size, np.int32)
         body_from_map = se3_inverse(self.map_from_body[frame])
         rect_from_map = np.stack([(rect @ body_from_map)[:3] for rect in self._rect_from_body])
         pinhole = np.array([camera.focal_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px])
         view, reach_per_m = (rect_from_map, pinhole), camera.focal_px / PITCH_PX
         points, sizes = landmarks.points_map, landmarks.sizes_m
-        count = landmark_kernels.project(points, sizes, *view, reach_per_m, pixels, octaves, distances, rows)
-        inside = np.arange(count)
+        rows, pixels, octaves, distances = project(points, sizes, *view, reach_per_m)
+        inside = np.arange(len(rows))
         if self._smudge is not None:
-            off_px = np.hypot(pixels[:count, 0] - self._smudge.u_px, pixels[:count, 1] - self._smudge.v_px)
+            off_px = np.hypot(pixels[:, 0] - self._smudge.u_px, pixels[:, 1] - self._smudge.v_px)
             inside = np.flatnonzero(off_px > self._smudge.radius_px)
         seen = landmarks.take(rows[inside])
         columns = (pixels[inside], octaves[inside], distances[inside])

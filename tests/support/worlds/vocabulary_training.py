@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.bow import Vocabulary
-from fleetmap.features.matching import Descriptors, packed
-from fleetmap.features.matching_kernels import FAR, Indices, Packed, hamming
+from fleetmap.features.matching import FAR, Descriptors, packed
 from fleetmap.geometry import Array
-from fleetmap.numerics.kernel import kernel
 
 _ITERATIONS = 8
+Packed, Indices = NDArray[np.uint64], NDArray[np.int64]
 
 
 def train_vocabulary(
@@ -52,10 +52,11 @@ def _split(bits: Packed, members: Indices, branching: int, rng: np.random.Genera
     """Centre and members of each child; none where the node is to stay a leaf."""
     if len(members) <= branching:
         return []
-    centres = seed_centres(bits, members, branching, rng.random(branching))
+    own = bits[members]
+    centres = seed_centres(own, branching, rng.random(branching))
     if len(centres) < 2:
         return []
-    labels = cluster(bits, members, centres, _ITERATIONS)
+    labels = cluster(own, centres, _ITERATIONS)
     groups = [(centres[c], members[labels == c]) for c in range(len(centres))]
     kept = [(centre, group) for centre, group in groups if len(group) > 0]
     return kept if len(kept) > 1 else []
@@ -72,63 +73,33 @@ def _idf(tree: Vocabulary, descriptors: Descriptors, images: NDArray[np.integer]
     return np.log(1.0 + len(numbers) / np.maximum(holding, 1)).astype(np.float32)
 
 
-@kernel
-def seed_centres(packed: Packed, members: Indices, branching: int, uniforms: Array) -> Packed:
-    """Up to `branching` distinct members, spread out; fewer where there are fewer. Source: Arthur 2007 (k-means++)."""
-    centres = np.empty((branching, 4), np.uint64)
-    squared = np.full(len(members), FAR * FAR, np.int64)
-    chosen = 0
-    pick = int(uniforms[0] * len(members))
+def seed_centres(bits: Packed, branching: int, uniforms: Array) -> Packed:
+    """Up to `branching` distinct descriptors of (M, 4), spread out; fewer where there are fewer. Source: Arthur 2007 (k-means++)."""
+    centres = bits[[int(uniforms[0] * len(bits))]]
+    squared = np.full(len(bits), FAR * FAR)
     while True:
-        centres[chosen] = packed[members[pick]]
-        chosen += 1
-        total = 0
-        for m in range(len(members)):
-            distance = hamming(packed, members[m], centres, chosen - 1)
-            squared[m] = min(squared[m], distance * distance)
-            total += squared[m]
-        if chosen == branching or total == 0:
-            return centres[:chosen].copy()
-        target, passed = uniforms[chosen] * total, 0
-        for m in range(len(members)):
-            passed += squared[m]
-            if passed > target:
-                pick = m
-                break
+        squared = np.minimum(squared, core.nearest_two(bits, centres[-1:])[1].astype(np.int64) ** 2)
+        passed = np.cumsum(squared)
+        if len(centres) == branching or passed[-1] == 0:
+            return centres
+        pick = int(np.searchsorted(passed, uniforms[len(centres)] * passed[-1], side="right"))
+        centres = np.concatenate([centres, bits[pick : pick + 1]])
 
 
-@kernel
-def cluster(packed: Packed, members: Indices, centres: Packed, iterations: int) -> Indices:
-    """Label (len(members),) of the nearest centre after refining `centres` in place. Source: Grana 2013 (k-majority).
+def cluster(bits: Packed, centres: Packed, iterations: int) -> Indices:
+    """Label (M,) of the nearest centre of descriptors (M, 4) after refining `centres` in place. Source: Grana 2013 (k-majority).
 
     A centre is the bit-wise majority of its members (ties: 0). One that nobody belongs to stays where it is.
     """
-    labels = np.full(len(members), -1, np.int64)
+    labels, each = np.full(len(bits), -1), np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")
     for _ in range(iterations):
-        ones = np.zeros((len(centres), 256), np.int64)
-        counts = np.zeros(len(centres), np.int64)
-        changed = False
-        for m in range(len(members)):
-            best, nearest = FAR, 0
-            for c in range(len(centres)):
-                distance = hamming(packed, members[m], centres, c)
-                if distance < best:
-                    best, nearest = distance, c
-            changed = changed or labels[m] != nearest
-            labels[m] = nearest
-            counts[nearest] += 1
-            for word in range(4):
-                bits = packed[members[m], word]
-                for bit in range(64):
-                    ones[nearest, 64 * word + bit] += np.int64((bits >> np.uint64(bit)) & np.uint64(1))
-        if not changed:
+        before, labels = labels, core.nearest_two(bits, centres)[0]
+        if np.array_equal(labels, before):
             break
-        for c in range(len(centres)):
-            for word in range(4):
-                majority = np.uint64(0)
-                for bit in range(64):
-                    if 2 * ones[c, 64 * word + bit] > counts[c]:
-                        majority |= np.uint64(1) << np.uint64(bit)
-                if counts[c] > 0:
-                    centres[c, word] = majority
+        counts = np.bincount(labels, minlength=len(centres))
+        held = np.flatnonzero(counts)
+        firsts = (np.cumsum(counts) - counts)[held]
+        ones = np.add.reduceat(each[np.argsort(labels, kind="stable")], firsts, axis=0, dtype=np.int64)
+        majority = np.packbits(2 * ones > counts[held, None], axis=1, bitorder="little")
+        centres[held] = majority.view(np.uint64)
     return labels
