@@ -507,6 +507,23 @@ def compose_pose(
 ) -> tuple[_Reals, _Reals]:
     """map_from_next (4, 4) and its covariance (6, 6), see `pose_covariance.compose_cov`."""
 
+def adjust_window(
+    map_from_cam: _Reals,
+    held: int,
+    points: _Reals,
+    starts: _Indices,
+    views: _Indices,
+    pixels: _Reals,
+    lens: _Reals,
+    sigma_px: float,
+    huber_sigmas: float,
+    iterations: int,
+) -> tuple[_Reals, _Reals, _Reals, float]:
+    """Bundle adjustment of one camera's views (V, 4, 4), of which the first `held` stay: views, points, squares, half their robust sum.
+
+    points (N, 3); starts (N + 1,) delimits each one's rows of views (M,) and pixels (M, 2). squares (M,) in sigmas.
+    """
+
 # --- tracks of points through cameras: views (n,) of odom_from_cam (M, 4, 4), pixels (n, 3) u_left v u_right, NaN none; lens (4,) ---
 
 def triangulate(

@@ -16,6 +16,7 @@ void bind_flow(nb::module_&);
 void bind_grid(nb::module_&);
 void bind_filter(nb::module_&);
 void bind_imu_checks(nb::module_&);
+void bind_mono_window(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
@@ -55,6 +56,7 @@ NB_MODULE(_core, module) {
   bind_flow(module);
   bind_filter(module);
   bind_imu_checks(module);
+  bind_mono_window(module);
   bind_matching(module);
   bind_pair_matching(module);
   bind_patch_align(module);

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
-from fleetmap.odometry.mono.mono_ba_kernels import adjust_window
 from fleetmap.odometry.mono.two_view import midpoints, rays_from_pixels, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
 from fleetmap.pnp.pnp import Correspondences, ransac_pnp, refine_pnp
@@ -306,13 +306,11 @@ class VisualOdometry:
             starts.append(len(obs_views))
         if len(numbers) < self._settings.min_points or len(views) <= held:
             return
-        rotations = np.array([v.vision_from_cam[:3, :3] for v in views])
-        positions = np.array([v.vision_from_cam[:3, 3] for v in views])
+        bounds, placed = np.array(starts, np.int64), np.array([v.vision_from_cam for v in views])
+        observed = bounds, np.array(obs_views, np.int64), np.array(pixels)
+        limits = self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS
         values = np.array([points[i] for i in numbers])
-        squared, bounds = np.empty(len(obs_views)), np.array(starts, np.int64)
-        fixed, observed = np.arange(len(views)) < held, (bounds, np.array(obs_views, np.int64), np.array(pixels))
-        lens, limits = self._lens[:3].copy(), (self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS)
-        adjust_window(rotations, positions, fixed, values, *observed, lens, *limits, squared)
+        placed, values, squared, _ = core.adjust_window(placed, held, values, *observed, self._lens, *limits)
         worst = np.maximum.reduceat(squared, bounds[:-1])
         limit = (self._settings.max_error_px / self._settings.sigma_px) ** 2
         for track_id, value, off in zip(numbers, values, worst.tolist(), strict=True):
@@ -321,8 +319,7 @@ class VisualOdometry:
             else:
                 del points[track_id]
         self._local_map.views = [
-            View(v.frame_index, _orthonormal(se3(rotations[k], positions[k])), v.ids, v.pixels)
-            for k, v in enumerate(views)
+            View(v.frame_index, _orthonormal(placed[k]), v.ids, v.pixels) for k, v in enumerate(views)
         ]
 
 
