@@ -14,6 +14,10 @@ namespace {
 constexpr int kRow = 16, kWideRow = 24;  // numbers in a row of a window, and of one that is larger by a pixel on all sides
 constexpr int kRows = 16;
 constexpr int kCells = kRow * kRows, kWideCells = kWideRow * (kRows + 2) + 8;
+constexpr int kSteps = 20;
+constexpr double kSettledPx = 0.01;
+constexpr int kStepsBack = 8;  // the way back begins near its end, so that failures show after few steps
+constexpr double kSettledBackPx = 0.03;
 constexpr double kLeastSlope = 0.1;  // mean square per pixel, in grey values, along the direction in which a window shows least
 constexpr double kTurningPx = 0.01;  // two steps that undo each other up to this: between them lies the end
 
@@ -150,15 +154,25 @@ void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, cons
   }
 }
 
-void check_back(GreyImage before, GreyImage now, FlowSteps steps, const double* pixels, const double* places, double within_px,
-                double margin_px, bool* held, size_t count) {
+void follow_down(const std::vector<GreyImage>& before, const std::vector<GreyImage>& now, int half, const double* pixels, double* places,
+                 bool* found, size_t count) {
+  const FlowSteps steps{half, kSteps, kSettledPx};
+  std::fill_n(found, count, true);
+  for (size_t level = std::min(before.size(), now.size()); level-- > 0;) {
+    follow(before[level], now[level], std::pow(0.5, double(level)), steps, pixels, places, found, count);
+    if (level > 0) std::fill_n(found, count, true);
+  }
+}
+
+void check_back(GreyImage before, GreyImage now, int half, const double* pixels, const double* places, double within_px, double margin_px,
+                bool* held, size_t count) {
   const double right = double(now.width - 1) - margin_px, bottom = double(now.height - 1) - margin_px;
   for (size_t n = 0; n < count; ++n) {
     const double x = places[2 * n], y = places[2 * n + 1];
     held[n] = held[n] && x > margin_px && y > margin_px && x < right && y < bottom;
   }
   std::vector<double> back(pixels, pixels + 2 * count);
-  follow(now, before, 1.0, steps, places, back.data(), held, count);
+  follow(now, before, 1.0, {half, kStepsBack, kSettledBackPx}, places, back.data(), held, count);
   for (size_t n = 0; n < count; ++n) {
     const double off_x = back[2 * n] - pixels[2 * n], off_y = back[2 * n + 1] - pixels[2 * n + 1];
     held[n] = held[n] && off_x * off_x + off_y * off_y < within_px * within_px;

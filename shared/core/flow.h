@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <vector>
 
 #include "image.h"
 
@@ -26,9 +27,14 @@ struct FlowSteps {
 void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, const double* pixels, double* places, bool* found,
             size_t count);
 
+// follow by whole pyramids, each image half as large as the one before: what a coarse level does not show, a finer one may. Places are
+// where the windows are looked for first; found (N,) tells of the first images.
+void follow_down(const std::vector<GreyImage>& before, const std::vector<GreyImage>& now, int half, const double* pixels, double* places,
+                 bool* found, size_t count);
+
 // Of places (N, 2) that pixels (N, 2) were followed to, and that are held (N,), leaves those further than margin_px from the image's
 // edges that lead back to within so many pixels. Source: Kalal et al. 2010.
-void check_back(GreyImage before, GreyImage now, FlowSteps steps, const double* pixels, const double* places, double within_px,
-                double margin_px, bool* held, size_t count);
+void check_back(GreyImage before, GreyImage now, int half, const double* pixels, const double* places, double within_px, double margin_px,
+                bool* held, size_t count);
 
 }  // namespace fleetmap

@@ -4,6 +4,8 @@ Headers there say what each function does. Images (H, W) uint8 grey, descriptors
 ValueError for sizes and numbers that cannot be, TypeError for another kind of array; what is not finite gives values.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,7 @@ _Floats = NDArray[np.float32]
 _Octaves = NDArray[np.int8]
 # Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), whether the disparities are measured.
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
+_Levels = Sequence[_Grey]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
 _ImageRows = tuple[_Reals, _Reals, _Reals, _Reals]
@@ -284,32 +287,62 @@ def blend_backward(
 ) -> _Reals:
     """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""
 
-def follow_windows(
+def follow_pixels(before: _Levels, now: _Levels, pixels: _Reals, predicted: _Reals, half: int) -> tuple[_Reals, _Flags]:
+    """Places (N, 2) of the windows around pixels (N, 2) in the next image, by pyramids, and which were found (N,)."""
+
+def check_back(
     before: _Grey,
     now: _Grey,
-    scale: float,
-    half: int,
-    steps: int,
-    settled_px: float,
     pixels: _Reals,
     places: _Reals,
     found: _Flags,
-) -> None:
-    """Moves places (N, 2) to where the windows around pixels (N, 2) are; found (N,) ends where they are lost."""
-
-def check_windows_back(
-    before: _Grey,
-    now: _Grey,
     half: int,
-    steps: int,
-    settled_px: float,
-    pixels: _Reals,
-    places: _Reals,
     within_px: float,
     margin_px: float,
-    held: _Flags,
-) -> None:
-    """Ends held (N,) where places (N, 2) do not lead back to pixels (N, 2)."""
+) -> _Flags:
+    """(N,) which of the found places (N, 2) lead back to pixels (N, 2)."""
+
+def track_points(
+    before: _Levels,
+    now: _Levels,
+    pixels: _Reals,
+    cam_from_previous: _Reals,
+    lens: _Reals,
+    half: int,
+    within_px: float,
+    margin_px: float,
+    least: int,
+    refinement: tuple[float, float, tuple[int, int]],
+) -> tuple[_Reals, _Flags, _Reals, int, _Reals, _Reals, _Reals]:
+    """Pixels (N, 3) followed from where the motion takes them: places (N, 2), which hold (N,), points_cam (N, 3) before; how many of those
+    with depth agree (-1: they determine no motion) with the motion (4, 4), its information (6, 6), their squared residuals."""
+
+def carry_points(
+    pixels: _Reals,
+    points_cam: _Reals,
+    places: _Reals,
+    kept: _Flags,
+    cam_from_previous: _Reals,
+    lens: _Reals,
+    limit_px: float,
+) -> tuple[_Flags, _Reals]:
+    """Which of the kept places (N, 2) are where the motion takes the points; they (N, 3) with u right by the depth that it leaves."""
+
+def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
+    """How far the pixels (N, 3) of ids in both, ascending, lists have moved."""
+
+class Observations:
+    """Observations of points until an update uses them."""
+
+    def __init__(self) -> None: ...
+    def add(self, frame_index: int, ids: _Indices, pixels: _Reals) -> None:
+        """What one frame saw."""
+    def clear(self) -> None:
+        """Forgets all."""
+    def take(
+        self, alive: _Indices, due: _Flags, held: _Indices, lens: _Reals, far_px: float
+    ) -> tuple[_Indices, _Indices, _Reals, _Indices, _Reals]:
+        """Removes tracks that ended or are due: starts (T + 1,), clone_ids and pixels (n, 3), anchors (T,), points_cam (T, 3)."""
 
 def align_patches(
     reference: _Pyramid,

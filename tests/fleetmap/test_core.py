@@ -42,6 +42,7 @@ DTYPES = {
     "_Floats": "float32",
     "_Octaves": "int8",
     "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
+    "_Levels": "collections.abc.Sequence[dtype=uint8]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
     "_ImageRows": "tuple[dtype=float64, dtype=float64, dtype=float64, dtype=float64]",
@@ -143,10 +144,16 @@ FILTER = InvariantFilter(
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 5, 8, 0.25), "narrow_half"),
         (lambda: core.match_projected(*NEAR[:3], NEAR[3][:1], *NEAR[4:]), "octave_range"),
         (lambda: core.match_projected(*NEAR[:5], NEAR[5][:1], *NEAR[6:]), "octaves"),
-        (lambda: core.follow_windows(IMAGE, IMAGE, 1.0, 8, 9, 0.1, PLACES, PLACES.copy(), np.ones(4, bool)), "half"),
-        (lambda: core.follow_windows(IMAGE, IMAGE, 1.0, 3, 9, 0.1, PLACES, PLACES.copy(), np.ones(3, bool)), "flags"),
-        (lambda: core.follow_windows(IMAGE, IMAGE[:0], 1.0, 3, 9, 0.1, PLACES, PLACES.copy(), np.ones(4, bool)), "now"),
-        (lambda: core.check_windows_back(IMAGE, IMAGE, 3, 9, 0.1, PLACES, PLACES[:1], 1.0, 0.0, np.ones(4, bool)), "places"),
+        (lambda: core.follow_pixels([IMAGE], [IMAGE], PLACES, PLACES, 8), "half"),
+        (lambda: core.follow_pixels([IMAGE], [IMAGE], PLACES, PLACES[:3], 7), "predicted"),
+        (lambda: core.follow_pixels([IMAGE], [IMAGE[:0]], PLACES, PLACES, 7), "now"),
+        (lambda: core.follow_pixels([], [IMAGE], PLACES, PLACES, 7), "before"),
+        (lambda: core.check_back(IMAGE, IMAGE, PLACES, PLACES[:1], np.ones(4, bool), 7, 1.0, 0.0), "places"),
+        (lambda: core.track_points([IMAGE], [IMAGE], SAMPLES, np.eye(4), np.ones(4), 0, 1.0, 0.0, 3, GUIDANCE[3]), "half"),
+        (lambda: core.carry_points(SAMPLES, SAMPLES, PLACES, np.ones(3, bool), np.eye(4), np.ones(4), 2.0), "places"),
+        (lambda: core.common_ways_px(STAMPS, SAMPLES[:2], STAMPS, SAMPLES), "pixels"),
+        (lambda: core.Observations().add(0, STAMPS, SAMPLES[:2]), "pixels"),
+        (lambda: core.Observations().take(STAMPS, np.ones(2, bool), STAMPS, np.ones(4), 1.0), "due"),
         (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((4, 2, 2)), 16, 3.0, 0.8), "half"),
         (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((3, 2, 2)), 4, 3.0, 0.8), "reference_from_current"),
         (lambda: core.align_patches(*PATCHES[:2], OCTAVES[:3], *PATCHES, np.ones((4, 2, 2)), 4, 3.0, 0.8), "octaves"),
@@ -206,11 +213,21 @@ HOSTILE = {
     "match_rows, without a limit": lambda places: core.match_rows(
         *[NOISE] * 4, places, places[:, 1].copy(), 8.0, -np.inf, np.inf, 7, 7, np.inf
     ),
-    "follow_windows": lambda places: core.follow_windows(
-        NOISE, NOISE, 1.0, 3, 9, 0.1, places, places[::-1].copy(), np.ones(4, bool)
+    "follow_pixels": lambda places: core.follow_pixels([NOISE] * 3, [NOISE] * 3, places, places[::-1].copy(), 3),
+    "check_back": lambda places: core.check_back(
+        NOISE, NOISE[:5, :9].copy(), places, places[::-1].copy(), np.ones(4, bool), 7, 3.0, -np.inf
     ),
-    "check_windows_back": lambda places: core.check_windows_back(
-        NOISE, NOISE[:5, :9].copy(), 7, 9, 0.1, places, places[::-1].copy(), 3.0, -np.inf, np.ones(4, bool)
+    "track_points": lambda places: core.track_points(
+        [NOISE],
+        [NOISE],
+        np.column_stack([places, places[::-1, 0]]),
+        np.eye(4),
+        np.array([9.0, 15.0, 10.0, 9.0]),
+        3,
+        np.inf,
+        -np.inf,
+        1,
+        GUIDANCE[3],
     ),
     "align_patches": lambda places: core.align_patches(
         *(PICTURES, places, OCTAVES),

@@ -11,22 +11,21 @@ void bind_block_cholesky(nb::module_&);
 void bind_bundle(nb::module_&);
 void bind_calibration(nb::module_&);
 void bind_corners(nb::module_&);
-void bind_surfels(nb::module_&);
-void bind_flow(nb::module_&);
-void bind_grid(nb::module_&);
 void bind_filter(nb::module_&);
+void bind_grid(nb::module_&);
 void bind_imu_checks(nb::module_&);
 void bind_mono_window(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
 void bind_pnp(nb::module_&);
-void bind_relocalization(nb::module_&);
 void bind_preintegration(nb::module_&);
+void bind_relocalization(nb::module_&);
 void bind_render(nb::module_&);
 void bind_stereo(nb::module_&);
-void bind_preintegration(nb::module_&);
+void bind_surfels(nb::module_&);
 void bind_track_joining(nb::module_&);
+void bind_tracking(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
 #if defined(__x86_64__)
@@ -51,23 +50,21 @@ NB_MODULE(_core, module) {
   bind_block_cholesky(module);
   bind_bundle(module);
   bind_calibration(module);
-  nb::set_leak_warnings(false);  // a process that ends while it holds a filter has no fault to report
   bind_corners(module);
-  bind_flow(module);
   bind_filter(module);
+  bind_grid(module);
   bind_imu_checks(module);
   bind_mono_window(module);
   bind_matching(module);
   bind_pair_matching(module);
   bind_patch_align(module);
   bind_pnp(module);
-  bind_relocalization(module);
   bind_preintegration(module);
+  bind_relocalization(module);
   bind_render(module);
   bind_stereo(module);
-  bind_preintegration(module);
-  bind_track_joining(module);
-  bind_vocabulary(module);
-  bind_grid(module);
   bind_surfels(module);
+  bind_track_joining(module);
+  bind_tracking(module);
+  bind_vocabulary(module);
 }

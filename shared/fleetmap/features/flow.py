@@ -10,10 +10,6 @@ from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
 
-_STEPS, _SETTLED_PX = 20, 0.01
-# The way back begins near its end, so that failures show after few steps.
-_STEPS_BACK, _SETTLED_BACK_PX = 8, 0.03
-
 
 class Pyramid:
     """An image and its halvings, made on demand."""
@@ -26,6 +22,11 @@ class Pyramid:
         while len(self._levels) <= number:
             self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1]), np.uint8))
         return self._levels[number]
+
+    def down_to(self, number: int) -> list[Image]:
+        """Its levels from the image to that one."""
+        self.level(number)
+        return self._levels[: number + 1]
 
 
 class Flow(NamedTuple):
@@ -41,14 +42,9 @@ def follow(before: Pyramid, now: Pyramid, pixels: Array, predicted: Array, *, wi
 
     predicted (N, 2): where they are looked for first, from so many levels above the image down.
     """
-    places, found = np.array(predicted, np.float64), np.ones(len(pixels), bool)
-    start, half = np.ascontiguousarray(pixels, np.float64), window_px // 2
-    for level in range(levels, 0, -1):  # what a coarse level does not show, a finer one may
-        core.follow_windows(
-            before.level(level), now.level(level), 0.5**level, half, _STEPS, _SETTLED_PX, start, places, found.copy()
-        )
-    core.follow_windows(before.level(0), now.level(0), 1.0, half, _STEPS, _SETTLED_PX, start, places, found)
-    return Flow(start, places, found)
+    start, sought = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(predicted, np.float64)
+    found = core.follow_pixels(before.down_to(levels), now.down_to(levels), start, sought, window_px // 2)
+    return Flow(start, *found)
 
 
 def forward_backward_check(
@@ -58,7 +54,4 @@ def forward_backward_check(
 
     Nearer than margin_px to the image's edges none does. Source: Kalal et al. 2010.
     """
-    held, ends = flow.found.copy(), (float(within_px), float(margin_px))
-    steps = window_px // 2, _STEPS_BACK, _SETTLED_BACK_PX
-    core.check_windows_back(before.level(0), now.level(0), *steps, flow.pixels, flow.places, *ends, held)
-    return held
+    return core.check_back(before.level(0), now.level(0), *flow, window_px // 2, within_px, margin_px)

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array
 from fleetmap.numerics.transform_kernels import angle_between_rad, distance_between
-from fleetmap.odometry.tracking import tracker_kernels
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is given up
@@ -78,9 +78,8 @@ def is_image_still(
     old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
 ) -> bool:
     """Whether most of at least ten points seen in both images, pixels (N, 3), have stayed within the limit; ids ascend."""
-    ways_px = np.empty(len(ids))
-    count = tracker_kernels.ways_of_common(old_ids, old_pixels, ids, pixels, ways_px)
-    return count >= _MIN_POINTS and middle(ways_px[:count]) < limit_px
+    ways_px = core.common_ways_px(old_ids, old_pixels, ids, pixels)
+    return len(ways_px) >= _MIN_POINTS and middle(ways_px) < limit_px
 
 
 def middle(values: Array) -> float:

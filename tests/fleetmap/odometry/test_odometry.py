@@ -217,9 +217,9 @@ def test_a_prediction_costs_less_than_a_guess_and_may_be_wrong(monkeypatch: pyte
     held, levels = {}, {}
     for name, predicted, sigma_rad in (("well", step, 0.01), ("badly", turned @ step, 0.01), ("guessed", step, None)):
         tracker, used = Tracker(CAMERA, TrackerSettings()), []
-        real = tracker._flow_from
+        real = tracker._followed
         monkeypatch.setattr(
-            tracker, "_flow_from", lambda *a, real=real, used=used: (used.append(a[2]), real(*a))[1], raising=True
+            tracker, "_followed", lambda *a, real=real, used=used: (used.append(a[1]), real(*a))[1], raising=True
         )
         tracker.track(stereo_frame(FRAME_NS), lambda _: None, sigma_rad)
         tracked = tracker.track(stereo_frame(2 * FRAME_NS), lambda _, predicted=predicted: predicted, sigma_rad)

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features import flow, orb, patch_align, stereo
 from fleetmap.features.corners import spread_corners
 from fleetmap.features.extraction import extract
@@ -13,7 +15,6 @@ from fleetmap.features.matching import match_mutual
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
-from fleetmap.odometry.tracking import tracker_kernels
 from fleetmap.pnp.pnp import (
     GATE_SQUARED,
     REFINEMENT,
@@ -76,6 +77,19 @@ class _Remembered:
     points_cam: Array
 
 
+class _Followed(NamedTuple):
+    """Where N points went: places (N, 2), which of them hold (N,), points_cam (N, 3) before, and how many of those with depth agree with
+    the motion (4, 4), of that information (6, 6) and squared normalised residuals; -1 where they determine none."""
+
+    places: Array
+    kept: NDArray[np.bool_]
+    points_cam: Array
+    agree: int
+    motion: Array
+    information: Array
+    squared: Array
+
+
 @dataclass
 class _Points:
     ids: Ids
@@ -136,68 +150,51 @@ class Tracker:
         self._pyramids[0] = self._pyramids[1]
         return Tracked(self._points.ids.copy(), self._points.pixels.copy(), earlier, motion, share, far, pnp)
 
-    def _points_cam(self, pixels: Array) -> Array:
-        if self._camera.baseline_m == 0:
-            return np.full((len(pixels), 3), np.nan)
-        points_cam = np.empty((len(pixels), 3))
-        tracker_kernels.stereo_points(pixels, self._lens, points_cam)
-        return points_cam
-
     def _follow(self, frame: RectifiedFrame, cam_from_previous: Array, sure: bool) -> tuple[PnpResult | None, float]:
-        """sure: the motion is a prediction, not a guess."""
-        if not len(self._points.ids):
-            return None, 0.0
-        pixels, points_cam = self._points.pixels, self._points_cam(self._points.pixels)
-        predicted = np.empty((len(pixels), 2))  # points without depth move as if far away
-        tracker_kernels.predict(points_cam, pixels, np.ascontiguousarray(cam_from_previous), self._lens, predicted)
-        flowed, kept = self._flow(frame, predicted, sure)
-        pnp = self._motion(points_cam, flowed, kept, cam_from_previous)
-        before = int(kept.sum())
-        carried = np.empty((len(pixels), 3))  # the old disparity is the prior of the new one
-        if pnp is not None:
-            motion, limit_px = pnp.cam_from_source, self._settings.ransac_px
-            tracker_kernels.carry(points_cam, pixels, flowed, motion, self._lens, limit_px, kept, carried)
-        else:
-            carried[:, :2], carried[:, 2] = flowed, np.nan
-        share = float(kept.sum()) / max(before, 1)
-        self._points = _Points(self._points.ids[kept], carried[kept])
-        return pnp, share
-
-    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
-        """Pyramidal Lucas-Kanade with back-check: pixels (N, 2) and which ones hold.
+        """sure: the motion is a prediction, not a guess.
 
         From a prediction one level above the image is enough: coarser levels cost as much again and mix near and far points.
         Where too few points hold, the prediction was wrong, and all levels are used.
         """
-        levels = self._settings.pyramid_levels
-        new, kept = self._flow_from(frame, predicted, min(levels, _LEVELS_WHEN_SURE) if sure else levels)
-        if sure and kept.mean() < _HELD_WHEN_SURE:
-            return self._flow_from(frame, predicted, levels)
-        return new, kept
+        if not len(self._points.ids):
+            return None, 0.0
+        guess, levels = np.ascontiguousarray(cam_from_previous), self._settings.pyramid_levels
+        followed = self._followed(guess, min(levels, _LEVELS_WHEN_SURE) if sure else levels)
+        if sure and followed.kept.mean() < _HELD_WHEN_SURE:
+            followed = self._followed(guess, levels)
+        pnp, kept = self._motion(followed), followed.kept
+        before = int(kept.sum())
+        if pnp is not None:  # the old disparity is the prior of the new one
+            motion, limit_px = np.ascontiguousarray(pnp.cam_from_source), self._settings.ransac_px
+            known = self._points.pixels, followed.points_cam, followed.places
+            kept, carried = core.carry_points(*known, kept, motion, self._lens, limit_px)
+        else:
+            carried = np.column_stack([followed.places, np.full(len(kept), np.nan)])
+        share = float(kept.sum()) / max(before, 1)
+        self._points = _Points(self._points.ids[kept], carried[kept])
+        return pnp, share
 
-    def _flow_from(self, frame: RectifiedFrame, predicted: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
-        s, (before, now) = self._settings, self._pyramids
-        flowed = flow.follow(before, now, self._points.pixels[:, :2], predicted, window_px=s.window_px, levels=levels)
-        return flowed.places, flow.forward_backward_check(
-            before, now, flowed, window_px=s.window_px, within_px=s.back_check_px, margin_px=_MARGIN_PX
-        )
+    def _followed(self, cam_from_previous: Array, levels: int) -> _Followed:
+        s, (before, now) = self._settings, (pyramid.down_to(levels) for pyramid in self._pyramids)
+        limits = s.window_px // 2, s.back_check_px, _MARGIN_PX, s.min_inliers, REFINEMENT
+        return _Followed(*core.track_points(before, now, self._points.pixels, cam_from_previous, self._lens, *limits))
 
-    def _motion(self, points_cam: Array, flowed: Array, kept: NDArray[np.bool_], guess: Array) -> PnpResult | None:
+    def _motion(self, followed: _Followed) -> PnpResult | None:
         """cam_from_previous from points with depth.
 
         Least squares from the guess, RANSAC where most points disagree with it.
         """
-        motion, information, squared = guess.copy(), np.empty((6, 6)), np.empty(len(kept))
-        limits = self._lens, self._settings.min_inliers, REFINEMENT
-        count, agree = tracker_kernels.motion_of(points_cam, flowed, kept, *limits, motion, information, squared)
+        points_cam, kept, squared = followed.points_cam, followed.kept, followed.squared
+        count = len(squared)
         if count < self._settings.min_inliers:
             return None
-        squared = squared[:count]
-        result = PnpResult(motion, information, squared < GATE_SQUARED, squared) if agree >= 0 else None
-        if agree > 0.6 * count:
+        result = None
+        if followed.agree >= 0:
+            result = PnpResult(followed.motion, followed.information, squared < GATE_SQUARED, squared)
+        if followed.agree > 0.6 * count:
             return result
         usable = kept & np.isfinite(points_cam).all(axis=1)
-        measured = np.column_stack([flowed[usable], np.full(count, np.nan)])
+        measured = np.column_stack([followed.places[usable], np.full(count, np.nan)])
         matches = Correspondences(self._camera, points_cam[usable], measured, np.ones((count, 2)))
         again = ransac_pnp(
             matches,

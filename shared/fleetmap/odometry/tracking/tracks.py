@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.geometry import Array
-from fleetmap.odometry.tracking import tracks_kernels
 from fleetmap.sensors.rectification import StereoCamera
 
 _FAR_DEPTH_M = 20.0
@@ -35,17 +35,15 @@ class Observations:
     """Every observation that no update has used yet, in order of arrival."""
 
     def __init__(self) -> None:
-        self._ids, self._frames, self._pixels = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+        self._table = core.Observations()
 
     def add(self, frame_index: int, ids: Ids, pixels: Array) -> None:
         """What one frame saw: ids (N,), pixels (N, 3)."""
-        self._ids = np.concatenate([self._ids, ids])
-        self._frames = np.concatenate([self._frames, np.full(len(ids), frame_index)])
-        self._pixels = np.concatenate([self._pixels, pixels])
+        self._table.add(frame_index, np.ascontiguousarray(ids), np.ascontiguousarray(pixels))
 
     def clear(self) -> None:
         """Forgets all."""
-        self._keep(np.zeros(len(self._ids), bool))
+        self._table.clear()
 
     def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:
         """Removes and returns the tracks that ended, or are due, with two observations or more in the clones `held`.
@@ -53,23 +51,5 @@ class Observations:
         alive (N,): ids that the newest frame saw, due (N,) which of them are to be used now. What is due but seen once
         stays; what ended so is forgotten.
         """
-        order = np.argsort(self._ids, kind="stable")
-        if len(alive) > 1 and not (alive[1:] > alive[:-1]).all():
-            rank = np.argsort(alive)
-            alive, due = alive[rank], due[rank]
-        size = len(order)
-        stays, rows, starts, anchors = np.zeros(size, bool), *np.empty((3, size + 1), np.int64)
-        points_cam = np.empty((size, 3))
         far_px = camera.focal_px * max(camera.baseline_m, 0.01) / _FAR_DEPTH_M
-        seen = self._ids, self._frames, self._pixels, order, alive, due, np.asarray(held, np.int64)
-        out = stays, rows, starts, anchors, points_cam
-        count = tracks_kernels.take(*seen, camera.lens, far_px, *out)
-        used = rows[: starts[count]]
-        batch = TrackBatch(
-            starts[: count + 1], self._frames[used], self._pixels[used], anchors[:count], points_cam[:count]
-        )
-        self._keep(stays)
-        return batch
-
-    def _keep(self, keep: NDArray[np.bool_]) -> None:
-        self._ids, self._frames, self._pixels = self._ids[keep], self._frames[keep], self._pixels[keep]
+        return TrackBatch(*self._table.take(alive, due, np.asarray(held, np.int64), camera.lens, far_px))
