@@ -17,27 +17,40 @@ The result is a log Bayes factor (Kass and Raftery 1995); a landmark's observati
 
 from dataclasses import dataclass, field
 from math import lgamma
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import CovisibleLandmarks
-from locclient.localization import alias_disambiguation_kernels as kernels
-from locclient.localization.alias_disambiguation_kernels import CellModel, Flags, LandmarkSet
 
 _MAX_VIEWS, _ALL_VIEWS = 64, (1 << 64) - 1  # that are remembered: some 20 m of travel
 _MAX_LANDMARKS = 3000  # of a hypothesis: some 30 m of travel
 _STEP_M, _STEP_RAD = 0.2, 0.15  # between views that count: two from the same viewpoint fail for the same reasons
 _REACH_M, _ALIKE_BITS = 0.15, 75  # of one thing's landmark, mapped in two aisles; others differ by 90 bits and more
 # A plate, a poster, a pallet: some lattice has most of a sign in one cell, and little else with it.
-_LATTICES = tuple((cell_m, shift) for cell_m in (0.35, 0.6, 0.9) for shift in (0.0, 0.5))
+_LATTICES = np.array([(cell_m, shift) for cell_m in (0.35, 0.6, 0.9) for shift in (0.0, 0.5)])
 _BLOCK_M, _MAX_BLOCKS = 1.8, 256
 _MAX_BLOCK_LOG_ODDS = 3.0  # no single thing that could have been carried here decides
 # Beta parameters of the share of views in which a landmark is found. Where it stands: about two in five, and one in eight landmarks
 # is never found. Where it does not: by chance.
 _PRESENT, _NEVER_SHARE, _ABSENT = (2.0, 2.8), 0.12, (0.5, 10.0)
+Flags = NDArray[np.bool_]
+
+
+class CellModel(NamedTuple):
+    """Probabilities of what a cell may hold."""
+
+    least: float
+    taken_share: float
+    different_share: float
+    odd_share: float
+    threshold: float
+
+
 _MODEL = CellModel(
     least=2.0,  # landmarks whose absence counts: any single one may be one that is never found
     taken_share=0.05,  # of the cells in which stock was moved since the survey
@@ -122,12 +135,8 @@ class ObservationHistory:
 def mark_shared(one: ObservationHistory, other: ObservationHistory, one_shared: Flags, other_shared: Flags) -> None:
     """Sets the flags of the landmarks (L,), (M,) that look the same at the same spot of the other place."""
     if len(one.ids) and len(other.ids):
-        kernels.mark_alike(
-            LandmarkSet(one.points_odom, packed(one.descriptors), one_shared),
-            LandmarkSet(other.points_odom, packed(other.descriptors), other_shared),
-            _REACH_M,
-            _ALIKE_BITS,
-        )
+        first = one.points_odom, packed(one.descriptors), one_shared
+        core.mark_shared(first, (other.points_odom, packed(other.descriptors), other_shared), _REACH_M, _ALIKE_BITS)
 
 
 def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Flags, other_shared: Flags) -> float:
@@ -143,15 +152,7 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
     for history, shared in ((one, one_shared), (other, other_shared)):
         expected, found = history.counts(common)
         sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], shared | (expected == 0)))
-    slots = 1 << int(np.ceil(np.log2(2 * (len(one.ids) + len(other.ids)))))
-    blocks, totals, count = np.zeros(_MAX_BLOCKS, np.int64), np.zeros((_MAX_BLOCKS, len(_LATTICES))), 0
-    for lattice, (cell_m, shift) in enumerate(_LATTICES):
-        table = kernels.CellTable(np.zeros(slots, np.int64), np.zeros((slots, 3)), np.zeros((slots, 2, 3)))
-        for side, (points_odom, scores, skipped) in enumerate(sides):
-            kernels.add_to_cells(points_odom, scores, skipped, side, (cell_m, shift), table)
-        count = kernels.add_block_log_odds(table, _MODEL, _BLOCK_M, blocks, count, totals[:, lattice])
-    # Of each block the strongest lattice for either place.
-    strongest = np.maximum(totals.max(axis=1), 0.0) - np.maximum(-totals.min(axis=1), 0.0)
+    strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _MODEL, _BLOCK_M, _MAX_BLOCKS)
     return float(np.clip(strongest, -_MAX_BLOCK_LOG_ODDS, _MAX_BLOCK_LOG_ODDS).sum())
 
 

@@ -7,11 +7,11 @@ from statistics import median
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.config import Section
 from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
-from locclient.localization import image_quality_kernels
 
 _EVERY_PX = 8  # step of the rows and columns that are sampled
 _BRIGHT = 250
@@ -57,7 +57,7 @@ class ImageQualityMonitor:
         """The quality of `frame`; its fault is darkness, glare, a camera (either one) that repeats its last image, or blur."""
         thinned = [_ThinnedImage.of(image) for image in (frame.left, frame.right) if image is not None]
         self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
-        count, total, squares = image_quality_kernels.row_steps(frame.left, _EVERY_PX)
+        count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
         variance = squares / count - (total / count) ** 2
         typical = median(self._sharpness) if self._sharpness else variance
         cause = self._exposure_fault(thinned[0])
@@ -103,8 +103,6 @@ class _ThinnedImage:
 
     @classmethod
     def of(cls, image: Image) -> "_ThinnedImage":
-        height, width = image.shape
-        pixels = np.empty((-(-height // _EVERY_PX), -(-width // _EVERY_PX)), np.uint8)
-        total, squares, brights = image_quality_kernels.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT, pixels)
+        pixels, total, squares, brights = core.thin(np.ascontiguousarray(image), _EVERY_PX, _BRIGHT)
         mean = total / pixels.size
         return cls(pixels, mean, sqrt(max(squares / pixels.size - mean * mean, 0.0)), brights / pixels.size)

@@ -10,11 +10,11 @@ more, because they will be found again.
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.tiles import landmark_budget_kernels as kernels
 
 # One thing differs from its twin by some 30 bits, two things by 128; twins stand equally high on the same floor.
 _ALIKE_BITS, _HEIGHT_M = 60, 0.15
@@ -31,13 +31,8 @@ def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> 
     """
     by_height = np.argsort(points_map[:, 2], kind="stable")  # the second search goes along it
     points, words = np.ascontiguousarray(points_map[by_height]), packed(descriptors[by_height])
-    repeated = np.zeros(len(points), bool)
-    for two_bytes in words.view(np.uint16).T:
-        order = np.argsort(two_bytes, kind="stable")
-        kernels.mark_repeated_near(words, points, order, _REACH, _ALIKE_BITS, _HEIGHT_M, _OWN_M, repeated)
-    kernels.mark_repeated(words, points, _MOST_COMPARED, _ALIKE_BITS, _HEIGHT_M, _OWN_M, repeated)
     distinct = np.empty(len(points), bool)
-    distinct[by_height] = ~repeated
+    distinct[by_height] = ~core.twins(words, points, _REACH, _MOST_COMPARED, _ALIKE_BITS, _HEIGHT_M, _OWN_M)
     return distinct
 
 
@@ -75,7 +70,7 @@ def choose_landmarks(
         for part, quota in zip((mask & distinct, mask, mask), quotas, strict=True):
             left, needs = np.flatnonzero(part & ~chosen), quota - taken
             if len(left) and limit > 0:
-                limit -= kernels.choose(
+                limit -= core.choose_landmarks(
                     left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
                 )
                 taken = quota - needs

@@ -1,5 +1,7 @@
 #include "vocabulary.h"
 
+#include <algorithm>
+
 namespace fleetmap {
 
 void descend(Descriptors descriptors, const Tree& tree, int32_t* words) {
@@ -39,6 +41,17 @@ void two_nearest(Descriptors descriptors, Descriptors centres, int32_t* found) {
     found[2 * i] = nearest;
     found[2 * i + 1] = runner_up;
   }
+}
+
+void InvertedFile::add(const int32_t* words, const float* weights, size_t count) {
+  for (size_t w = 0; w < count; ++w) postings_[size_t(words[w])].push_back({int32_t(places_), weights[w]});
+  ++places_;
+}
+
+void InvertedFile::score(const int32_t* words, const float* weights, size_t count, double* scores) const {
+  std::fill_n(scores, places_, 0.0);
+  for (size_t w = 0; w < count; ++w)
+    for (const Posting& posting : postings_[size_t(words[w])]) scores[posting.place] += double(std::min(weights[w], posting.weight));
 }
 
 }  // namespace fleetmap

@@ -62,6 +62,16 @@ def descend(
 def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
     """(N, 2) numbers of the nearest and the second nearest centre."""
 
+class InvertedFile:
+    """Places by the words that they show."""
+
+    def __init__(self, words: int) -> None: ...
+    def add(self, word_ids: _Numbers, weights: _Floats) -> None:
+        """The next place: its words (W,), rising, and their weights."""
+
+    def scores(self, word_ids: _Numbers, weights: _Floats) -> _Reals:
+        """(P,) of each place: 1 - |a - b|_1 / 2, 1 for equal vectors."""
+
 def refine_pnp(
     points: _Reals,
     pixels: _Reals,
@@ -126,6 +136,134 @@ def near_descriptors(
     descriptors: _Descriptors, centres: _Descriptors, cells: int, held: _Descriptors, starts: _Indices, max_bits: int
 ) -> _Flags:
     """(M,) which of held are within max_bits of any of descriptors, in so many cells nearest to that; starts (C + 1,) of the cells."""
+
+def lookalikes(
+    features: _Descriptors,
+    heights_m: _Reals,
+    landmarks: _Descriptors,
+    points_map: _Reals,
+    first: int,
+    last: int,
+    room: int,
+) -> _Numbers:
+    """(P, 2) up to `room` pairs of features (F) and landmarks [first, last) that look the same at the same height, by landmark."""
+
+def camera_votes(
+    pairs: _Numbers, offsets_m: _Reals, points_map: _Reals, low_m: _Reals, cell_m: float, columns: int, rows: int
+) -> _Numbers:
+    """(columns, rows) features that vote for a camera in a square of two cells' side that begins at the cell's corner.
+
+    pairs (P, 2) of features and landmarks, all those of a feature together. offsets_m (F, 2): from the camera to what each feature
+    shows, turned as the camera would be. points_map (N, 3). low_m (2,): where the cells begin.
+    """
+
+def mark_shared(
+    one: tuple[_Reals, _Descriptors, _Flags],
+    other: tuple[_Reals, _Descriptors, _Flags],
+    reach_m: float,
+    max_bits: int,
+) -> None:
+    """Sets flags (N,) of landmarks at points_odom (N, 3) that have one of the other place within reach_m that looks the same."""
+
+def block_log_odds(
+    one: tuple[_Reals, _Reals, _Flags],
+    other: tuple[_Reals, _Reals, _Flags],
+    lattices: _Reals,
+    model: tuple[float, float, float, float, float],
+    block_m: float,
+    room: int,
+) -> _Reals:
+    """(room,) log odds of the first place against the second, of each block of cells by its strongest lattice.
+
+    one, other: points_odom (N, 3), log likelihoods (N, 2) where present and where absent, which are skipped (N,). lattices (L, 2): cell
+    size in metres, shift as a share of it. model: least landmarks, shares taken, different, odd; threshold.
+    """
+
+def thin(image: _Grey, every: int, bright: int) -> tuple[_Grey, int, int, int]:
+    """Each every-th pixel of each every-th row, their sum, that of their squares, how many are at least so bright."""
+
+def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
+    """Number, sum and sum of squares of the steps from pixel to pixel along each every-th row."""
+
+def undistort(lens: _Reals, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
+    """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 brings to the goals; not checked."""
+
+def register_depth(points: _Reals, pixels: _Reals, width: int, height: int) -> _Floats:
+    """(height, width) depth of the nearest point (N, 3) around each pixel (N, 2), NaN for unseen; 0 where there is none."""
+
+def spare_keyframes(
+    rows: _Indices,
+    row_starts: _Indices,
+    tracks: _Indices,
+    starts: _Indices,
+    keyframes: _Indices,
+    octaves: NDArray[np.int8],
+    gap: int,
+    visits: int,
+    share: float,
+    least: int,
+) -> _Flags:
+    """(K,) keyframes of whose tracks a share, and `least`, are seen on so many other visits; visits are `gap` keyframes apart.
+
+    Members (M,) of tracks by rising keyframe: tracks, keyframes, octaves; starts (G + 1,) delimits each track's, row_starts (K + 1,)
+    each keyframe's in rows (M,).
+    """
+
+def duplicate_landmarks(
+    near: _Indices,
+    points_map: _Reals,
+    sigmas_m: _Reals,
+    starts: _Indices,
+    obs_keyframe: _Numbers,
+    descriptors: _Descriptors,
+    most_bits: int,
+) -> _Flags:
+    """(N,) the less observed landmark of every near pair (P, 2), in their order, that could be one landmark.
+
+    starts (N + 1,) delimits each landmark's obs_keyframe (M,); descriptors of their first observations.
+    """
+
+def redundant_keyframes(
+    order: _Indices,
+    rows: _Indices,
+    row_starts: _Indices,
+    obs_landmark: _Numbers,
+    obs_keyframe: _Numbers,
+    octaves: _Indices,
+    starts: _Indices,
+    observers: int,
+    share: float,
+) -> _Flags:
+    """(K,) keyframes, looked at in `order`, of whose observations a share is repeated by so many that are left.
+
+    row_starts (K + 1,) delimits each keyframe's observations in rows, starts (N + 1,) each landmark's.
+    """
+
+def medoids(descriptors: _Descriptors, starts: _Indices) -> _Indices:
+    """(N,) the row of descriptors nearest to all others of its list, which starts (N + 1,) delimits; 0 for an empty one."""
+
+def choose_landmarks(
+    candidates: _Indices,
+    starts: _Indices,
+    bins: _Indices,
+    weights: _Reals,
+    cells: _Indices,
+    room: _Indices,
+    limit: int,
+    counts: _Indices,
+    chosen: _Flags,
+    needs: _Indices,
+    bins_per_view: int,
+) -> int:
+    """Number of candidates chosen, at most `limit`; marks them in chosen (N,).
+
+    Landmark n is seen in bins[starts[n]:starts[n + 1]]. counts of the bins, room of the cells (N,) and needs of the views are carried on.
+    """
+
+def twins(
+    descriptors: _Descriptors, points_map: _Reals, reach: int, most: int, max_bits: int, height_m: float, own_m: float
+) -> _Flags:
+    """(N,) which landmarks at points_map (N, 3), by rising z, look like one that stands as high and further off than own_m."""
 
 def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
     """(N, 2) whole-pixel corners, row by row."""

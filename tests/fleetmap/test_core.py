@@ -93,6 +93,10 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
 
 POINTS = np.ones((5, 3))
 SEEN = POINTS, POINTS, np.ones((5, 2)), np.ones(4), (4.0, 11.0, (10, 5))  # as PnP takes it
+THREE, BOUNDS, NEIGHBOURS = np.arange(3), np.arange(4), np.array([[0, 1]])
+HEIGHTS, PLANE, UNSET, LEVELS = np.ones(3), np.ones((3, 2)), np.zeros(3, bool), np.zeros(3, np.int8)
+CELL_MODEL = 2.0, 0.05, 0.15, 0.01, 1.25
+BUDGET = THREE, np.full(3, 9), 3, np.zeros(3, np.int64), UNSET, np.full(3, 9), 1  # of choose_landmarks
 CONES = POINTS, np.ones((5, 3), np.float32), np.ones(5, np.float32), np.ones(5, np.float32)
 VIEW = 1.0, 10.0, np.pi, 1.2  # scale of distances, margin, angle, scale of octaves
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
@@ -121,6 +125,10 @@ FILTER = InvariantFilter(
         (lambda: core.descend(WORDS, WORDS, NUMBERS, NUMBERS + 5, NUMBERS), "children"),
         (lambda: core.descend(WORDS, WORDS[:0], NUMBERS[:0], NUMBERS[:0], NUMBERS[:0]), "root"),
         (lambda: core.descend(WORDS, WORDS, NUMBERS[:2], NUMBERS, NUMBERS), "one number for each node"),
+        (lambda: core.InvertedFile(0), "words"),
+        (lambda: core.InvertedFile(3).add(NUMBERS + 3, CONES[3][:3]), "word_ids"),
+        (lambda: core.InvertedFile(3).scores(NUMBERS - 1, CONES[3][:3]), "word_ids"),
+        (lambda: core.InvertedFile(3).scores(NUMBERS, CONES[3]), "weights"),
         (lambda: core.refine_pnp(POINTS, POINTS[:2], *SEEN[2:], np.eye(4), None), "pixels"),
         (lambda: core.ransac_pnp(*SEEN[:2], np.ones((2, 2)), *SEEN[3:], 1.0, 4, POINTS / 2, 0.9), "weights"),
         (lambda: core.ransac_pnp(*SEEN, 1.0, 4, POINTS, 0.9), "draws"),
@@ -130,6 +138,50 @@ FILTER = InvariantFilter(
         (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 1, 3]), 9), "starts: one more"),
         (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 2, 1, 3]), 9), "starts: rising"),
         (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 1, 2, 4]), 9), "starts: rising"),
+        (lambda: core.lookalikes(WORDS, POINTS[:2, 0].copy(), WORDS, POINTS[:3], 0, 3, 9), "heights_m"),
+        (lambda: core.lookalikes(WORDS, HEIGHTS, WORDS, POINTS, 0, 3, 9), "points_map"),
+        (lambda: core.lookalikes(WORDS, HEIGHTS, WORDS, POINTS[:3], 2, 4, 9), "first, last"),
+        (lambda: core.lookalikes(WORDS, HEIGHTS, WORDS, POINTS[:3], 0, 3, -1), "room"),
+        (lambda: core.camera_votes(np.full((1, 2), 3, np.int32), PLANE, POINTS, PLANE[0], 0.5, 9, 9), "pairs"),
+        (lambda: core.camera_votes(np.full((1, 2), -1, np.int32), PLANE, POINTS, PLANE[0], 0.5, 9, 9), "pairs"),
+        (lambda: core.camera_votes(np.zeros((1, 2), np.int32), PLANE, POINTS, PLANE[0], 0.5, 1 << 20, 1 << 20), "cells"),
+        (lambda: core.mark_shared((POINTS[:2], WORDS, np.zeros(2, bool)), (POINTS[:3], WORDS, UNSET), 1.0, 9), "one, other"),
+        (lambda: core.block_log_odds((POINTS, PLANE, UNSET), (POINTS[:3], PLANE, UNSET), PLANE, CELL_MODEL, 1.0, 9), "one, other"),
+        (lambda: core.block_log_odds(*[(POINTS[:3], PLANE, UNSET)] * 2, PLANE, CELL_MODEL, 1.0, -1), "room"),
+        (lambda: core.thin(IMAGE, 0, 250), "every"),
+        (lambda: core.row_steps(IMAGE, -1), "every"),
+        (lambda: core.undistort(np.ones(8), HEIGHTS, HEIGHTS[:2]), "goals_y"),
+        (lambda: core.register_depth(POINTS, PLANE, 9, 9), "pixels"),
+        (lambda: core.register_depth(POINTS[:3], PLANE, 9, -1), "width, height"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS, THREE[:2], BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "keyframes: one"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS, THREE, BOUNDS, THREE, LEVELS[:2], 1, 1, 0.5, 1), "octaves: one"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS + 1, THREE, BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "row_starts"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS, THREE, -BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "starts: rising"),
+        (lambda: core.spare_keyframes(THREE + 1, BOUNDS, THREE, BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "rows: of"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS, THREE - 1, BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "tracks: of"),
+        (lambda: core.spare_keyframes(THREE, BOUNDS, THREE, BOUNDS, THREE + 1, LEVELS, 1, 1, 0.5, 1), "keyframes: of"),
+        (lambda: core.duplicate_landmarks(NEIGHBOURS, POINTS[:3], HEIGHTS[:2], BOUNDS, NUMBERS, WORDS, 9), "sigmas_m"),
+        (lambda: core.duplicate_landmarks(NEIGHBOURS, POINTS[:3], HEIGHTS, BOUNDS, NUMBERS, WORDS[:2], 9), "descriptors"),
+        (lambda: core.duplicate_landmarks(NEIGHBOURS, POINTS[:3], HEIGHTS, BOUNDS[:2], NUMBERS, WORDS, 9), "starts: one more"),
+        (lambda: core.duplicate_landmarks(NEIGHBOURS, POINTS[:3], HEIGHTS, BOUNDS, NUMBERS[:2], WORDS, 9), "starts: rising"),
+        (lambda: core.duplicate_landmarks(NEIGHBOURS + 2, POINTS[:3], HEIGHTS, BOUNDS, NUMBERS, WORDS, 9), "near"),
+        (lambda: core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS, NUMBERS[:2], THREE, BOUNDS, 3, 0.9), "obs_keyframe"),
+        (lambda: core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS, NUMBERS, THREE[:2], BOUNDS, 3, 0.9), "octaves"),
+        (lambda: core.redundant_keyframes(THREE + 1, THREE, BOUNDS, NUMBERS, NUMBERS, THREE, BOUNDS, 3, 0.9), "order"),
+        (lambda: core.redundant_keyframes(THREE, THREE - 1, BOUNDS, NUMBERS, NUMBERS, THREE, BOUNDS, 3, 0.9), "rows"),
+        (lambda: core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS + 3, NUMBERS, THREE, BOUNDS, 3, 0.9), "obs_landmark"),
+        (lambda: core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS, NUMBERS - 1, THREE, BOUNDS, 3, 0.9), "obs_keyframe"),
+        (lambda: core.medoids(WORDS, np.array([0, 2, 1])), "starts"),
+        (lambda: core.medoids(WORDS, np.zeros(0, np.int64)), "starts"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS[:2], *BUDGET), "weights"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, THREE[:2], *BUDGET[1:]), "cells: one"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, *BUDGET[:4], UNSET[:2], *BUDGET[5:]), "chosen"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, *BUDGET[:-1], 0), "bins_per_view"),
+        (lambda: core.choose_landmarks(THREE + 1, BOUNDS, THREE, HEIGHTS, *BUDGET), "candidates"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, THREE + 1, *BUDGET[1:]), "cells: of"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE + 1, HEIGHTS, *BUDGET), "bins: of"),
+        (lambda: core.twins(WORDS, POINTS, 6, 9, 60, 0.1, 2.0), "points_map"),
+        (lambda: core.twins(WORDS, POINTS[:3], 6, 0, 60, 0.1, 2.0), "most"),
         (lambda: core.fast_corners(IMAGE, 300, 3, None), "threshold"),
         (lambda: core.fast_corners(IMAGE, 20, 2, None), "border_px"),
         (lambda: core.fast_corners(IMAGE, 20, 3, IMAGE[:5]), "free"),
@@ -201,6 +253,15 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
     assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
     for strange in (np.nan, np.inf, 1e200, 0.0):
         points = np.full((5, 3), strange)
+        core.lookalikes(WORDS, points[:3, 0].copy(), WORDS, points[:3], 0, 3, 9)
+        core.camera_votes(np.zeros((1, 2), np.int32), PLANE, points, PLANE[0], strange, 9, 9)
+        core.mark_shared((points[:3], WORDS, UNSET.copy()), (points[:3], WORDS, UNSET.copy()), strange, 9)
+        place = points[:3], PLANE * strange, UNSET
+        assert len(core.block_log_odds(place, place, PLANE * [1.0, strange], CELL_MODEL, strange, 9)) == 9
+        core.undistort(np.full(8, strange), HEIGHTS * strange, HEIGHTS)
+        core.register_depth(points[:3], PLANE * strange, 9, 9)
+        core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS * strange, *BUDGET)
+        core.twins(WORDS, points[:3], 6, 9, 60, strange, strange)
         core.visible_landmarks((points, *CONES[1:]), np.full((4, 4), strange), np.full(6, strange), *VIEW)
         assert core.refine_pnp(points, *SEEN[1:], np.eye(4), None) is None
         assert core.ransac_pnp(POINTS, points, *SEEN[2:], 1.0, 4, np.eye(3) / 2, 0.9) is None

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array
-from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, mark_redundant
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.state import Keyframe, Landmarks, SurveyState
 
@@ -60,17 +60,15 @@ def _duplicates(
     marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
 ) -> NDArray[np.bool_]:
     """(N,) landmarks that stand where a better observed one stands, look like it and were never seen beside it."""
-    double = np.zeros(len(marks.points_map), bool)
     near = cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
     if not len(near):
-        return double
+        return np.zeros(len(marks.points_map), bool)
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     first = replace(marks, obs_keyframe=marks.obs_keyframe[starts[:-1]], obs_feature=marks.obs_feature[starts[:-1]])
     near = near[np.lexsort((near[:, 1], near[:, 0]))].astype(np.int64)
     descriptors = packed(first.of_features([k.features.descriptors for k in keyframes]))
     landmarks = marks.points_map, sigmas_m, starts, marks.obs_keyframe, descriptors
-    mark_duplicates(near, *landmarks, settings.duplicate_distance, double)
-    return double
+    return core.duplicate_landmarks(near, *landmarks, settings.duplicate_distance)
 
 
 def redundant(
@@ -81,7 +79,6 @@ def redundant(
     Taken out one by one, those with the fewest landmarks first, so that the ones that repeat each other do not all go.
     Source: Mur-Artal and Tardos 2015 (ORB-SLAM).
     """
-    gone = np.zeros(count, bool)
     usable = np.flatnonzero(lasting[marks.obs_landmark])
     own = marks.obs_keyframe[usable]
     seen = np.bincount(own, minlength=count)
@@ -89,5 +86,6 @@ def redundant(
     order = np.array(sorted(range(1, count - 1), key=lambda k: (seen[k], k)), np.int64)
     rows, row_starts = usable[np.argsort(own, kind="stable")], np.concatenate([[0], np.cumsum(seen)])
     observed = marks.obs_landmark, marks.obs_keyframe, octaves, starts
-    mark_redundant(order, rows, row_starts, *observed, settings.redundant_observers, settings.redundant_share, gone)
-    return gone
+    return core.redundant_keyframes(
+        order, rows, row_starts, *observed, settings.redundant_observers, settings.redundant_share
+    )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.features.patch_align import halvings
 from fleetmap.geometry import Array, se3_inverse
@@ -12,7 +13,6 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.culling import Culled, cull
 from mapserver.survey.finish.frame_adjustment import PlacedFrames
-from mapserver.survey.finish.map_assembly_kernels import medoids
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_map import SurveyMap
@@ -58,9 +58,8 @@ def assemble(
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
     """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
     rows = marks.of_features([k.features.descriptors for k in keyframes])
-    chosen = np.zeros(len(marks.points_map), np.int64)
-    medoids(packed(rows), np.searchsorted(marks.obs_landmark, np.arange(len(chosen) + 1)), chosen)
-    return rows[chosen]
+    starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
+    return rows[core.medoids(packed(rows), starts)]
 
 
 def point_sigmas_m(state: SurveyState) -> Array:

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import (
     apply_result,
     bundle_problem,
     bundle_rounds,
 )
-from mapserver.survey.keyframes.revisit_thinning_kernels import TrackMembers, mark_repeated
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, SurveyState
 from mapserver.survey.tracks.tracks import Tracks
@@ -30,7 +30,7 @@ def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: Sur
     whole drives are left. None are redundant where no place is seen on more visits than those. Keyframes that then share too
     few tracks with the others, such as blind ones, are redundant too: their neighbours are known better.
     """
-    cull, redundant = settings.cull, np.zeros(len(keyframes), bool)
+    cull = settings.cull
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
     octaves = np.concatenate([np.zeros(0, np.int8), *(k.features.octaves for k in keyframes)])
     starts = np.append(tracks.starts, len(tracks.keyframes))
@@ -39,8 +39,9 @@ def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: Sur
     row_starts = np.searchsorted(tracks.keyframes[order], np.arange(len(keyframes) + 1))
     octaves = octaves[first_of[tracks.keyframes] + tracks.features]
     gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
+    members = track, starts, tracks.keyframes, octaves
     limits = gap, cull.repeated_visits, cull.repeated_share, least
-    mark_repeated(order, row_starts, TrackMembers(track, starts, tracks.keyframes, octaves), limits, redundant)
+    redundant = core.spare_keyframes(order, row_starts, *members, *limits)
     while (alone := _left_alone(tracks.keyframes, track, redundant, least)).any():
         redundant |= alone
     return redundant

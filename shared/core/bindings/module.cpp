@@ -7,14 +7,18 @@
 
 namespace nb = nanobind;
 
+void bind_aliases(nb::module_&);
 void bind_block_cholesky(nb::module_&);
 void bind_bundle(nb::module_&);
 void bind_calibration(nb::module_&);
+void bind_camera(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_filter(nb::module_&);
 void bind_grid(nb::module_&);
 void bind_imu_checks(nb::module_&);
 void bind_mono_window(nb::module_&);
+void bind_image_quality(nb::module_&);
+void bind_landmarks(nb::module_&);
 void bind_matching(nb::module_&);
 void bind_pair_matching(nb::module_&);
 void bind_patch_align(nb::module_&);
@@ -47,6 +51,7 @@ NB_MODULE(_core, module) {
         "fleetmap needs a processor with AVX2 and FMA (x86-64-v3: Intel since Haswell, 2013; AMD since Excavator, 2015), which this one "
         "is not; in a virtual machine let it see the host's processor");
 #endif
+  bind_aliases(module);
   bind_block_cholesky(module);
   bind_bundle(module);
   bind_calibration(module);
@@ -55,6 +60,9 @@ NB_MODULE(_core, module) {
   bind_grid(module);
   bind_imu_checks(module);
   bind_mono_window(module);
+  bind_camera(module);
+  bind_image_quality(module);
+  bind_landmarks(module);
   bind_matching(module);
   bind_pair_matching(module);
   bind_patch_align(module);
@@ -63,8 +71,8 @@ NB_MODULE(_core, module) {
   bind_relocalization(module);
   bind_render(module);
   bind_stereo(module);
-  bind_surfels(module);
   bind_track_joining(module);
-  bind_tracking(module);
   bind_vocabulary(module);
+  bind_surfels(module);
+  bind_tracking(module);
 }

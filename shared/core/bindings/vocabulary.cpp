@@ -38,6 +38,27 @@ auto two_nearest_of(const Packed& descriptors, const Packed& centres) {
   return as_numpy<int32_t, 2>(std::move(found), {count, 2});
 }
 
+using Weights = Array<float, -1>;
+
+void check_words(const InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
+  if (weights.shape(0) != word_ids.shape(0)) throw nb::value_error("weights: one for each word");
+  for (size_t w = 0; w < word_ids.shape(0); ++w)
+    if (word_ids(w) < 0 || size_t(word_ids(w)) >= index.words()) throw nb::value_error("word_ids: of the vocabulary");
+}
+
+void add_place(InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
+  check_words(index, word_ids, weights);
+  index.add(word_ids.data(), weights.data(), word_ids.shape(0));
+}
+
+auto scores_of(const InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
+  check_words(index, word_ids, weights);
+  const size_t count = index.places();
+  std::vector<double> scores(count);
+  unlocked([&] { index.score(word_ids.data(), weights.data(), word_ids.shape(0), scores.data()); });
+  return as_numpy<double, 1>(std::move(scores), {count});
+}
+
 }  // namespace
 
 void bind_vocabulary(nb::module_& module) {
@@ -45,4 +66,15 @@ void bind_vocabulary(nb::module_& module) {
   module.def("descend", &descend_of, descriptors, centres, "first_child"_a.noconvert(), "child_count"_a.noconvert(),
              "word_of_node"_a.noconvert());
   module.def("two_nearest", &two_nearest_of, descriptors, centres);
+  const auto word_ids = "word_ids"_a.noconvert(), weights = "weights"_a.noconvert();
+  nb::class_<InvertedFile>(module, "InvertedFile")
+      .def(
+          "__init__",
+          [](InvertedFile* index, int words) {
+            if (words < 1 || words > 1 << 24) throw nb::value_error("words: 1 to 2^24");
+            new (index) InvertedFile(size_t(words));
+          },
+          "words"_a)
+      .def("add", &add_place, word_ids, weights)
+      .def("scores", &scores_of, word_ids, weights);
 }

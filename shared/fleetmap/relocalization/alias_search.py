@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array
-from fleetmap.relocalization import alias_search_kernels
 
 _MAX_FEATURES, _MAX_PAIRS = 96, 400_000
 _CELL_M = 0.5
@@ -62,16 +62,15 @@ def find_aliases(
     points_map = seen.points_map[used]
     features, others = packed(seen.descriptors[used]), packed(landmarks.descriptors)
     heights_m = np.ascontiguousarray(points_map[:, 2])
-    pairs, count = np.empty((_MAX_PAIRS, 2), np.int32), 0
+    found, room = [np.zeros((0, 2), np.int32)], _MAX_PAIRS
     step = max(1, _COMPARISONS_PER_SLICE // max(len(used), 1))
     for first in range(0, len(others), step):
         if first:
             yield
         last = min(first + step, len(others))
-        count += alias_search_kernels.alike(
-            features, heights_m, others, landmarks.points_map, first, last, pairs[count:]
-        )
-    pairs = pairs[:count]
+        found.append(core.lookalikes(features, heights_m, others, landmarks.points_map, first, last, room))
+        room -= len(found[-1])
+    pairs = np.concatenate(found)
     pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
     votes = _Votes(pairs, points_map, landmarks.points_map, map_from_cam)
     return [votes.candidate(*peak, used) for peak in votes.peaks(min_ratio, max_count)]
@@ -87,8 +86,9 @@ class _Votes:
         high = np.maximum(
             np.minimum(landmarks_map[:, :2].max(axis=0) + _BORDER_M, here + _REACH_M), self._low + 2 * _CELL_M
         )
-        self._shape = tuple(int(n) for n in np.ceil((high - self._low) / _CELL_M))
-        self._offsets = [(points_map[:, :2] - map_from_cam[:2, 3]) @ turn.T for turn in _QUARTER_TURNS]
+        self._shape: tuple[int, int] = tuple(np.ceil((high - self._low) / _CELL_M).astype(int).tolist())
+        offsets = points_map[:, :2] - map_from_cam[:2, 3]
+        self._offsets = [np.ascontiguousarray(offsets @ turn.T) for turn in _QUARTER_TURNS]
         # Landmarks of the place itself vote for it alone. Near a camera they lie in the same cell from whichever side they are seen.
         away_m = np.linalg.norm(landmarks_map[pairs[:, 1]] - points_map[pairs[:, 0]], axis=1)
         self._others = np.ascontiguousarray(pairs[away_m > _OWN_LANDMARK_M])
@@ -98,10 +98,7 @@ class _Votes:
         self._own = max(int(there[column - 1 : column + 1, row - 1 : row + 1].max()), 1)
 
     def _cast(self, pairs: NDArray[np.int32], quarter: int) -> NDArray[np.int32]:
-        counts, last = np.zeros(self._shape, np.int32), np.full(self._shape, -1, np.int32)
-        offsets = self._offsets[quarter]
-        alias_search_kernels.vote(pairs, offsets, self._landmarks_map, self._low, _CELL_M, last, counts)
-        return counts
+        return core.camera_votes(pairs, self._offsets[quarter], self._landmarks_map, self._low, _CELL_M, *self._shape)
 
     def peaks(self, min_ratio: float, max_count: int) -> list[tuple[int, Array, float]]:
         """Quarter turn, (x, y) and share of the own votes of the best cells, none near another one or near the place itself."""

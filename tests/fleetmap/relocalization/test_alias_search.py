@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.numerics.time_sliced import finished
-from fleetmap.relocalization import alias_search_kernels
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 
 PITCH_M, AISLES = 5.0, 7
@@ -89,17 +89,14 @@ def test_alike_is_what_its_definition_says() -> None:
     landmarks = spoiled(rng, looks[rng.integers(0, 40, 300)], 0.15)
     points: Array = rng.uniform(0, 1, (300, 3))
     heights: Array = rng.uniform(0, 1, 40)
-    pairs = np.empty((20_000, 2), np.int32)
     features, held = packed(looks), packed(landmarks)
-    first = alias_search_kernels.alike(features, heights, held, points, 0, 170, pairs)
-    count = first + alias_search_kernels.alike(features, heights, held, points, 170, 300, pairs[first:])
+    parts = [core.lookalikes(features, heights, held, points, *part, 20_000) for part in ((0, 170), (170, 300))]
+    pairs = np.concatenate(parts)
     bits = np.bitwise_count(looks[:, None] ^ landmarks).sum(axis=2)
     expected = (bits <= 50) & (np.abs(points[:, 2] - heights[:, None]) <= 0.3)
-    assert 20 < expected.sum() == count
-    assert set(map(tuple, pairs[:count].tolist())) == set(
-        zip(*(axis.tolist() for axis in np.nonzero(expected)), strict=True)
-    )
-    assert alias_search_kernels.alike(features, heights, held, points, 0, 300, pairs[:7]) == 7
+    assert 20 < expected.sum() == len(pairs)
+    assert set(map(tuple, pairs.tolist())) == set(zip(*(axis.tolist() for axis in np.nonzero(expected)), strict=True))
+    np.testing.assert_array_equal(core.lookalikes(features, heights, held, points, 0, 300, 7), pairs[:7])
 
 
 def test_a_feature_votes_once_in_a_square() -> None:
@@ -107,8 +104,7 @@ def test_a_feature_votes_once_in_a_square() -> None:
     pairs = np.array([[0, 0], [0, 1], [1, 2]], np.int32)
     points = np.array([[5.0, 5.0, 1.0], [5.05, 5.0, 1.0], [7.0, 5.0, 1.0]])
     offsets = np.array([[1.0, 0.0], [3.0, 0.0]])
-    counts = np.zeros((40, 40), np.int32)
-    alias_search_kernels.vote(pairs, offsets, points, np.zeros(2), 0.5, np.full((40, 40), -1, np.int32), counts)
+    counts = core.camera_votes(pairs, offsets, points, np.zeros(2), 0.5, 40, 40)
     assert counts.max() == 2
     assert counts[7:9, 9:11].min() == 2
     assert counts.sum() == 8

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
-from locclient.localization import image_quality_kernels
 from locclient.localization.image_quality import ImageQualityMonitor, ImageQualitySettings
 
 Spoil = Callable[[Image, np.random.Generator], Image]
@@ -82,10 +82,9 @@ def test_something_before_the_cameras_is_told_by_its_depth() -> None:
 
 def test_sums_are_those_of_numpy() -> None:
     seen = np.random.default_rng(7).integers(0, 256, (43, 77)).astype(np.uint8)
-    small = np.empty((6, 10), np.uint8)
-    total, squares, brights = image_quality_kernels.thin(seen, 8, 250, small)
+    small, total, squares, brights = core.thin(seen, 8, 250)
     thinned = seen[::8, ::8].astype(np.int64)
     np.testing.assert_array_equal(small, thinned)
     assert (total, squares, brights) == (thinned.sum(), (thinned**2).sum(), (thinned >= 250).sum())
     steps = np.diff(seen[::8].astype(np.int64), axis=1)
-    assert image_quality_kernels.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())
+    assert core.row_steps(seen, 8) == (steps.size, steps.sum(), (steps**2).sum())

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import encode_tile
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.tiles import landmark_budget_kernels as kernels
 from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m, distinctive_landmarks
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
@@ -58,7 +58,7 @@ def test_the_lazy_choice_is_the_plain_one(seed: int, needs: list[int]) -> None:
     expected = plain_greedy(bins, weights, cells, room.tolist(), 20, needs)
     starts = np.concatenate([[0], np.cumsum([len(b) for b in bins])]).astype(np.int64)
     chosen = np.zeros(40, bool)
-    taken = kernels.choose(
+    taken = core.choose_landmarks(
         np.arange(40), starts, np.concatenate(bins).astype(np.int64), weights, cells.astype(np.int64),
         room.astype(np.int64), 20, np.zeros(12, np.int64), chosen, np.array(needs), 4,
     )  # fmt: skip

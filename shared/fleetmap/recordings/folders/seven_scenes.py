@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.folders.depth_registration_kernels import nearest_surface
 from fleetmap.recordings.folders.layout import ImageFiles, existing_images, file_frames, read_image, read_table
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import decode_depth, decode_grey
@@ -95,9 +95,8 @@ class DepthRegistration:
         known = (depth_m.ravel() > 0) & self._has_ray
         points_depth = self._rays_depth[known] * depth_m.ravel()[known, None]
         points_colour = transform_points(self._colour_from_depth, points_depth.astype(np.float64))
-        image = np.empty((self._colour.height_px, self._colour.width_px), np.float32)
-        nearest_surface(points_colour, self._colour.pixel_from_ray(points_colour), image)
-        return image
+        pixels = np.ascontiguousarray(self._colour.pixel_from_ray(points_colour))
+        return core.register_depth(points_colour, pixels, self._colour.width_px, self._colour.height_px)
 
 
 def _files(path: Path, kind: str, log: ReadLog) -> ImageFiles:

@@ -8,8 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.geometry import Array
-from fleetmap.sensors.cameras.radial_tangential_kernels import Lens, undistort
+
+Lens = tuple[float, float, float, float, float, float, float, float]  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
 def _coefficients(distortion: Array) -> Lens:
@@ -55,8 +57,7 @@ def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Ar
     """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN where it does not come back to the pixel."""
     fx, fy, cx, cy = intrinsics_px
     goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    x, y = np.empty_like(goal_x), np.empty_like(goal_y)
-    undistort(_coefficients(distortion), (goal_x, goal_y), (x, y))
+    x, y = core.undistort(np.array(_coefficients(distortion)), goal_x, goal_y)
     back_x, back_y = _distort(distortion, x, y)
     limit = _radial_limit(_coefficients(distortion))
     missed = ~((np.hypot(back_x - goal_x, back_y - goal_y) < 1e-7) & (x * x + y * y < limit))

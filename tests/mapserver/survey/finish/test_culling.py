@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 from mapserver.survey.finish.culling import cull, parallax_rad, redundant
-from mapserver.survey.finish.map_assembly_kernels import mark_duplicates, medoids
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
 from support.worlds.session_scene import CAMERA, survey_state
@@ -112,8 +112,7 @@ def test_the_medoid_is_the_nearest_to_all_others() -> None:
     rng = np.random.default_rng(4)
     rows = rng.integers(0, 256, (40, 32)).astype(np.uint8)
     starts = np.array([0, 1, 4, 20, 40])
-    chosen = np.zeros(4, np.int64)
-    medoids(packed(rows), starts, chosen)
+    chosen = core.medoids(packed(rows), starts)
     for n in range(4):
         own = np.unpackbits(rows[starts[n] : starts[n + 1]], axis=1).astype(int)
         total = np.abs(own[:, None] - own[None]).sum(axis=(1, 2))
@@ -131,9 +130,8 @@ def test_only_what_could_be_one_landmark_is_a_duplicate() -> None:
     points[5] += 0.2
     keyframes = [[0, 1], [2], [0, 1], [2], [0, 1], [2], [0, 1], [1, 2], [0], [2, 3]]
     starts = np.cumsum([0, *(len(k) for k in keyframes)])
-    double = np.zeros(10, bool)
-    mark_duplicates(
+    double = core.duplicate_landmarks(
         np.arange(10).reshape(5, 2), points, np.full(10, 0.02), starts, np.concatenate(keyframes).astype(np.int32),
-        packed(words), 50, double,
+        packed(words), 50,
     )  # fmt: skip
     assert np.flatnonzero(double).tolist() == [1, 8]
