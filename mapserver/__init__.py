@@ -14,10 +14,10 @@ The names are imported when they are first used, so that `import mapserver` and 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from fleetmap import __version__
 from fleetmap.errors import FleetmapError
 
 if TYPE_CHECKING:
+    from fleetmap import __version__
     from mapserver.library import (
         Actor,
         BuildOptions,
@@ -38,6 +38,8 @@ def __getattr__(name: str) -> Any:
     """The library's names, PEP 562; FleetmapError where the server's libraries are not installed."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "__version__":  # which is looked up in the installation's metadata
+        return importlib.import_module("fleetmap").__version__
     try:
         return getattr(importlib.import_module("mapserver.library"), name)
     except ModuleNotFoundError as error:

@@ -11,7 +11,7 @@ Names are imported when they are first used, so that `import fleetmap` stays lig
 shared/README.md; every error is a `FleetmapError` whose message names the next step. examples/ holds whole programs.
 """
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -62,6 +62,8 @@ _MODULES = {name: f"fleetmap.{module}" for module, names in _NAMES.items() for n
 
 
 def _version() -> str:
+    from importlib import metadata  # takes a tenth of a second
+
     try:
         return metadata.version("fleetmap")
     except metadata.PackageNotFoundError:

@@ -81,14 +81,18 @@ def _fields(kind: Any) -> list[inspect.Parameter]:
 
 def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> typer.Typer:
     """A program of these commands; `callback` holds its own options, `read_config` serves --config."""
-    settings: dict[str, Any] = {"obj": Program(commands, read_config)}
+    settings: dict[str, Any] = {"obj": Program(commands, read_config), "max_content_width": 140}
     app = typer.Typer(
-        no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, context_settings=settings
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,  # help in frames would cost every call 0.3 s
+        context_settings=settings,
     )
     app.callback()(callback)
     for name, command in commands.items():
         if isinstance(command, Group):
-            group = typer.Typer(no_args_is_help=True, add_completion=False, help=command.help)
+            group = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None, help=command.help)
             for inner_name, inner in command.commands.items():
                 group.command(inner_name, cls=RetiringCommand)(inner)
             app.add_typer(group, name=name)
