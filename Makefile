@@ -5,10 +5,10 @@
 #   make test                  all tests but the long ones
 #   make test-all              every test: with browser walks, fault sweeps, real recordings, nights and drills
 #   make test-ci               make test, and those of the long tests that CI runs (tests/tiers.toml)
+#   make sanitize              what computes, with a core that ends at a read beside an array or an undefined result (needs g++)
 #   make check                 format, lint, types, import contracts
 #   make docs                  write the tables of docs/command_line.md and docs/settings.md anew
 #   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
-#   make kernels               compile what everything computes with, once for all processes; tests and demo do it as they go
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
 #   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
@@ -34,7 +34,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core demo demo-recording test test-ci test-all check docs kernels kernels-server kernels-robot kernels-simulator bench acceptance study clean
+.PHONY: help core demo demo-recording test test-ci test-all sanitize check docs bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -73,22 +73,18 @@ check: $(DEV_STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The core once more, with sanitizers, and what calls it: a read beside an array, or an overflow, ends the test.
+SANITIZED := $(VENV)/core-sanitize
+TESTS_OF_CORE := $(addprefix tests/,fleetmap fleetsim mapserver/survey mapserver/calibration mapserver/surfels mapserver/grid mapserver/tiles \
+	locclient/localization locclient/replay/test_failure_replay.py)
+sanitize: core
+	@$(BUILD_CORE) sanitize
+	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so) $$(c++ -print-file-name=libstdc++.so)" \
+		ASAN_OPTIONS=detect_leaks=0 FLEETMAP_CORE="$$(echo $(CURDIR)/$(SANITIZED)/_core.*.so)" PYTHONPATH=shared/core/sanitize \
+		$(BIN)/python -m pytest $(TESTS_OF_CORE) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+
 docs: core
 	$(BIN)/python docs/generate.py
-
-# With --jobs=2 side by side: most of what robots share with the server is there when they get to it.
-kernels: kernels-server kernels-robot kernels-simulator
-
-kernels-server: core
-	$(BIN)/mapserver prepare
-
-kernels-robot: core
-	$(BIN)/locclient prepare
-
-# All kernels of pictures: through a lens, blurred, spoiled by a camera.
-kernels-simulator: core
-	folder=$$(mktemp -d) && $(BIN)/fleetsim record clip --robot tote-1 --lens equidistant --camera-pipeline phone --frames 20 \
-		--size 160x120 --out $$folder/clip.mcap; status=$$?; rm -r $$folder; exit $$status
 
 bench: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py --all $(NAMES)

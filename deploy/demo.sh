@@ -16,7 +16,6 @@ ROBOTS=(tote-1 tote-2)
 READY_WITHIN_S=60
 server_pid=
 robots_pid=
-prepare_pid=
 drive_pids=()
 replay_pids=()
 publish_options=()
@@ -62,7 +61,7 @@ if [[ ${1:-} == --check ]]; then
 fi
 recording=${1:-}
 check_recording "$recording"
-trap 'stop_server || true; kill $robots_pid $prepare_pid ${drive_pids[@]+"${drive_pids[@]}"} \
+trap 'stop_server || true; kill $robots_pid ${drive_pids[@]+"${drive_pids[@]}"} \
   ${replay_pids[@]+"${replay_pids[@]}"} 2>/dev/null || true' EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
@@ -132,11 +131,8 @@ half_of() {
 
 warehouse() {
   local robot number
-  say "a survey robot drives through a simulated warehouse; meanwhile the kernels are compiled, the first time"
-  ("$BIN/mapserver" prepare && "$BIN/locclient" prepare) >"$OUT/prepare.log" 2>&1 &
-  prepare_pid=$!
+  say "a survey robot drives through a simulated warehouse"
   record survey 0
-  wait "$prepare_pid" || { cat "$OUT/prepare.log" >&2; fail "compiling the kernels failed"; }
   say "building a map of the survey; meanwhile it is the next day and two robots drive, stock has moved"
   (for robot in "${ROBOTS[@]}"; do record "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
   robots_pid=$!

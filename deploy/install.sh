@@ -27,7 +27,7 @@ pip() { "$tools/bin/python" -m pip --python "$folder/bin/python" install --quiet
 pip --require-hashes --only-binary :all: "$@" -r "$lock"
 pip --no-deps "$wheel"
 
-rm -rf "$folder"/lib/python*/site-packages/numba/tests "$folder"/lib/python*/site-packages/cv2/data/*.xml
+rm -rf "$folder"/lib/python*/site-packages/cv2/data/*.xml
 find "$folder"/lib/python*/site-packages/numpy -type d -name tests -prune -exec rm -rf {} +
 if command -v strip readelf >/dev/null; then
   # Without the *.libs folders: what wheels bundle there was rewritten when they were made, and strip damages such files.

@@ -28,9 +28,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fleetmap import __version__
-    from fleetmap.numerics.time_sliced import finished
     from fleetmap.relocalization.map_view import MapView
     from fleetmap.relocalization.relocalizer import Fix, Relocalizer
+    from fleetmap.time_sliced import finished
     from locclient.localization.estimate import Estimate
     from locclient.localization.localizer import Localizer
     from locclient.localization.settings import LocalizerSettings
@@ -55,7 +55,7 @@ __all__ = [
 ]
 _NAMES = {
     "fleetmap": "__version__",
-    "fleetmap.numerics.time_sliced": "finished",
+    "fleetmap.time_sliced": "finished",
     "fleetmap.relocalization.map_view": "MapView",
     "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
     "locclient.localization.estimate": "Estimate",

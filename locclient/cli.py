@@ -1,7 +1,6 @@
 """The command `locclient`. Heavy imports happen inside the commands, after their arguments are checked."""
 
 import os
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -94,37 +93,6 @@ def status(
     typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
 
 
-def prepare() -> None:
-    """Compile everything that `run` and `replay` compute with, so that no frame waits; at once where that was done before."""
-    import fleetmap
-    import locclient
-    from fleetmap.preparation.kernel_cache import prepare_kernels
-
-    packages = [Path(package.__path__[0]) for package in (fleetmap, locclient)]
-    prepare_kernels("locclient", packages, warm_up_steps, typer.echo)
-
-
-def warm_up_steps() -> Mapping[str, Callable[[], None]]:
-    """What `prepare` runs, by its name."""
-    import cv2
-
-    from fleetmap.preparation.painted_room import rig
-    from fleetmap.sensors.rectification import Rectifier
-    from fleetmap.sensors.samples import SensorSet
-    from locclient.localization.settings import LocalizerSettings
-    from locclient.robot.jit_warmup import warm_up_kernels
-
-    cv2.setNumThreads(1)
-
-    def warm_up(sensors: SensorSet) -> None:
-        calibration = rig(sensors)
-        rectifier = Rectifier(calibration, has_depth=sensors is SensorSet.RGBD)
-        warm_up_kernels(calibration, rectifier, LocalizerSettings())
-
-    carried = (SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD)
-    return {f"robot with {sensors}": lambda sensors=sensors: warm_up(sensors) for sensors in carried}  # type: ignore[misc]
-
-
 def show_config(context: typer.Context, config: ConfigFile = None) -> None:
     """Print the effective configuration as TOML, with the origin of every value."""
     import msgspec
@@ -146,7 +114,6 @@ COMMANDS: Commands = {
     "replay": replay,
     "run": run,
     "status": status,
-    "prepare": prepare,
     "config": Group("The configuration file.", {"show": show_config}),
 }
 

@@ -16,7 +16,6 @@ from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
-from mapserver.commands.prepare import prepare
 from mapserver.commands.releases.inspect import diff, inspect, versions
 from mapserver.commands.releases.promote import promote, publish, rollback
 from mapserver.commands.serve import serve
@@ -62,7 +61,6 @@ COMMANDS: Commands = {
     "map": MAP,
     "operators": OPERATORS,
     "audit": audit,
-    "prepare": prepare,
     "trust": TRUST,
     "config": CONFIG,
 }

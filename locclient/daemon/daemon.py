@@ -12,8 +12,8 @@ import cv2
 
 from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UsageError
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import WantedVersion
-from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
@@ -33,7 +33,7 @@ from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
-from locclient.robot.jit_warmup import drop_compiler_code, gc_frozen, warm_up_kernels
+from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Robot
 from locclient.vda5050.adapter import FleetAdapter
 from locclient.vda5050.factsheet import read_factsheet
@@ -123,12 +123,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             _log.error("failures are not kept: %s", outbox.fault)
         if outbox.set_aside is not None:
             _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
-        begun_s = time.monotonic()
-        warm_up_kernels(calibration, rectifier, config.localizer)
-        drop_compiler_code()
         give_back_free_memory()
         stack.enter_context(gc_frozen())
-        _log.info("warm after %.1f s", time.monotonic() - begun_s)
         caches: tuple[TileCache, ...] = ()
         server: ServerSync | None = None
         maps: MapSource

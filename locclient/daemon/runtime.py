@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.log_lines import LogLimit
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
-from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from fleetmap.threads import ended_by_threads

@@ -6,9 +6,9 @@ from itertools import combinations
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate, log_odds, mark_shared
 from locclient.localization.pose_covariance import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.estimate import QueryResult

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix, is_reliable
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.time_sliced import TimeSliced
 from locclient.localization.estimate import QueryResult
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.initial_pose_prior import InitialPosePrior, agrees

@@ -13,8 +13,8 @@ import cv2
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.errors import LinkError, RecordingError, UsageError
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import Array, rotation_angle_rad
-from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.lens_fit import lens_of_frames
 from fleetmap.sensors.rectification import Rectifier
@@ -31,7 +31,7 @@ from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_reporter import RunReporter
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile
-from locclient.robot.jit_warmup import gc_frozen
+from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from fleetmap.errors import StoreError, disk_errors
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import AnyArray
-from fleetmap.numerics.free_memory import give_back_free_memory
 from fleetmap.sensors.samples import CameraFrame
 from mapserver.survey.state import MemoryImageStore, Pictures
 
@@ -88,7 +88,7 @@ class MappedImageStore:
             segment.madvise(mmap.MADV_DONTNEED)
 
     def _mapped(self, array: AnyArray) -> AnyArray:
-        """The same array in the file, writable, so that numba compiles no second version for it; OSError where the disk has no room."""
+        """The same array in the file; OSError where the disk has no room."""
         data = np.ascontiguousarray(array)
         if not data.size:
             return data

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MAX_REFUSED = 300  # loops of a build, the most alike first: they are what could have made a wrong map
 MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
 
-_LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
+_LIBRARIES = ("numpy", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
 class BuildReport(msgspec.Struct, frozen=True, kw_only=True):

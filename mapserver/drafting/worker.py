@@ -1,6 +1,6 @@
 """Executors for surveys: threads of this process, or the processes of a dask cluster.
 
-Threads copy nothing, and the kernels run without the interpreter's lock. What travels to a cluster are pickles, which run code where they
+Threads copy nothing, and the core runs without the interpreter's lock. What travels to a cluster are pickles, which run code where they
 are opened: it is reached by TLS with certificates on both sides.
 """
 
@@ -39,8 +39,7 @@ class Threads:
 class Cluster:
     """An executor of the processes behind a dask client.
 
-    Everything travels as pickles of ours: arrays that dask unpacks itself cannot be written to, and numba would compile every
-    kernel a second time for such.
+    Everything travels as pickles of ours: arrays that dask unpacks itself cannot be written to.
     """
 
     def __init__(self, client: Any) -> None:

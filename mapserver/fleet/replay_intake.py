@@ -109,7 +109,7 @@ def _judged(data: bytes, named: tuple[str, str, str]) -> FailureReplay:
 
 
 def _read(path: Path, data: bytes, named: tuple[str, str, str]) -> FailureReplay:
-    # Recordings' readers bring OpenCV and numba: every command that reads a configuration would load them.
+    # Recordings' readers bring OpenCV: every command that reads a configuration would load them.
     from fleetmap.recordings import open_recording
     from fleetmap.recordings.failure_recording import SUMMARY, attachments_of
     from fleetmap.recordings.images import image_size

@@ -30,7 +30,6 @@ _AHEAD = 8  # decoded frames that wait
 _QUEUE = 40  # frames of sensors that may wait for tracking: two seconds
 _IMU_WAIT_S = 0.05
 _POLL_S = 0.25
-_WARM_UP_FRAMES = 3
 _SILENCE_S = 10.0  # after which a sensor that has said nothing is no sensor
 
 
@@ -59,9 +58,6 @@ class Drive(Protocol):
     def check(self) -> list[str]:
         """What is wanting, in words; RecordingError for what a build would refuse, as far as that shows before the drive."""
 
-    def warm_up(self) -> tuple[RectifiedFrame, ...]:
-        """A few frames to load kernels on, if there are any before it begins."""
-
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """Each frame when it is due; None now and then while none comes."""
 
@@ -89,9 +85,6 @@ class RecordedDrive:
     def check(self) -> list[str]:
         refuse_hopeless(self._recording)
         return [f"issue: {issue.what}: {issue.detail}" for issue in self._recording.issues]
-
-    def warm_up(self) -> tuple[RectifiedFrame, ...]:
-        return tuple(self._frame(int(index)) for index in self._indices[:_WARM_UP_FRAMES])
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """See Drive."""
@@ -145,9 +138,6 @@ class SensorDrive:
     def check(self) -> list[str]:
         """See Drive: sensors are judged by what they send."""
         return []
-
-    def warm_up(self) -> tuple[RectifiedFrame, ...]:
-        return ()
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """See Drive; RecordingError where the sensors end by a fault, with where the drive is recorded up to there."""

@@ -17,7 +17,6 @@ from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse, skew
 from fleetmap.live_survey import LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
-from fleetmap.sensors.samples import ImuSamples
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
@@ -149,13 +148,8 @@ class _Survey:
         """Tracks all frames, each when it is due; `check` comes first."""
         request, drive = self._request, self._drive
         rectifier = drive.rectifier
-        warm_up = drive.warm_up()
-        scratch = LiveTracking(drive.calibration, rectifier, request.settings)
-        for frame in warm_up:
-            scratch.handle(frame, ImuSamples.empty(), ())
-        del scratch
         # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
-        with _one_thread(), MappingProcess(self._config, self._rig, warm_up) as mapping:
+        with _one_thread(), MappingProcess(self._config, self._rig) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
             self._look(mapping)

@@ -24,7 +24,7 @@ from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 
-_READY_WITHIN_S = 120.0  # a first start compiles kernels
+_READY_WITHIN_S = 60.0  # it imports the survey, on a machine that may be busy
 _STOP_WITHIN_S = 120.0  # for the keyframes that wait
 MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 _LOOK_EVERY_S = 2.0  # at what the drive lacks
@@ -75,13 +75,12 @@ _Item = tuple[RectifiedFrame, NewKeyframe]
 class MappingProcess:
     """The process and the threads that speak with it, from `with` until its end."""
 
-    def __init__(self, config: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
-        """warm_up: frames on which its kernels are loaded before the survey begins."""
+    def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         # What it needs goes through the pipe: more than a pipe holds, as arguments, would wait for ever for a process that has died.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
-        self._theirs, self._needed = theirs, (config, rig, warm_up)
+        self._theirs, self._needed = theirs, (config, rig)
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
@@ -94,7 +93,10 @@ class MappingProcess:
         self._theirs.close()
         if not self._is_ready():
             self._process.kill()
-            raise FleetmapError("mapping did not start; `mapserver prepare` compiles what it needs, then try again")
+            raise FleetmapError(
+                "mapping did not start: its process says above why; where it says nothing, see that the machine has a core and memory "
+                "to spare, then try again"
+            )
         for thread in self._threads:
             thread.start()
         return self
@@ -188,8 +190,7 @@ def _map(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
     os.nice(_NICENESS)
     cv2.setNumThreads(1)  # the other core is tracking's
-    config, rig, warm_up = pipe.recv()
-    _warm(LiveMap(config, rig), warm_up)
+    config, rig = pipe.recv()
     gc.freeze()
     growing, quality, looked_s, shown_s = LiveMap(config, rig), None, 0.0, 0.0
     try:
@@ -216,18 +217,6 @@ def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
     return cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam)
-
-
-def _warm(scratch: LiveMap, frames: tuple[RectifiedFrame, ...]) -> None:
-    """Loads every kernel on some frames."""
-    step = np.diag([1e-4] * 6)
-    for number, frame in enumerate(frames):
-        still = np.zeros(3)
-        frame_from_body = np.eye(4)
-        frame_from_body[0, 3] = 0.01 * number
-        scratch.add(
-            frame, NewKeyframe(number, frame_from_body, np.eye(3), step if number else None, still, still, still)
-        )
 
 
 def sketch_of(growing: LiveMap, quality: tuple[Array, list[LiveMissing]] | None = None) -> MapSketch:

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
-from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.time_sliced import finished
 from mapserver.quality.figures import LookAlike, Starts
 from mapserver.survey.survey_map import SurveyMap
 

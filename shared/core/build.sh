@@ -1,16 +1,17 @@
 #!/bin/sh
-# Builds fleetmap._core into shared/fleetmap, as far as its sources changed: shared/core/build.sh VENV, which has cmake, ninja, nanobind
-# and Eigen's headers. Where no C++ compiler is installed it takes that of `ziglang` from the package index.
+# Builds fleetmap._core into shared/fleetmap, as far as its sources changed: shared/core/build.sh VENV [sanitize]. VENV has cmake, ninja,
+# nanobind and Eigen's headers. With `sanitize` it builds the core of `make sanitize`, into VENV/core-sanitize. Where no C++ compiler is
+# installed it takes that of `ziglang` from the package index.
 set -eu
 core=$(cd "$(dirname "$0")" && pwd)
 venv=$(cd "$1" && pwd)
-build=$venv/core
+build=$venv/core${2:+-$2}
 export PATH="$venv/bin:$PATH"
 # Configured anew where that was never done, and in a folder that was copied.
 if ! grep -qs "^CMAKE_HOME_DIRECTORY:INTERNAL=$core\$" "$build/CMakeCache.txt" || ! [ -f "$build/build.ninja" ]; then
   rm -rf "$build"
   mkdir "$build"
-  set -- -DPython_EXECUTABLE="$venv/bin/python" -DWARNINGS_ARE_ERRORS=ON
+  set -- ${2:+-DSANITIZE=ON} -DPython_EXECUTABLE="$venv/bin/python" -DWARNINGS_ARE_ERRORS=ON
   if ! [ "${CXX:-}" ] && ! command -v c++ >/dev/null && ! command -v g++ >/dev/null && ! command -v clang++ >/dev/null; then
     echo "fleetmap: no C++ compiler is installed (g++ on Debian and Ubuntu); taking that of ziglang from the package index, which needs" \
       "some minutes for its first build"

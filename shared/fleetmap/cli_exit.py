@@ -4,7 +4,6 @@ import re
 import shlex
 import sys
 from collections.abc import Callable
-from importlib import metadata
 from itertools import pairwise
 
 from fleetmap.errors import FleetmapError, UsageError
@@ -16,7 +15,7 @@ _NEEDS = {
         r"mapserver (build|live|nightly|publish|promote|rollback|versions|inspect|diff|export|align|areas|grid|map"
         r"|fleet (report|resurvey)|robots (enrol|revoke|remove))\b"
     ),
-    "--store": re.compile(r"mapserver (?!(doctor|calibrate|convert|evaluate|prepare|config|trust key)\b)"),
+    "--store": re.compile(r"mapserver (?!(doctor|calibrate|convert|evaluate|config|trust key)\b)"),
 }
 INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
@@ -64,6 +63,8 @@ def runnable(text: str, arguments: list[str]) -> str:
 
 def require_extra(extra: str, program: str) -> None:
     """UsageError where libraries of an extra are not installed, with what to install; a source tree that is not installed passes."""
+    from importlib import metadata  # takes a tenth of a second
+
     try:
         project = metadata.distribution("fleetmap")
     except metadata.PackageNotFoundError:
@@ -81,6 +82,8 @@ def require_extra(extra: str, program: str) -> None:
 
 
 def _is_installed(name: str) -> bool:
+    from importlib import metadata
+
     try:
         metadata.distribution(name)
     except metadata.PackageNotFoundError:

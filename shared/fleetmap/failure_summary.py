@@ -1,6 +1,6 @@
 """What robots tell servers of a failure's seconds: the parts in which a recording of them travels, and the summary in it.
 
-No reader of recordings is needed for either: who only forwards them loads neither OpenCV nor numba.
+No reader of recordings is needed for either: who only forwards them does not load OpenCV.
 """
 
 from itertools import pairwise

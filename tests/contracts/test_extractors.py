@@ -7,7 +7,7 @@ from fleetmap.errors import UsageError
 from fleetmap.features.extraction import EXTRACTORS, extract, extract_in_slices
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.settings import OrbSettings
-from fleetmap.numerics.time_sliced import finished
+from fleetmap.time_sliced import finished
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT, SHIFT_PX = 320, 240, 6

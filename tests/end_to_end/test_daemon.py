@@ -29,7 +29,7 @@ from support.fleet.tls_site import TlsSite
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
-PATIENCE_S = 500.0  # compiles every kernel, on a machine that may be busy
+PATIENCE_S = 120.0  # on a machine that may be busy
 
 
 def write_walk(folder: Path, frames: int, dark: range) -> Path:

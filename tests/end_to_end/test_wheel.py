@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -44,26 +43,7 @@ def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("robot") / "environment"
     settings = {"LOCK": str(folder.parent / "client.lock"), "PYTHON": sys.executable}
     run([REPOSITORY / "deploy/install.sh", wheel, "client", folder], folder.parent, **settings)
-    programs = folder / "bin"
-    (installed,) = folder.glob("lib/python*/site-packages")
-    for source in (REPOSITORY / "shared/fleetmap", REPOSITORY / "locclient"):
-        take_kernels(source, installed / source.name)
-    return programs
-
-
-def take_kernels(source: Path, installed: Path) -> None:
-    """What was compiled for the source tree serves the installed files too: same bytes, and now the same times.
-
-    It takes a robot a minute, which `prepare`'s own tests see.
-    """
-    for file in source.rglob("*.py"):
-        copy = installed / file.relative_to(source)
-        assert copy.read_bytes() == file.read_bytes()
-        shutil.copystat(file, copy)
-    for compiled in source.rglob("__pycache__/*.nb[ci]"):
-        kept = installed / compiled.relative_to(source)
-        kept.parent.mkdir(exist_ok=True)
-        shutil.copy2(compiled, kept)
+    return folder / "bin"
 
 
 def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
@@ -71,7 +51,7 @@ def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
     tops = {name.partition("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == PACKAGES
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    assert sum(name.endswith((".so", ".nbc")) for name in names) == 1, "the core alone is compiled"
+    assert sum(name.endswith(".so") for name in names) == 1, "the core alone is compiled"
     assert {"fleetmap/_core.pyi", "fleetmap/py.typed", "locclient/py.typed", "fleetmap/data/vocabulary.fmvb"} <= set(
         names
     )

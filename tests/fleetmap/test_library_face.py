@@ -11,7 +11,7 @@ import pytest
 import fleetmap
 from fleetmap.errors import RecordingError
 
-HEAVY = ("numpy", "numba", "cv2", "zenoh", "msgspec")
+HEAVY = ("numpy", "cv2", "zenoh", "msgspec")
 
 
 @pytest.mark.parametrize("package", ["fleetmap", "fleetsim"])

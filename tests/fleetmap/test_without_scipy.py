@@ -1,4 +1,4 @@
-"""The robot carries no scipy, which numba's own linear algebra would ask for: the odometry must run without."""
+"""The robot carries no scipy, and the odometry must run without."""
 
 import os
 import subprocess

@@ -25,7 +25,7 @@ from rich.progress import track
 
 PAGES = Path(__file__).parents[2] / "docs" / "studies"
 _BEGIN, _END = "<!-- begin of results -->", "<!-- end of results -->"
-_VERSIONS = "numpy", "scipy", "gtsam", "numba", "opencv-python-headless"
+_VERSIONS = "numpy", "scipy", "gtsam", "opencv-python-headless"
 
 Row = dict[str, Any]
 

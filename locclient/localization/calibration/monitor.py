@@ -7,10 +7,10 @@ import numpy as np
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import Cause, Status
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.relocalizer import is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.time_sliced import TimeSliced
 from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
 from locclient.localization.calibration.parameters import CalibrationState
 from locclient.localization.calibration.watch import CalibrationWatch, Mounting

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetmap.features.matching_kernels import Indices
+from fleetmap.features.matching import Indices
 from fleetmap.geometry import Array
 
 _FIRST_CAPACITY = 16

@@ -12,7 +12,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fleetmap.features.matching_kernels import Indices
+from fleetmap.features.matching import Indices
 from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edges, optimize_pose_graph

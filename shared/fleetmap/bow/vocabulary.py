@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features.matching import Descriptors, packed
-from fleetmap.features.matching_kernels import Packed
+from fleetmap.features.matching import Descriptors, Packed, packed
 
 WordIds = NDArray[np.int32]
 

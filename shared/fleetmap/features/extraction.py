@@ -5,8 +5,8 @@ from collections.abc import Callable
 from fleetmap.errors import UsageError
 from fleetmap.features import orb
 from fleetmap.features.settings import OrbSettings
-from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
+from fleetmap.time_sliced import TimeSliced, finished
 
 Extractor = Callable[[Image, OrbSettings], TimeSliced[orb.Features]]
 """Features of a rectified grey image (H, W); the same image and settings give the same features."""

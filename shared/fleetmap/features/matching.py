@@ -6,22 +6,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features.matching_kernels import FAR, Distances, Indices, Packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 
 Descriptors = NDArray[np.uint8]
+Packed = NDArray[np.uint64]
+Indices = NDArray[np.int64]
+Distances = NDArray[np.int32]
+FAR = 257  # more than any two descriptors can differ by
 
 __all__ = ["FAR", "Projected", "hamming_knn2", "match_by_projection", "match_mutual", "packed"]
 
 
 def packed(descriptors: Descriptors) -> Packed:
-    """(N, 4) uint64 of descriptors (N, 32) uint8: the same bits as machine words, copied only where kernels need it."""
+    """(N, 4) uint64 of descriptors (N, 32) uint8: the same bits as machine words, copied only where the core needs it."""
     assert descriptors.ndim == 2
     assert descriptors.shape[1] == 32
     assert descriptors.dtype == np.uint8
-    # Read-only or unaligned input (bytes of a tile) would make numba compile a second version of every kernel.
-    return np.require(np.ascontiguousarray(descriptors).view(np.uint64), requirements=["C", "A", "W"])
+    # Bytes of a tile may begin anywhere; words must not.
+    return np.require(np.ascontiguousarray(descriptors).view(np.uint64), requirements=["C", "A"])
 
 
 def hamming_knn2(descriptors_a: Descriptors, descriptors_b: Descriptors) -> tuple[Indices, Distances, Distances]:

@@ -11,8 +11,8 @@ from fleetmap import core
 from fleetmap.features.corners import corner_candidates, select_best
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
-from fleetmap.numerics.time_sliced import TimeSliced, finished
 from fleetmap.sensors.samples import Image
+from fleetmap.time_sliced import TimeSliced, finished
 
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15

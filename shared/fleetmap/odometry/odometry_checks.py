@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array
-from fleetmap.numerics.transform_kernels import angle_between_rad, distance_between
+from fleetmap.geometry import Array, length, rotation_angle_rad, se3_inverse
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is given up
@@ -29,7 +28,7 @@ class DivergenceMonitor:
         """
         if predicted is None or seen is None:
             return False
-        is_off = angle_between_rad(predicted, seen) > _DISAGREEMENT_RAD
+        is_off = rotation_angle_rad(predicted[:3, :3].T @ seen[:3, :3]) > _DISAGREEMENT_RAD
         self._disagreements = max(self._disagreements + (1 if is_off else -1), 0)
         return self._disagreements >= _MAX_DISAGREEMENTS
 
@@ -43,7 +42,8 @@ class DivergenceMonitor:
             return True
         if predicted is None or seen is None:
             return False
-        self._diverged_frames = 0 if distance_between(predicted, seen) < _DIVERGED_M else self._diverged_frames + 1
+        off_m = length((predicted @ se3_inverse(seen))[:3, 3])
+        self._diverged_frames = 0 if off_m < _DIVERGED_M else self._diverged_frames + 1
         return self._diverged_frames >= _MAX_DIVERGED_FRAMES
 
     def begin_again(self) -> None:

@@ -10,7 +10,6 @@ from fleetmap.features import orb
 from fleetmap.features.extraction import extract_in_slices
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -18,6 +17,7 @@ from fleetmap.relocalization.landmark_visibility import Rows, image_coverage, ma
 from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.time_sliced import TimeSliced
 
 _RANKED = 8  # so many times as many places are ranked as are tried
 _TRIALS_AT_A_PLACE = 2

@@ -13,7 +13,6 @@ import argparse
 import json
 import platform
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +62,7 @@ def main() -> None:
     if options.out is not None:
         about = {
             "machine": f"{platform.machine()}, {platform.processor() or platform.system()}",
-            "python": platform.python_version(), "numpy": np.__version__, "numba": version("numba"),
+            "python": platform.python_version(), "numpy": np.__version__,
             "command": f"bench_consistency.py --runs {options.runs} --first {options.first} --frames {options.frames}",
             "cpu_s": time.process_time() - begun_s,
         }  # fmt: skip

@@ -13,7 +13,6 @@ from fleetmap.bow import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
@@ -23,6 +22,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior, wheel_between
+from fleetmap.time_sliced import TimeSliced
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings

@@ -21,7 +21,7 @@ from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 
 SITE = "hall"
-LIBRARIES = ("numpy", "numba", "opencv-python-headless")
+LIBRARIES = ("numpy", "opencv-python-headless")
 
 
 def parsed(description: str | None, names: Iterable[str]) -> argparse.Namespace:

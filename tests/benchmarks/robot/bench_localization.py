@@ -26,7 +26,7 @@ from benchmarks.common.recorded_runs import (
     write_results,
 )
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
-from fleetmap.numerics.free_memory import give_back_free_memory
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
@@ -34,7 +34,6 @@ from fleetmap.sources.replay_source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
-from locclient.robot.jit_warmup import drop_compiler_code, warm_up_kernels
 
 # Options of `fleetsim record small-loop` for the robot's recording.
 CASES: dict[str, tuple[str, ...]] = {
@@ -100,9 +99,6 @@ def main() -> None:
         recording = recorded(arguments.work, CASES[name])
         warmed_up(recording, store)
         played(recording, store, settings, ":60")
-        with open_recording(recording) as opened:  # as the daemon does
-            warm_up_kernels(opened.calibration, Rectifier(opened.calibration), settings)
-        drop_compiler_code()
         give_back_free_memory()
         slow = [slowness()]
         found[name] = figures(played(recording, store, settings))

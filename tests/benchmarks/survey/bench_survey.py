@@ -24,7 +24,7 @@ from support.recordings.realdata import DATA
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SOURCES = os.pathsep.join(str(REPOSITORY / folder) for folder in ("shared", ""))
-LIBRARIES = ("numpy", "numba", "opencv-python-headless", "gtsam", "scipy")
+LIBRARIES = ("numpy", "opencv-python-headless", "gtsam", "scipy")
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
+from fleetmap.time_sliced import finished
 
 PITCH_M, AISLES = 5.0, 7
 BODY_FROM_CAM = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])

@@ -7,12 +7,12 @@ import pytest
 
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array, se3
-from fleetmap.numerics.time_sliced import finished
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.time_sliced import finished
 from support.storage.map_samples import random_tile
 from support.worlds.vocabulary_training import train_vocabulary
 

@@ -1,14 +1,10 @@
 """A robot's disk that became read-only, or whose files belong to another account, keeps its map usable."""
 
-import importlib
 import os
-import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numba
 import pytest
 
 import fleetmap.trust.tuf_client  # noqa: F401 - before an account is taken that cannot read it
@@ -160,30 +156,3 @@ def test_a_spool_that_cannot_be_made_is_made_once_the_disk_lets_it(tmp_path: Pat
     place.unlink()
     spool.put(QueuedReport("a", b"a"))
     assert (spool.fault, spool.counts()["waiting"]) == ("", 1)
-
-
-def test_kernels_that_were_compiled_on_a_read_only_disk_are_read_from_a_copy() -> None:
-    with open_folder() as folder:
-        cache, module = folder / "cache", folder / "doubled.py"
-        cache.mkdir()
-        module.write_text("from fleetmap.numerics.kernel import kernel\n\n@kernel\ndef double(x):\n    return 2 * x\n")
-
-        def use() -> tuple[int, int, str]:
-            config: Any = numba.config
-            os.environ.update(HOME="/proc/none", XDG_CACHE_HOME="/proc/none")
-            config.CACHE_DIR = str(cache)
-            sys.path.insert(0, str(folder))
-            double = importlib.import_module("doubled").double
-            return double(3), sum(double.stats.cache_hits.values()), config.CACHE_DIR
-
-        def compiled() -> None:
-            pid = os.fork()
-            if pid == 0:
-                use()
-                os._exit(0)
-            os.waitpid(pid, 0)
-
-        compiled()
-        value, hits, copy = on_bad_disk("read-only", folder, use)
-        shutil.rmtree(copy)
-        assert (value, hits, copy == str(cache)) == (6, 1, False)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
@@ -14,9 +13,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from locclient.delivery.report_delivery import write_failure
 from locclient.robot.failure_report import expected_matches, match_view, small_jpeg, without_detail
-from locclient.robot.jit_warmup import warm_up_kernels
 from mapserver.store import MapStore
-from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 
@@ -118,15 +115,3 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())
     assert written["cause"] == "dark"
     assert all((tmp_path / "failures" / name).stat().st_size > 100 for name in written["thumbnails"])
-
-
-def test_warming_up_runs_the_whole_way() -> None:
-    assert warm_up_kernels(calibration(), robot_world.rectifier(), robot_world.SETTINGS) >= 3
-
-
-@pytest.mark.parametrize("has_imu", [False])
-def test_warming_up_needs_no_imu(has_imu: bool) -> None:
-    from fleetmap.sensors.rectification import Rectifier
-
-    rig = calibration(has_imu=has_imu)
-    assert warm_up_kernels(rig, Rectifier(rig), robot_world.SETTINGS) >= 3

@@ -25,7 +25,7 @@ from mapserver.survey.settings import SurveySettings
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-HEAVY = ("numpy", "numba", "cv2", "scipy", "gtsam", "matplotlib", "zenoh", "fastapi", "rich.progress", "msgspec")
+HEAVY = ("numpy", "cv2", "scipy", "gtsam", "matplotlib", "zenoh", "fastapi", "rich.progress", "msgspec")
 HEAVY += ("nicegui", "starlette", "pydantic", "distributed", "dask", "mcap", "sqlite_utils", "tuf", "securesystemslib")
 
 

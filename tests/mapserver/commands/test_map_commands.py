@@ -8,9 +8,9 @@ import pytest
 from plyfile import PlyData
 
 from fleetmap.geometry import quat_wxyz_from_rotation
-from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.sensors.samples import SensorSet
 from mapserver.store import MapStore
+from support.recordings.painted_room import Ride, write_ride
 from support.storage.map_samples import save_sample_draft, save_surfel_draft, seen_wall, wall
 
 

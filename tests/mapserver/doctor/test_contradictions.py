@@ -13,7 +13,6 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.geometry import Array
-from fleetmap.preparation.painted_room import Ride, write_ride
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 from mapserver.doctor import Verdict, camera_motion
@@ -22,6 +21,7 @@ from mapserver.doctor.images import fine_structure, fixed_pattern
 from mapserver.drafting.sensor_subset import reduced
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
+from support.recordings.painted_room import Ride, write_ride
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
 Change = Callable[[Recording], Recording]

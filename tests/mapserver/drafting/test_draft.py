@@ -121,7 +121,7 @@ def test_the_manifest_tells_what_the_map_depends_on(done: Path) -> None:
     assert manifest.report.pop("evidence")["calibrations"], "what the gate of another store judges by"
     assert manifest.report == {key: report[key] for key in KEYS if key not in NOT_FOR_ROBOTS}
     assert manifest.configuration["survey"]["keyframes"]["policy"] == "overlap"
-    assert set(manifest.libraries) == {"numpy", "numba", "opencv-python-headless", "gtsam", "scipy", "fleetmap"}
+    assert set(manifest.libraries) == {"numpy", "opencv-python-headless", "gtsam", "scipy", "fleetmap"}
     assert [(r.name, r.frames) for r in manifest.recordings] == [("walk", FRAMES)]
     assert str(done) not in str(manifest)
 

@@ -191,7 +191,7 @@ def test_one_source_must_be_named(given: list[str], tmp_path: Path) -> None:
 
 def test_mapping_that_does_not_start_is_an_error_with_a_next_step() -> None:
     broken: Any = None  # settings without which the process ends before it is ready
-    with pytest.raises(FleetmapError, match="mapserver prepare"), MappingProcess(broken, broken):
+    with pytest.raises(FleetmapError, match="did not start"), MappingProcess(broken, broken):
         pass
 
 
@@ -207,9 +207,8 @@ class _Unreadable:
 
 
 def test_a_process_that_dies_before_it_has_read_its_orders_is_not_waited_for() -> None:
-    orders: Any = _Unreadable()
-    frames: Any = (bytes(1 << 20),)  # more than a pipe holds
-    with pytest.raises(FleetmapError, match="mapserver prepare"), MappingProcess(orders, orders, frames):
+    orders: Any = (_Unreadable(), bytes(1 << 20))  # more than a pipe holds
+    with pytest.raises(FleetmapError, match="did not start"), MappingProcess(orders, orders):
         pass
 
 

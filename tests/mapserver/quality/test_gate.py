@@ -15,11 +15,11 @@ from fleetmap.features.orb import Features, detect_in_slices
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, so3_exp, transform_points
 from fleetmap.mapformat import BlobEntry, CameraEntry, Manifest, RecordingEntry, Tile, TileEntry, encode_tile
-from fleetmap.numerics.time_sliced import TimeSliced
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
+from fleetmap.time_sliced import TimeSliced
 from mapserver.drafting.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged

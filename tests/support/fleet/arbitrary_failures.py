@@ -2,7 +2,7 @@
 
     python arbitrary_failures.py FAILURE.mcap STORE
 
-Run with NUMBA_BOUNDSCHECK=1, so that a kernel that reads beside an array raises.
+Under `make sanitize` a step of the core that reads beside an array ends it.
 """
 
 import copy

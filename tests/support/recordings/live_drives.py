@@ -29,7 +29,7 @@ class MappingHere:
 
     made: "MappingHere"
 
-    def __init__(self, config: SurveyConfig, rig: LiveRig, warm_up: tuple[RectifiedFrame, ...] = ()) -> None:
+    def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
         self._map, self.sketch, self.behind, self.failed, self.longest_lag_s = (
             LiveMap(config, rig),
             NO_SKETCH,

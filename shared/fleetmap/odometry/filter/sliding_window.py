@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_adjoint, se3_inverse
-from fleetmap.numerics.transform_kernels import angle_between_rad, distance_between
+from fleetmap.geometry import Array, length, rotation_angle_rad, se3_adjoint, se3_inverse
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.odometry_checks import middle
@@ -17,7 +16,6 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 
 _UNKNOWN_DEPTH_M = 5.0
-_NO_MOTION = np.eye(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +164,8 @@ class SlidingWindow:
             ids = self.filter.clone_ids
             motion = self.filter.motion_between(ids[-3], ids[-2])
             is_still = (
-                angle_between_rad(motion, _NO_MOTION) < settings.keyframe_rotation_rad
-                and distance_between(motion, _NO_MOTION) / self.scene_depth_m < settings.keyframe_parallax
+                rotation_angle_rad(motion[:3, :3]) < settings.keyframe_rotation_rad
+                and length(motion[:3, 3]) / self.scene_depth_m < settings.keyframe_parallax
             )
             gone = ids[-2] if is_still else ids[0]
             if is_still:
