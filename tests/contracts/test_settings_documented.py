@@ -63,9 +63,9 @@ def test_tiers_name_settings_that_exist(program: str) -> None:
 
 def test_every_setting_is_read_somewhere() -> None:
     """A setting that nothing reads promises something that does not happen."""
-    source = "\n".join(
-        path.read_text("utf-8") for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))
-    )
+    files = [path for folder in PACKAGES for path in sorted((REPOSITORY / folder).rglob("*.py"))]
+    files += sorted((REPOSITORY / "shared/core/bindings").glob("*.cpp"))  # which take a section as an object
+    source = "\n".join(path.read_text("utf-8") for path in files)
     read = {*re.findall(r"\.(\w+)", source), *re.findall(r"[\"'](\w+)(?=[\"'])", source)}
     unread = [
         f"{name}.{field.name}"

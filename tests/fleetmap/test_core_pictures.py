@@ -45,7 +45,7 @@ BAKED = ROOM["quads"], ROOM["numbers"], np.zeros((2, 2), np.int32), 0
 
 
 def painted(
-    samples: int = 2, shape: tuple[int, int] = (20, 30), rays: Any = NO_LENS, pose: Any = FORWARD, **parts: Any
+    samples: int = 2, shape: tuple[int, int] = (20, 30), rays: Any = NO_LENS, cam_from_map: Any = FORWARD, **parts: Any
 ) -> Array:
     """The picture of the room with other parts; a wall ahead over a floor."""
     room = ROOM | parts
@@ -56,7 +56,7 @@ def painted(
     centre, painter = np.array([0.0, 0, 0.5]), core.ScenePainter(PLANE, rays)
     chunks = room["ranges"], room["bounds"]
     painter.add(
-        faces, chunks, textures, pose, centre, samples, (0.1, 0.0), 1.0, 4, 0.06, CENTRES, True, picture, *truth
+        faces, chunks, textures, cam_from_map, centre, samples, (0.1, 0.0), 1.0, 4, 0.06, CENTRES, True, picture, *truth
     )
     return picture
 
@@ -75,12 +75,14 @@ def test_a_painted_room_is_seen() -> None:
 def test_products_are_rounded_before_they_are_added() -> None:
     """No processor's fused additions, so that every machine computes the same bits."""
     rng = np.random.default_rng(0)
-    points, pose = rng.normal(size=(2000, 3)).astype(np.float32), np.eye(4)
-    pose[:3, :3] = rng.normal(size=(3, 3))
-    numbers, points_cam, _ = core.discs_before(points, -points, pose, -9.0, 99.0, np.zeros(4), 9, 9)
+    points, cam_from_map = rng.normal(size=(2000, 3)).astype(np.float32), np.eye(4)
+    cam_from_map[:3, :3] = rng.normal(size=(3, 3))
+    numbers, points_cam, _ = core.discs_before(points, -points, cam_from_map, -9.0, 99.0, np.zeros(4), 9, 9)
     x, y, z = points[numbers].astype(np.float64).T
     assert len(numbers) > 1900
-    assert np.array_equal(points_cam, np.stack([row[0] * x + row[1] * y + row[2] * z for row in pose[:3, :3]], axis=1))
+    assert np.array_equal(
+        points_cam, np.stack([row[0] * x + row[1] * y + row[2] * z for row in cam_from_map[:3, :3]], axis=1)
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,16 +151,16 @@ def test_hostile_numbers_lead_nowhere(seed: int) -> None:
     def floats(*shape: int) -> Any:
         return reals(*shape).astype(np.float32)
 
-    table, points, normals, pose = core.VoxelTable(), floats(3, 3), floats(3, 3), reals(4, 4)
-    table.add(floats(12, 14), one(), reals(4), pose)
+    table, points, normals, cam_from_map = core.VoxelTable(), floats(3, 3), floats(3, 3), reals(4, 4)
+    table.add(floats(12, 14), one(), reals(4), cam_from_map)
     assert len({len(column) for column in table.surfels()}) == 1
     assert len(core.voxel_keys(points, LEVELS)) == 3
-    core.look_at(points, LEVELS, floats(5, 6), 4, one(), reals(4), pose, one(), 0.05)
-    core.discs_before(points, normals, pose, one(), one(), reals(4), 30, 20)
+    core.look_at(points, LEVELS, floats(5, 6), 4, one(), reals(4), cam_from_map, one(), 0.05)
+    core.discs_before(points, normals, cam_from_map, one(), one(), reals(4), 30, 20)
     window = core.cast_view(floats(12, 14), floats(12, 14), one(), reals(4), reals(3, 3), reals(3), CELLS)
     for row, column in rng.choice([-(1 << 31), -3, 0, 2, (1 << 31) - 1], (4, 2)).tolist():
         core.add_view(*window, row, column, *TILE)
-    painted(quads=reals(2, 9), values=reals(2, 6), pose=reals(3, 3), bounds=reals(1, 6), rays=floats(20, 30, 4))
+    painted(quads=reals(2, 9), values=reals(2, 6), cam_from_map=reals(3, 3), bounds=reals(1, 6), rays=floats(20, 30, 4))
     grid = core.BoxGrid(reals(4, 8), np.zeros(3), np.ones(3), 0.3)
     grid.cast(reals(3), reals(5, 3), reals(5))
     lamps = np.column_stack([reals(3, 4), np.zeros(3)])
@@ -166,7 +168,7 @@ def test_hostile_numbers_lead_nowhere(seed: int) -> None:
     core.develop(reals(3, 3), one(), one(), one(), floats(8), int(rng.integers(-(1 << 63), 1 << 63)), floats(3, 3))
     pixels = reals(3, 2)
     core.draw_discs(
-        NUMBERS, reals(3, 3), pixels, pose, normals, LEVELS, LEVELS, one(), one(), reals(5, 6, 3), floats(5, 6)
+        NUMBERS, reals(3, 3), pixels, cam_from_map, normals, LEVELS, LEVELS, one(), one(), reals(5, 6, 3), floats(5, 6)
     )
     gaussians = pixels, reals(3, 3), reals(3, 2), reals(3), reals(3)
     core.blend(*gaussians, 6, 5)

@@ -15,7 +15,8 @@ from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_
 from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
-from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
+from fleetmap.odometry.tracking.tracker import Followed, MotionSince, Tracked, Tracker
+from fleetmap.pnp.pnp import Correspondences, refine_pnp
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
@@ -59,9 +60,22 @@ class EstimatorTracker(Tracker):
         begun = np.array([self._begun_px[number] for number in ids.tolist()]).reshape(-1, 2)
         return self._session.follow(self._frame_index, ids.astype(np.uint64), begun)
 
-    def _flow(self, frame: RectifiedFrame, predicted: Array, sure: bool) -> tuple[Array, NDArray[np.bool_]]:
-        pixels, kept = self._measure(self._points.ids)
-        return np.where(kept[:, None], pixels[:, :2], predicted), kept
+    def _followed(self, cam_from_previous: Array, levels: int) -> Followed:
+        before, (pixels, kept) = self._points.pixels, self._measure(self._points.ids)
+        has_depth = self._camera.baseline_m > 0
+        disparities = before[:, 0] - before[:, 2] if has_depth else np.full(len(before), np.nan)
+        points_cam = self._camera.point_from_pixel(before[:, :2], disparities)
+        places = np.where(kept[:, None], pixels[:, :2], before[:, :2])
+        known = kept & np.isfinite(points_cam).all(axis=1)
+        measured, sigmas = np.column_stack([places[known], np.full(known.sum(), np.nan)]), np.ones((known.sum(), 2))
+        found = None
+        if known.sum() >= self._settings.min_inliers:
+            matches = Correspondences(self._camera, points_cam[known], measured, sigmas)
+            found = refine_pnp(matches, cam_from_previous)
+        if found is None:
+            return Followed(places, kept, points_cam, -1, cam_from_previous, np.zeros((6, 6)), np.zeros(known.sum()))
+        agree = int(found.inliers.sum())
+        return Followed(places, kept, points_cam, agree, found.cam_from_source, found.information, found.squared)
 
     def _renew_disparities(self, frame: RectifiedFrame) -> None:
         pixels, _ = self._measure(self._points.ids)

@@ -92,7 +92,9 @@ def project(
     rect_from_map (2, 3, 4): left and right; pinhole (5,): focal cx cy width height. The right camera's own axes give
     u_right.
     """
-    (x, y, z), (x_right, _, z_right) = ([_dot(points, row) + row[3] for row in pose] for pose in rect_from_map)
+    (x, y, z), (x_right, _, z_right) = (
+        [_dot(points, row) + row[3] for row in view_from_map] for view_from_map in rect_from_map
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = pinhole[0] * x / z + pinhole[1], pinhole[0] * y / z + pinhole[2]
         u_right = pinhole[0] * x_right / z_right + pinhole[1]

@@ -77,7 +77,7 @@ class _Remembered:
     points_cam: Array
 
 
-class _Followed(NamedTuple):
+class Followed(NamedTuple):
     """Where N points went: places (N, 2), which of them hold (N,), points_cam (N, 3) before, and how many of those with depth agree with
     the motion (4, 4), of that information (6, 6) and squared normalised residuals; -1 where they determine none."""
 
@@ -174,12 +174,12 @@ class Tracker:
         self._points = _Points(self._points.ids[kept], carried[kept])
         return pnp, share
 
-    def _followed(self, cam_from_previous: Array, levels: int) -> _Followed:
+    def _followed(self, cam_from_previous: Array, levels: int) -> Followed:
         s, (before, now) = self._settings, (pyramid.down_to(levels) for pyramid in self._pyramids)
         limits = s.window_px // 2, s.back_check_px, _MARGIN_PX, s.min_inliers, REFINEMENT
-        return _Followed(*core.track_points(before, now, self._points.pixels, cam_from_previous, self._lens, *limits))
+        return Followed(*core.track_points(before, now, self._points.pixels, cam_from_previous, self._lens, *limits))
 
-    def _motion(self, followed: _Followed) -> PnpResult | None:
+    def _motion(self, followed: Followed) -> PnpResult | None:
         """cam_from_previous from points with depth.
 
         Least squares from the guess, RANSAC where most points disagree with it.
