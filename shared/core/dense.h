@@ -54,6 +54,10 @@ inline void transpose(const Matrix& a, Matrix& out) {
     for (size_t j = 0; j < a.columns; ++j) out[j][i] = a[i][j];
 }
 
+inline bool is_finite(const double* values, size_t count) {
+  return std::all_of(values, values + count, [](double value) { return std::isfinite(value); });
+}
+
 // a <- (a + a^T) / 2.
 inline void symmetrise(Matrix& a) {
   for (size_t i = 0; i < a.rows; ++i)

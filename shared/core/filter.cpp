@@ -192,7 +192,8 @@ void Filter::predict_random_walk(const SE3& body_from_next, double rotation_sigm
     for (int k = 0; k < 36; ++k) sum.values[k] += measured[k];
     solve_in_place(sum, solved);
     multiply(spread, solved, part);
-    for (int k = 0; k < 36; ++k) spread.values[k] -= part.values[k];
+    if (fleetmap::is_finite(part[0], 36))
+      for (int k = 0; k < 36; ++k) spread.values[k] -= part.values[k];
   }
   transpose(shape, shape_turned);
   multiply(shape, spread, part);
@@ -304,6 +305,9 @@ void Filter::apply(const double* error) {
 void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE3>& newest_odom_from_body, double sigma_scale,
                     int8_t* used) {
   if (tracks.count() == 0) return;
+  const NavState state_before = state;
+  const double offset_before_s = imu_minus_cam_s;
+  clones_before_ = clones_, covariance_before_ = covariance, true_error_cov_before_ = true_error_cov;
   PixelModel pixels = model_.pixels;
   pixels.weights = {pixels.weights.pixel / sigma_scale, pixels.weights.disparity / sigma_scale};
   // Errors count from here: those of a turn about an origin far away would be so large that rounding leaves no covariance.
@@ -311,7 +315,6 @@ void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE
   move_origin(begin);
   const size_t size = 6 * clones_.size(), all = kClones + size;
   const NavState prior = state;
-  const double prior_offset_s = imu_minus_cam_s;
   prior_clones_ = clones_;
   inner_.resize(size, size);
   for (size_t a = 0; a < size; ++a) std::copy_n(covariance[kClones + a] + kClones, size, inner_[a]);
@@ -340,12 +343,23 @@ void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE
     remove_common_motion(gain_turned_);
     correction_.resize(all);
     multiply(equations.vector.data(), gain_turned_[0], correction_.data(), 1, size, all);
-    state = prior, imu_minus_cam_s = prior_offset_s, clones_ = prior_clones_;
+    state = prior, imu_minus_cam_s = offset_before_s, clones_ = prior_clones_;
     apply(correction_.data());
     moved_.assign(correction_.begin() + kClones, correction_.end());
   }
   learn(gain_turned_);
   move_origin(-begin);
+  if (is_finite()) return;
+  state = state_before, imu_minus_cam_s = offset_before_s;
+  std::swap(clones_, clones_before_), std::swap(covariance, covariance_before_), std::swap(true_error_cov, true_error_cov_before_);
+  std::replace(used, used + tracks.count(), int8_t(1), int8_t(-1));
+}
+
+bool Filter::is_finite() const {
+  static_assert(sizeof(NavState) == 21 * sizeof(double) && sizeof(SE3) == 12 * sizeof(double));
+  const auto all = [](const double* values, size_t count) { return fleetmap::is_finite(values, count); };
+  return all(state.rotation[0], 21) && std::isfinite(imu_minus_cam_s) && all(clones_[0].rotation[0], 12 * clones_.size()) &&
+         all(covariance[0], covariance.values.size()) && all(true_error_cov[0], true_error_cov.values.size());
 }
 
 // Takes from a gain, transposed (6 M, n), its part on errors that clones which see the same points share: in exact numbers it changes
@@ -452,6 +466,7 @@ double Filter::correct_with(const Measurement& measurement, double gate) {
     return std::numeric_limits<double>::infinity();
   double distance = 0.0;
   for (size_t a = 0; a < rows; ++a) distance += residual[a] * solved[a];
+  if (!std::isfinite(distance)) return std::numeric_limits<double>::infinity();
   if (distance > gate) return distance;
   // With the factor L of the innovation's covariance: L^-1 H P, and the gain's transpose L^-T L^-1 H P.
   const auto subtract = [&](double* to, double share, const double* from) {
@@ -471,6 +486,7 @@ double Filter::correct_with(const Measurement& measurement, double gate) {
     for (size_t j = 0; j < size; ++j) correction_[j] += residual[a] * gain[a][j];
     for (size_t b = 0; b < rows; ++b) subtract(projected[a] + kConsidered, 0.5 * spread[a][b], gain[b]);
   }
+  if (!fleetmap::is_finite(correction_.data(), size)) return std::numeric_limits<double>::infinity();
   for (size_t i = 0; i < size; ++i) {
     double *const row = p[i], *const true_row = t[kConsidered + i];
     for (size_t a = 0; a < rows; ++a) {
@@ -541,6 +557,7 @@ bool Filter::inflate(size_t index, Vec3 seen_position, double gap_s) {
   Vec3 solved = off;
   if (solve_spd(spread[0], solved.at, 3, 3) && dot(off, solved) < kPositionGate) return false;
   const double size = norm(off), speed = size / std::max(gap_s, 0.1);
+  if (!std::isfinite(size * size + speed * speed)) return false;
   for (auto [p, first] : both())
     for (size_t a = 0; a < 3; ++a) (*p)[first + kPosition + a][first + kPosition + a] += size * size;
   inflate_velocity(speed);

@@ -73,17 +73,20 @@ class Filter {
 
   // Uses each track once; used (T,) as of TrackConstraints. More than one iteration relinearises (iterated Kalman filter), for large
   // corrections; newest_odom_from_body is then where the newest clone is linearised first, when vision knows it better than the
-  // prediction. It adds no information. sigma_scale widens the noise, for matches that are less exact than flow.
+  // prediction. It adds no information. sigma_scale widens the noise, for matches that are less exact than flow. Nothing is changed, and
+  // no track counts as taken, where the result would not be finite.
   void update(const Tracks& tracks, int iterations, const std::optional<SE3>& newest_odom_from_body, double sigma_scale, int8_t* used);
 
   // By the motion of `base` on its wheels: forward speed, no other, and yaw rate; gyro measured at the same time. Each returns the
-  // squared Mahalanobis distance by true_error_cov; nothing is changed where that exceeds the gate.
+  // squared Mahalanobis distance by true_error_cov, infinity where it or the correction is no number; nothing is changed where that
+  // exceeds the gate.
   double correct_by_wheels(Vec3 velocity_base, double yaw_rate, double sigma_mps, double sigma_radps, Vec3 gyro, const SE3& base_from_body,
                            double gate);
   // By standing still: neither speed nor turn, the gyro's mean shows its bias alone (ZUPT).
   double correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate);
 
   // Inflates position and velocity where vision contradicts the prediction since a clone beyond its covariance; true where it did.
+  // What is not finite contradicts nothing.
   // After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every image never recovers.
   bool inflate(size_t index, Vec3 seen_position, double gap_s);
   void inflate_velocity(double sigma_mps);
@@ -105,6 +108,7 @@ class Filter {
   Matrix covariance, true_error_cov;
 
  private:
+  bool is_finite() const;
   // A covariance, and the number of the state's first error in it.
   using Errors = std::pair<Matrix*, size_t>;
   std::array<Errors, 2> both() { return {Errors{&covariance, 0}, Errors{&true_error_cov, kConsidered}}; }
@@ -130,9 +134,10 @@ class Filter {
   std::vector<SE3> clones_;
   TrackConstraints constraints_;
   // Kept so that nothing is allocated in a frame.
-  std::vector<SE3> cameras_, prior_clones_;
+  std::vector<SE3> cameras_, prior_clones_, clones_before_;
   std::vector<double> moved_, correction_;
-  Matrix spare_, inner_, by_clones_, weighing_, gain_turned_, gain_, seen_, spread_, taken_, part_, turned_;
+  Matrix covariance_before_, true_error_cov_before_, spare_, inner_, by_clones_, weighing_, gain_turned_, gain_, seen_, spread_, taken_,
+      part_, turned_;
 };
 
 }  // namespace fleetmap

@@ -208,7 +208,7 @@ int8_t TrackConstraints::add(const std::vector<SE3>& odom_from_cam, const Sighti
     return total;
   };
   const double limit = chi_square_limit(dof, model.gate_quantile);
-  if (squared() > limit) return -1;
+  if (!(squared() <= limit)) return -1;
   for (int k = 0; k < 3; ++k) {  // of what a track keeps for itself, only what passes the gate
     for (size_t row = 0; row < dof; ++row) whitened_[row] = own_[row][k];
     forward_substitute(innovation_[0], whitened_.data(), dof, dof);

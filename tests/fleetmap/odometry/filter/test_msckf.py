@@ -333,6 +333,48 @@ def test_a_correction_is_kalmans_and_what_its_gate_refuses_changes_nothing(by: s
     assert estimate.state.gyro_bias_radps == pytest.approx(state.gyro_bias_radps + (gain @ residual)[9:12], rel=1e-8)
 
 
+def everything(estimate: InvariantFilter) -> list[Array]:
+    held = [estimate.odom_from_clone(number) for number in estimate.clone_ids]
+    numbers = np.array([estimate.imu_minus_cam_s])
+    return [*estimate.state.arrays, *held, estimate.covariance, estimate.true_error_cov, numbers]
+
+
+def assert_unchanged(estimate: InvariantFilter, before: list[Array]) -> None:
+    for now, then in zip(everything(estimate), before, strict=True):
+        assert np.isfinite(then).all()
+        np.testing.assert_array_equal(now, then)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("gate", [22.0, np.inf])
+def test_what_is_no_number_corrects_nothing(bad: float, gate: float) -> None:
+    estimate = some_filter(np.random.default_rng(11))
+    before, gyro = everything(estimate), np.array([0.0, bad, 0.0])
+    assert estimate.correct_by_rest(gyro, 1e-3, gate) == np.inf
+    sample = WheelSample(0, np.array([bad, 0.0, 0.0]), 0.1, 0.1, 0.1)
+    assert estimate.correct_by_wheel_sample(sample, np.zeros(3), np.eye(4), gate) == np.inf
+    away = estimate.state.odom_from_body
+    away[0, 3] = bad
+    assert not estimate.inflate(2, away, 1.0)
+    assert_unchanged(estimate, before)
+    estimate.predict_random_walk(np.eye(4), 0.3, 1.5, measured_cov=np.full((6, 6), bad))
+    assert np.isfinite(estimate.covariance).all()
+
+
+def test_an_update_that_would_not_be_finite_is_refused() -> None:
+    """The clones are so uncertain that the product of their covariance with the images' information overflows."""
+    points = room(np.random.default_rng(6))
+    estimate, seen = clones_at([0.0, 0.15], points, np.random.default_rng(7))
+    estimate.predict_random_walk(np.eye(4), 1e150, 1e150)
+    estimate.add_clone(2, np.zeros(3))
+    seen[2] = observe(points, 0.15, np.random.default_rng(8))
+    before = everything(estimate)
+    used = estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+    assert_unchanged(estimate, before)
+    assert (used == -1).any()
+    assert not (used == 1).any()
+
+
 def test_a_frame_that_begins_anew_changes_nothing_between_clones() -> None:
     """Neither what is known of the motions, nor what images then say of them; only where the frame lies is certain again."""
     points, found = room(np.random.default_rng(3)), []
