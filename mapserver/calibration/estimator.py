@@ -205,7 +205,8 @@ class _Problem:
         info, rhs = np.zeros((self.size, self.size)), np.zeros(self.size)
         marks, columns = len(self.starts) - 1, UNKNOWNS
         gone = BorderedLandmarks(np.empty((marks, 3, 3)), np.empty((marks, 3)), np.empty((marks, 3, columns)))
-        core.reduce_landmarks(images, self.keyframes, self.starts, self.stride, damping, info, rhs, gone)
+        if not core.reduce_landmarks(images, self.keyframes, self.starts, self.stride, damping, info, rhs, gone):
+            raise np.linalg.LinAlgError("what a landmark's observations say of it is not finite")
         border = self.size - columns
         for each in edges:
             at = slice(each.first * self.stride, (each.first + 2) * self.stride)

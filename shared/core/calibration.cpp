@@ -23,10 +23,11 @@ inline void subtract_rows(double a0, double a1, double a2, const double* __restr
 
 }  // namespace
 
-void reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
+bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
                       const CalibrationLandmarks& out) {
   const size_t columns = rows.columns, border = size - columns;
   std::vector<double> coupled, corner(columns * columns), lifted(3 * columns);  // W of each observation, H_cc's upper triangle, H_ll^-1 E
+  bool finite = true;
   for (size_t n = 0; n < rows.landmarks; ++n) {
     const size_t begin = size_t(rows.starts[n]), end = size_t(rows.starts[n + 1]);
     double *coupling = out.coupling + 3 * columns * n, block[9] = {};
@@ -51,6 +52,7 @@ void reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
     const double sum = trace(damped);
     for (int a = 0; a < 3; ++a) damped[a][a] += damping * damped[a][a] + 1e-9 * sum + 1e-12;
     const Mat3 held = out.inverse[n] = inverse_symmetric(damped);
+    finite = finite && is_finite(held[0], 9);
     multiply(held[0], coupling, lifted.data(), 3, 3, columns);
     for (size_t a = 0; a < columns; ++a)
       subtract_rows(coupling[a], coupling[columns + a], coupling[2 * columns + a], lifted.data(), columns, &corner[a * columns], a);
@@ -76,6 +78,7 @@ void reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
   for (size_t a = 0; a < columns; ++a)
     for (size_t b = 0; b < columns; ++b) information[(border + a) * size + border + b] += corner[std::min(a, b) * columns + std::max(a, b)];
   reduce_residuals(rows, stride, size, rhs, out);
+  return finite;
 }
 
 void reduce_residuals(const CalibrationRows& rows, size_t stride, size_t size, double* rhs, const CalibrationLandmarks& out) {

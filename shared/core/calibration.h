@@ -30,8 +30,9 @@ struct CalibrationLandmarks {
 };
 
 // Adds what images say of poses and calibration to information (D, D), its upper triangle of blocks, and to rhs (D,). Keyframe k's pose
-// is from stride k on, the calibration is the last C. damping: share of H_ll's diagonal that is added to it. Fills `out`.
-void reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
+// is from stride k on, the calibration is the last C. damping: share of H_ll's diagonal that is added to it. Fills `out`. False where
+// a landmark's H_ll has no inverse of finite numbers, and so the system none.
+bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
                       const CalibrationLandmarks& out);
 
 // The part of reduce_landmarks that residuals change: rhs, and that of the landmarks in `out`, which holds the rest.

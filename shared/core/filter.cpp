@@ -486,7 +486,8 @@ double Filter::correct_with(const Measurement& measurement, double gate) {
     for (size_t j = 0; j < size; ++j) correction_[j] += residual[a] * gain[a][j];
     for (size_t b = 0; b < rows; ++b) subtract(projected[a] + kConsidered, 0.5 * spread[a][b], gain[b]);
   }
-  if (!fleetmap::is_finite(correction_.data(), size)) return std::numeric_limits<double>::infinity();
+  if (!fleetmap::is_finite(gain[0], rows * size) || !fleetmap::is_finite(projected[0], rows * whole))
+    return std::numeric_limits<double>::infinity();
   for (size_t i = 0; i < size; ++i) {
     double *const row = p[i], *const true_row = t[kConsidered + i];
     for (size_t a = 0; a < rows; ++a) {

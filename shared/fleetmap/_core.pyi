@@ -927,12 +927,13 @@ def reduce_landmarks(
     information: _Reals,
     rhs: _Reals,
     landmarks: _Landmarks,
-) -> None:
+) -> bool:
     """Adds what images say of poses and calibration to information (D, D), its upper triangle of blocks, and rhs (D,); fills `landmarks`.
 
     images: whitened rows of M observations, landmark by landmark: residuals (M, 4), derivatives by pose (M, 4, 6), point (M, 4, 3) and
     calibration (M, 4, C); keyframes (M,); starts (N + 1,) of each landmark. landmarks: inverse (N, 3, 3) of their information, rhs (N, 3),
-    coupling (N, 3, C) to the calibration. stride: unknowns per keyframe; the calibration is the last C. damping: of the landmarks.
+    coupling (N, 3, C) to the calibration. stride: unknowns per keyframe; the calibration is the last C. damping: of the landmarks. False
+    where the information of one has no inverse of finite numbers.
     """
 
 def reduce_residuals(

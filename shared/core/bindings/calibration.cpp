@@ -46,13 +46,13 @@ int64_t keyframes_in(size_t size, const Images& images, int stride) {
   return int64_t((size - columns) / size_t(stride));
 }
 
-void reduce_landmarks_of(const Images& images, const Indices& keyframes, const Indices& starts, int stride, double damping,
+bool reduce_landmarks_of(const Images& images, const Indices& keyframes, const Indices& starts, int stride, double damping,
                          const MutableReals<-1, -1>& information, const MutableReals<-1>& rhs, const Landmarks& landmarks) {
   const size_t size = rhs.shape(0);
   check(information.shape(0) == size && information.shape(1) == size, "information: square, as long as rhs");
   const auto rows = rows_of(images, keyframes, starts, keyframes_in(size, images, stride));
   const auto out = landmarks_of(landmarks, rows);
-  unlocked([&] { reduce_landmarks(rows, size_t(stride), damping, size, information.data(), rhs.data(), out); });
+  return unlocked([&] { return reduce_landmarks(rows, size_t(stride), damping, size, information.data(), rhs.data(), out); });
 }
 
 void reduce_residuals_of(const Images& images, const Indices& keyframes, const Indices& starts, int stride, const MutableReals<-1>& rhs,

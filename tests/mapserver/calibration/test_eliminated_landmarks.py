@@ -1,6 +1,7 @@
 """Elimination of landmarks against dense normal equations."""
 
 import numpy as np
+import pytest
 
 from fleetmap import core
 from fleetmap.geometry import AnyArray, Array
@@ -24,7 +25,7 @@ def scene(seed: int) -> tuple[ImageRows, AnyArray, AnyArray]:
 def reduced(rows: ImageRows, keyframes: AnyArray, starts: AnyArray) -> tuple[Array, Array, BorderedLandmarks]:
     info, rhs = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     out = BorderedLandmarks(*(np.empty((LANDMARKS, *shape)) for shape in ((3, 3), (3,), (3, COLUMNS))))
-    core.reduce_landmarks(rows, keyframes, starts, STRIDE, 0.0, info, rhs, out)
+    assert core.reduce_landmarks(rows, keyframes, starts, STRIDE, 0.0, info, rhs, out)
     return info, rhs, out
 
 
@@ -56,6 +57,14 @@ def test_other_residuals_change_the_right_hand_side_alone() -> None:
     core.reduce_residuals(other, keyframes, starts, STRIDE, found, out)
     assert np.array_equal(found, rhs)
     assert np.array_equal(out.rhs, expected.rhs)
+
+
+@pytest.mark.parametrize("slope", [np.nan, np.inf, np.finfo(np.float64).max])
+def test_a_landmark_that_is_not_finite_is_told(slope: float) -> None:
+    rows, keyframes, starts = scene(4)
+    rows.by_point[3, 1, 2] = slope
+    out = BorderedLandmarks(*(np.empty((LANDMARKS, *shape)) for shape in ((3, 3), (3,), (3, COLUMNS))))
+    assert not core.reduce_landmarks(rows, keyframes, starts, STRIDE, 0.0, np.zeros((SIZE, SIZE)), np.zeros(SIZE), out)
 
 
 def test_derivatives_without_a_value_weigh_nothing() -> None:

@@ -353,6 +353,8 @@ def test_what_is_no_number_corrects_nothing(bad: float, gate: float) -> None:
     assert estimate.correct_by_rest(gyro, 1e-3, gate) == np.inf
     sample = WheelSample(0, np.array([bad, 0.0, 0.0]), 0.1, 0.1, 0.1)
     assert estimate.correct_by_wheel_sample(sample, np.zeros(3), np.eye(4), gate) == np.inf
+    sample = WheelSample(0, np.zeros(3), 0.1, bad, 0.1)
+    assert estimate.correct_by_wheel_sample(sample, np.zeros(3), np.eye(4), gate) == np.inf
     away = estimate.state.odom_from_body
     away[0, 3] = bad
     assert not estimate.inflate(2, away, 1.0)
