@@ -203,11 +203,10 @@ class _Problem:
 
     def _reduced(self, images: ImageRows, edges: list[Rows], damping: float) -> _System:
         info, rhs = np.zeros((self.size, self.size)), np.zeros(self.size)
-        marks, columns = len(self.starts) - 1, UNKNOWNS
+        marks, columns, border = len(self.starts) - 1, UNKNOWNS, self.size - UNKNOWNS
         gone = BorderedLandmarks(np.empty((marks, 3, 3)), np.empty((marks, 3)), np.empty((marks, 3, columns)))
         if not core.reduce_landmarks(images, self.keyframes, self.starts, self.stride, damping, info, rhs, gone):
             raise np.linalg.LinAlgError("what a landmark's observations say of it is not finite")
-        border = self.size - columns
         for each in edges:
             at = slice(each.first * self.stride, (each.first + 2) * self.stride)
             info[at, at] += each.by_keyframes.T @ each.by_keyframes
