@@ -81,7 +81,7 @@ void mark_redundant(const int64_t* order, size_t order_count, const int64_t* row
       const int64_t row = rows[at];
       int64_t others = -1;  // itself does not count
       for (int64_t m = starts[landmark[row]]; m < starts[landmark[row] + 1]; ++m)
-        others += octave[m] <= octave[row] + 1 && !gone[seen.keyframe[m]];
+        others += (octave[m] <= octave[row] || octave[m] - 1 == octave[row]) && !gone[seen.keyframe[m]];
       repeated += others >= observers;
     }
     gone[k] = double(repeated) >= share * double(keyframes.size(size_t(k)));

@@ -55,7 +55,7 @@ class PixelGrid {
 
  private:
   std::pair<ptrdiff_t, ptrdiff_t> cells(double from, double to, double origin, ptrdiff_t count) const {
-    auto cell = [&](double at) { return ptrdiff_t(std::min(std::max(std::floor((at - origin) / size_), -1.0), double(count))); };
+    auto cell = [&](double at) { return ptrdiff_t(std::min(std::max(-1.0, std::floor((at - origin) / size_)), double(count))); };
     return {std::max<ptrdiff_t>(cell(from), 0), std::min(cell(to), count - 1)};
   }
 

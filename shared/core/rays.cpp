@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <stdexcept>
 
 #include "picture.h"
 
@@ -40,7 +41,9 @@ Hit enter_box(const YawedBox& box, Vec3 origin, Vec3 direction) {
 BoxGrid::BoxGrid(std::vector<YawedBox> boxes, Vec3 low, Vec3 high, double cell_m) : boxes_(std::move(boxes)), low_(low), cell_m_(cell_m) {
   for (int axis = 0; axis < 3; ++axis) counts_[axis] = std::max<int64_t>(0, whole_or_outside(std::ceil((high[axis] - low[axis]) / cell_m)));
   starts_.assign(size_t(counts_[0] * counts_[1] * counts_[2]) + 1, 0);
+  constexpr int64_t kMostItems = 1 << 26;
   const auto for_each_cell = [&](const auto& visit) {
+    int64_t items = 0;
     for (size_t b = 0; b < boxes_.size(); ++b) {
       const YawedBox& box = boxes_[b];
       const Vec3 reach = {std::abs(box.cosine) * box.half[0] + std::abs(box.sine) * box.half[1],
@@ -51,6 +54,9 @@ BoxGrid::BoxGrid(std::vector<YawedBox> boxes, Vec3 low, Vec3 high, double cell_m
         last[axis] =
             std::min<int64_t>(counts_[axis] - 1, whole_or_outside(std::floor((box.centre[axis] + reach[axis] - low[axis]) / cell_m)));
       }
+      int64_t touched = 1;
+      for (int axis = 0; axis < 3; ++axis) touched *= std::max<int64_t>(0, last[axis] - first[axis] + 1);
+      if ((items += touched) > kMostItems) throw std::length_error("boxes: at most 2^26 in the lists of all cells");
       for (int64_t k = first[2]; k <= last[2]; ++k)
         for (int64_t j = first[1]; j <= last[1]; ++j)
           for (int64_t i = first[0]; i <= last[0]; ++i) visit(size_t((k * counts_[1] + j) * counts_[0] + i), int32_t(b));

@@ -96,6 +96,7 @@ SEEN = POINTS, POINTS, np.ones((5, 2)), np.ones(4), (4.0, 11.0, (10, 5))  # as P
 THREE, BOUNDS, NEIGHBOURS = np.arange(3), np.arange(4), np.array([[0, 1]])
 HEIGHTS, PLANE, UNSET, LEVELS = np.ones(3), np.ones((3, 2)), np.zeros(3, bool), np.zeros(3, np.int8)
 CELL_MODEL = 2.0, 0.05, 0.15, 0.01, 1.25
+FARTHEST = np.iinfo(np.int64).max
 BUDGET = THREE, np.full(3, 9), 3, np.zeros(3, np.int64), UNSET, np.full(3, 9), 1  # of choose_landmarks
 CONES = POINTS, np.ones((5, 3), np.float32), np.ones(5, np.float32), np.ones(5, np.float32)
 VIEW = 1.0, 10.0, np.pi, 1.2  # scale of distances, margin, angle, scale of octaves
@@ -132,6 +133,7 @@ FILTER = InvariantFilter(
         (lambda: core.refine_pnp(POINTS, POINTS[:2], *SEEN[2:], np.eye(4), None), "pixels"),
         (lambda: core.ransac_pnp(*SEEN[:2], np.ones((2, 2)), *SEEN[3:], 1.0, 4, POINTS / 2, 0.9), "weights"),
         (lambda: core.ransac_pnp(*SEEN, 1.0, 4, POINTS, 0.9), "draws"),
+        (lambda: core.refine_pnp(*SEEN[:4], (4.0, 11.0, (10, 1001)), np.eye(4), None), "refinement"),
         (lambda: core.pnp_with_rotation(POINTS[:2], *SEEN[1:], 1.0, 4, np.eye(3), 0.1), "one row for each point"),
         (lambda: core.visible_landmarks((POINTS, *CONES[1:3], CONES[3][:2]), np.eye(4), np.ones(6), *VIEW), "cones"),
         (lambda: core.nearest_cells(WORDS, WORDS, 0), "cells"),
@@ -153,6 +155,11 @@ FILTER = InvariantFilter(
         (lambda: core.undistort(np.ones(8), HEIGHTS, HEIGHTS[:2]), "goals_y"),
         (lambda: core.register_depth(POINTS, PLANE, 9, 9), "pixels"),
         (lambda: core.register_depth(POINTS[:3], PLANE, 9, -1), "width, height"),
+        (lambda: core.register_depth(POINTS[:3], PLANE, 1 << 14, 1 << 14), "width, height"),
+        (lambda: core.blend(PLANE, POINTS[:3], PLANE, HEIGHTS, HEIGHTS, 1 << 14, 1 << 14), "width, height"),
+        (lambda: core.BoxGrid(np.ones((1, 8)), ZERO, np.array([1.0, 1.0, 5e3]), 1.0), "cell_m"),
+        (lambda: core.BoxGrid(np.full((9, 8), 2e3), ZERO, np.array([256.0, 256.0, 256.0]), 1.0), "boxes"),
+        (lambda: core.ScenePainter(np.full(6, np.nan), np.zeros((0, 0, 4), np.float32)), "plane"),
         (lambda: core.spare_keyframes(THREE, BOUNDS, THREE[:2], BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "keyframes: one"),
         (lambda: core.spare_keyframes(THREE, BOUNDS, THREE, BOUNDS, THREE, LEVELS[:2], 1, 1, 0.5, 1), "octaves: one"),
         (lambda: core.spare_keyframes(THREE, BOUNDS + 1, THREE, BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "row_starts"),
@@ -177,6 +184,7 @@ FILTER = InvariantFilter(
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, THREE[:2], *BUDGET[1:]), "cells: one"),
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, *BUDGET[:4], UNSET[:2], *BUDGET[5:]), "chosen"),
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, *BUDGET[:-1], 0), "bins_per_view"),
+        (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, *BUDGET[:3], THREE - FARTHEST, *BUDGET[4:]), "counts, needs"),
         (lambda: core.choose_landmarks(THREE + 1, BOUNDS, THREE, HEIGHTS, *BUDGET), "candidates"),
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS, THREE + 1, *BUDGET[1:]), "cells: of"),
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE + 1, HEIGHTS, *BUDGET), "bins: of"),
@@ -188,6 +196,7 @@ FILTER = InvariantFilter(
         (lambda: core.select_spread(PIXELS, np.array([3]), PIXELS, 5.0, 9, 30, 20), "order"),
         (lambda: core.select_spread(OUTSIDE, np.array([1]), PIXELS, 5.0, 9, 30, 20), "pixels"),
         (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, float("nan"), 9, 30, 20), "distance_px"),
+        (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, 0.1, 9, 1 << 30, 1 << 30), "width, height"),
         (lambda: core.clear_discs(IMAGE.copy(), PIXELS, float("nan")), "radius_px"),
         (lambda: core.centroid_angles_deg(IMAGE[:0], PIXELS, 15), "image"),
         (lambda: core.match_rows(IMAGE, IMAGE[:9], IMAGE, IMAGE, PLACES, PLACES[:, 0].copy(), *STEREO_LIMITS), "right"),
@@ -244,6 +253,8 @@ def test_what_cannot_be_is_refused(call: object, told: str) -> None:
 
 
 def test_what_is_not_finite_or_outside_gives_values() -> None:
+    octaves = np.array([FARTHEST, -FARTHEST - 1, 0])
+    assert not core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS, NUMBERS, octaves, np.array([0, 3]), 3, 0.9).any()
     free = np.full((20, 30), 255, np.uint8)
     core.clear_discs(free, OUTSIDE, 5.0)
     assert free.all()
@@ -263,6 +274,8 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
         core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS * strange, *BUDGET)
         core.twins(WORDS, points[:3], 6, 9, 60, strange, strange)
         core.visible_landmarks((points, *CONES[1:]), np.full((4, 4), strange), np.full(6, strange), *VIEW)
+        core.match_projected(*NEAR[:4], np.full((3, 2), strange), *NEAR[5:])
+        core.match_projected(NEAR[0], HEIGHTS * abs(strange), *NEAR[2:])
         assert core.refine_pnp(points, *SEEN[1:], np.eye(4), None) is None
         assert core.ransac_pnp(POINTS, points, *SEEN[2:], 1.0, 4, np.eye(3) / 2, 0.9) is None
         assert core.pnp_with_rotation(points, *SEEN[1:], 1.0, 4, np.eye(3), 0.1) is None

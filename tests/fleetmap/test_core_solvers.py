@@ -102,6 +102,7 @@ def border(keyframes: AnyArray = KEYFRAMES, starts: AnyArray = STARTS, stride: i
         (lambda: bundle().factorise_sparsely(np.arange(5)), "order"),
         (lambda: bundle().optimize(0.0, 9, 1e-4), "lambda_start"),
         (lambda: bundle().optimize(float("nan"), 9, 1e-4), "lambda_start"),
+        (lambda: bundle().optimize(1e-6, 1 << 30, 1e-4), "max_iterations"),
     ],
 )
 def test_what_cannot_be_is_refused(call: Any, told: str) -> None:

@@ -42,11 +42,11 @@ namespace {
 using Indices = Array<int64_t, -1>;
 
 void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>& pairs, const Indices& order) {
-  constexpr int64_t kMost = 1 << 30;
+  constexpr int64_t kMostEach = 1 << 12, kMost = 1 << 24;
   const int64_t count = int64_t(sizes.shape(0));
   int64_t total = 0;
   for (int64_t n = 0; n < count; ++n) {
-    if (sizes(n) < 1 || sizes(n) > kMost || (total += sizes(n)) > kMost) throw nb::value_error("sizes: at least 1, at most 2^30 in all");
+    if (sizes(n) < 1 || sizes(n) > kMostEach || (total += sizes(n)) > kMost) throw nb::value_error("sizes: 1 to 4096, at most 2^24 in all");
   }
   std::vector<std::pair<int64_t, int64_t>> coupled;
   for (size_t n = 0; n < pairs.shape(0); ++n) {

@@ -127,6 +127,7 @@ void factorise_sparsely(BundleSolver& solver, const Indices<-1>& order) {
 
 auto optimize(BundleSolver& solver, double lambda_start, int max_iterations, double relative_cost_tolerance) {
   check(lambda_start > 0.0 && std::isfinite(lambda_start), "lambda_start: above zero");
+  check(max_iterations >= 0 && max_iterations <= 10'000, "max_iterations: 0 to 10,000");
   auto interruptible = [] {
     nb::gil_scoped_acquire held;
     if (PyErr_CheckSignals() != 0) throw nb::python_error();

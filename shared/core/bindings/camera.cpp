@@ -18,9 +18,9 @@ auto undistort_of(const Array<double, 8>& lens, const Reals& goals_x, const Real
 }
 
 auto register_depth_of(const Array<double, -1, 3>& points, const Array<double, -1, 2>& pixels, int width, int height) {
-  constexpr int kLargest = 1 << 15;
+  constexpr int64_t kMostPixels = 1 << 26;
   if (pixels.shape(0) != points.shape(0)) throw nb::value_error("pixels: one for each point");
-  if (width < 0 || height < 0 || width > kLargest || height > kLargest) throw nb::value_error("width, height: up to 2^15");
+  if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
   std::vector<float> image(size_t(width) * size_t(height));
   unlocked([&] { register_depth(points.data(), pixels.data(), points.shape(0), height, width, image.data()); });
   return as_numpy<float, 2>(std::move(image), {size_t(height), size_t(width)});

@@ -34,6 +34,9 @@ auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, con
                       int height) {
   if (!(distance_px >= 0.1 && width >= 0 && height >= 0 && count >= 0))
     throw nb::value_error("distance_px: at least 0.1; sizes: not negative");
+  constexpr double kMostCells = 1 << 26;
+  if ((width / distance_px + 1.0) * (height / distance_px + 1.0) > kMostCells)
+    throw nb::value_error("width, height: up to 2^26 squares of distance_px");
   const int64_t known = int64_t(pixels.shape(0));
   for (size_t k = 0; k < order.shape(0); ++k)
     if (order(k) < 0 || order(k) >= known) throw nb::value_error("order: indices of pixels");

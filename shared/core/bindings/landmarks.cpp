@@ -109,6 +109,10 @@ size_t choose_landmarks_of(const Indices& candidates, const Indices& starts, con
   check_size(cells.shape(0), landmarks.count, "cells: one for each landmark");
   check_size(chosen.shape(0), landmarks.count, "chosen: one for each landmark");
   if (limit < 0 || bins_per_view < 1) throw nb::value_error("limit: not negative; bins_per_view: at least 1");
+  constexpr int64_t kFarthest = int64_t(1) << 62;
+  const auto is_far = [](int64_t number) { return number < -kFarthest || number > kFarthest; };
+  for (const Counts* each : {&counts, &needs})
+    if (std::any_of(each->data(), each->data() + each->size(), is_far)) throw nb::value_error("counts, needs: within 2^62");
   check_indices(candidates, landmarks.count, "candidates: of landmarks");
   check_indices(cells, room.shape(0), "cells: of room");
   check_indices(bins, std::min(counts.shape(0), needs.shape(0) * size_t(bins_per_view)), "bins: of counts and needs");

@@ -1,5 +1,5 @@
 #include "pair_matching.h"
-#include "arrays.h"  // first: Python's header comes before the system's
+#include "refinement.h"  // first: Python's header comes before the system's
 
 using namespace fleetmap;
 
@@ -22,12 +22,11 @@ KeyframeFeatures features_of(const Features& features) {
 }
 
 auto match_guided_of(const Features& a, const Features& b, const Array<double, 4, 4>& b_from_a, const Lens& lens, const Size& size_px,
-                     double sigma_px, const std::tuple<double, double, std::tuple<int, int>>& refinement, int max_distance,
-                     const Array<double, -1>& radii_px, int least_inliers, double least_share) {
+                     double sigma_px, const Limits& refinement, int max_distance, const Array<double, -1>& radii_px, int least_inliers,
+                     double least_share) {
   if (least_inliers < 0) throw nb::value_error("least_inliers: not negative");
-  const auto [width, gate_squared, iterations] = refinement;
-  const Refinement limits{width, gate_squared, std::get<0>(iterations), std::get<1>(iterations)};
-  const PairGuidance guidance{stereo_lens(lens), std::get<0>(size_px), std::get<1>(size_px), sigma_px, limits, max_distance};
+  const PairGuidance guidance{stereo_lens(lens), std::get<0>(size_px),      std::get<1>(size_px),
+                              sigma_px,          refinement_of(refinement), max_distance};
   const PairStart start{{radii_px.data(), radii_px.data() + radii_px.size()}, least_inliers, least_share};
   const KeyframeFeatures ours = features_of(a), theirs = features_of(b);
   GuidedPair found = unlocked([&] { return match_guided(ours, theirs, guidance, se3(b_from_a.data()), start); });

@@ -4,6 +4,7 @@
 #include <optional>
 
 #include "pnp_search.h"
+#include "refinement.h"
 
 using namespace fleetmap;
 
@@ -12,7 +13,6 @@ namespace {
 using Lens = Array<double, 4>;
 using Points = Array<double, -1, 3>;
 using Weights = Array<double, -1, 2>;
-using Limits = std::tuple<double, double, std::tuple<int, int>>;
 
 Sightings sightings_of(const Points& points, const Points& pixels, const Weights& weights) {
   if (pixels.shape(0) != points.shape(0) || weights.shape(0) != points.shape(0))
@@ -21,11 +21,6 @@ Sightings sightings_of(const Points& points, const Points& pixels, const Weights
 }
 
 StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
-
-Refinement refinement_of(const Limits& limits) {
-  const auto& [width, gate_squared, iterations] = limits;
-  return {width, gate_squared, std::get<0>(iterations), std::get<1>(iterations)};
-}
 
 Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
 
@@ -44,9 +39,9 @@ Result result_of(std::optional<Resection>&& found) {
 Result refine_pnp_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
                      const Array<double, 4, 4>& cam_from_source, const std::optional<Array<double, 6, 6>>& prior) {
   const Sightings seen = sightings_of(points, pixels, weights);
-  return result_of(unlocked([&] {
-    return refine_pnp(seen, lens_of(lens), refinement_of(refinement), prior ? prior->data() : nullptr, se3(cam_from_source.data()));
-  }));
+  const Refinement limits = refinement_of(refinement);
+  return result_of(
+      unlocked([&] { return refine_pnp(seen, lens_of(lens), limits, prior ? prior->data() : nullptr, se3(cam_from_source.data())); }));
 }
 
 Result ransac_pnp_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
@@ -54,17 +49,18 @@ Result ransac_pnp_of(const Points& points, const Points& pixels, const Weights& 
   const Sightings seen = sightings_of(points, pixels, weights);
   if (!std::all_of(draws.data(), draws.data() + draws.size(), [](double draw) { return draw >= 0.0 && draw < 1.0; }))
     throw nb::value_error("draws: from 0 to below 1");
+  const Refinement limits = refinement_of(refinement);
   return result_of(unlocked([&] {
-    return ransac_pnp(seen, lens_of(lens), refinement_of(refinement), agreement_of(threshold_px, min_inliers), draws.data(), draws.shape(0),
-                      confidence);
+    return ransac_pnp(seen, lens_of(lens), limits, agreement_of(threshold_px, min_inliers), draws.data(), draws.shape(0), confidence);
   }));
 }
 
 Result pnp_with_rotation_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,
                             double threshold_px, int min_inliers, const Array<double, 3, 3>& rotation, double rotation_sigma_rad) {
   const Sightings seen = sightings_of(points, pixels, weights);
+  const Refinement limits = refinement_of(refinement);
   return result_of(unlocked([&] {
-    return pnp_with_rotation(seen, lens_of(lens), refinement_of(refinement), agreement_of(threshold_px, min_inliers), mat3(rotation.data()),
+    return pnp_with_rotation(seen, lens_of(lens), limits, agreement_of(threshold_px, min_inliers), mat3(rotation.data()),
                              rotation_sigma_rad);
   }));
 }

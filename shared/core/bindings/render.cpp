@@ -21,7 +21,7 @@ using Chunks = std::tuple<Array<int32_t, -1, 2>, Sixes>;
 using Atlas = std::tuple<Array<uint8_t, -1>, Array<int32_t, -1, -1>, Array<int32_t, -1, -1>, Array<int32_t, 2>>;
 using Triple = Array<double, 3>;
 
-constexpr double kMostPx = 8192;
+constexpr double kMostPx = 8192, kMostCellsAlong = 4096;
 
 Textures textures_of(const Atlas& atlas) {
   const auto& [texels, table, decals, floor] = atlas;
@@ -66,9 +66,9 @@ Surfaces surfaces_of(const Lit& lit, const Chunks& chunks, int64_t textures) {
 class Painter {
  public:
   Painter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays)
-      : rows_(rays.size() ? rays.shape(0) : size_t(plane(5))),
-        columns_(rays.size() ? rays.shape(1) : size_t(plane(4))),
-        painter_(checked(plane), {rays.data(), ptrdiff_t(rays.shape(0)), ptrdiff_t(rays.shape(1))}) {}
+      : painter_(checked(plane), {rays.data(), ptrdiff_t(rays.shape(0)), ptrdiff_t(rays.shape(1))}),
+        rows_(rays.size() ? rays.shape(0) : size_t(plane(5))),
+        columns_(rays.size() ? rays.shape(1) : size_t(plane(4))) {}
 
   void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Array<double, 3, 3>& cam_from_map, const Triple& centre_map,
            int samples, std::tuple<double, double> shift, double weight, int most_taps, double reflectance,
@@ -100,8 +100,8 @@ class Painter {
   }
 
   std::mutex mutex_;
-  size_t rows_, columns_;
   ScenePainter painter_;
+  size_t rows_, columns_;  // once the plane is checked
 };
 
 auto develop_of(const Array<double, -1, -1>& radiance, double gain, double shot, double read, const Array<float, -1>& normals, int64_t key,
@@ -119,8 +119,12 @@ auto develop_of(const Array<double, -1, -1>& radiance, double gain, double shot,
 
 BoxGrid box_grid_of(const Array<double, -1, 8>& boxes, const Triple& low, const Triple& high, double cell_m) {
   double cells = 1.0;
-  for (size_t axis = 0; axis < 3; ++axis) cells *= std::max(1.0, std::ceil((high(axis) - low(axis)) / cell_m));
-  if (!(cells <= double(1 << 24))) throw nb::value_error("low, high, cell_m: at most 2^24 cells");
+  for (size_t axis = 0; axis < 3; ++axis) {
+    const double along = std::max(1.0, std::ceil((high(axis) - low(axis)) / cell_m));
+    cells *= along;
+    if (along > kMostCellsAlong || cells > double(1 << 24))
+      throw nb::value_error("low, high, cell_m: at most 2^24 cells, 4096 along an axis");
+  }
   std::vector<YawedBox> all(boxes.shape(0));
   for (size_t b = 0; b < all.size(); ++b)
     all[b] = {{boxes(b, 0), boxes(b, 1), boxes(b, 2)}, {boxes(b, 3), boxes(b, 4), boxes(b, 5)}, boxes(b, 6), boxes(b, 7)};

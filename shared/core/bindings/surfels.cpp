@@ -19,7 +19,7 @@ using Image64 = Array<double, -1, -1>;
 using Pose = Array<double, 4, 4>;
 using Lens = Array<double, 4>;
 
-constexpr int kMostPx = 1 << 16;
+constexpr int64_t kMostPixels = 1 << 25;
 
 StereoLens stereo(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
@@ -130,7 +130,7 @@ Gaussians gaussians_of(const Pairs& pixels, const Triples& conics, const Pairs& 
 auto blend_of(const Pairs& pixels, const Triples& conics, const Pairs& reaches_px, const Doubles& peaks, const Doubles& greys, int width,
               int height) {
   const Gaussians gaussians = gaussians_of(pixels, conics, reaches_px, peaks, greys);
-  if (width < 0 || height < 0 || width > kMostPx || height > kMostPx) throw nb::value_error("width, height: 0 to 65536");
+  if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^25 pixels");
   const size_t rows = size_t(height), columns = size_t(width);
   std::vector<double> through(rows * columns, 1.0), blended(rows * columns);
   unlocked([&] { blend(gaussians, {through.data(), height, width}, blended.data()); });

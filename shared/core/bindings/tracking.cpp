@@ -6,6 +6,7 @@
 #include "flow.h"
 #include "images.h"  // first: Python's header comes before the system's
 #include "observations.h"
+#include "refinement.h"
 #include "tracking.h"
 
 using namespace fleetmap;
@@ -56,12 +57,9 @@ using Points = Array<double, -1, 3>;
 StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
 auto track_points_of(const Levels& before, const Levels& now, const Points& pixels, const Motion& cam_from_previous, const Lens& lens,
-                     int half, double within_px, double margin_px, int least,
-                     const std::tuple<double, double, std::tuple<int, int>>& refinement) {
+                     int half, double within_px, double margin_px, int least, const Limits& refinement) {
   check_window(half);
-  const auto [width, gate_squared, iterations] = refinement;
-  const TrackLimits limits{
-      half, within_px, margin_px, size_t(std::max(least, 1)), {width, gate_squared, std::get<0>(iterations), std::get<1>(iterations)}};
+  const TrackLimits limits{half, within_px, margin_px, size_t(std::max(least, 1)), refinement_of(refinement)};
   const std::vector<GreyImage> first = greys(before), second = greys(now);
   const size_t count = pixels.shape(0);
   PointTracks found =
