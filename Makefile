@@ -34,7 +34,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core demo demo-recording test test-ci test-all sanitize check docs bench acceptance study clean
+.PHONY: help core demo demo-recording test test-ci test-all sanitizers sanitize check docs bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -77,11 +77,20 @@ check: $(DEV_STAMP)
 SANITIZED := $(VENV)/core-sanitize
 TESTS_OF_CORE := $(addprefix tests/,fleetmap fleetsim mapserver/survey mapserver/calibration mapserver/surfels mapserver/grid mapserver/tiles \
 	locclient/localization locclient/replay/test_failure_replay.py)
-sanitize: core
+GXX := $${CXX:-c++}
+sanitize: sanitizers core
 	@$(BUILD_CORE) sanitize
-	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so) $$(c++ -print-file-name=libstdc++.so)" \
-		ASAN_OPTIONS=detect_leaks=0 FLEETMAP_CORE="$$(echo $(CURDIR)/$(SANITIZED)/_core.*.so)" PYTHONPATH=shared/core/sanitize \
+	LD_PRELOAD="$$($(GXX) -print-file-name=libasan.so) $$($(GXX) -print-file-name=libubsan.so) $$($(GXX) -print-file-name=libstdc++.so)" \
+		ASAN_OPTIONS=detect_leaks=0:max_allocation_size_mb=1536 FLEETMAP_CORE="$$(echo $(CURDIR)/$(SANITIZED)/_core.*.so)" \
+		FLEETMAP_HOSTILE_EXAMPLES=1000 PYTHONPATH=shared/core/sanitize \
 		$(BIN)/python -m pytest $(TESTS_OF_CORE) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+
+# Python, which is not built with them, loads the libraries of g++ first; clang's cannot be had so.
+sanitizers:
+	@for library in libasan libubsan libstdc++; do \
+	  test -f "$$($(GXX) -print-file-name=$$library.so 2>/dev/null)" && ! $(GXX) --version | grep -q clang || { \
+	  echo "fleetmap: make sanitize needs g++ and its $$library.so (g++ on Debian and Ubuntu), which $(GXX) is not" >&2; exit 1; }; \
+	done
 
 docs: core
 	$(BIN)/python docs/generate.py
