@@ -173,7 +173,7 @@ Vec3 Filter::propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, 
   }
   transition(covariance, 0, phi, processes[0], spare_);
   transition(true_error_cov, kConsidered, phi, processes[1], spare_);
-  forget_pair(end_ns > start_ns ? double(end_ns - start_ns) * 1e-9 : 0.0);
+  forget_pair(end_ns > start_ns ? double(uint64_t(end_ns) - uint64_t(start_ns)) * 1e-9 : 0.0);
   return last_rate;
 }
 

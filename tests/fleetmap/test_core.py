@@ -97,6 +97,15 @@ THREE, BOUNDS, NEIGHBOURS = np.arange(3), np.arange(4), np.array([[0, 1]])
 HEIGHTS, PLANE, UNSET, LEVELS = np.ones(3), np.ones((3, 2)), np.zeros(3, bool), np.zeros(3, np.int8)
 CELL_MODEL = 2.0, 0.05, 0.15, 0.01, 1.25
 FARTHEST = np.iinfo(np.int64).max
+BAKED = (
+    np.ones((1, 9)),
+    np.zeros((1, 6), np.int32),
+    np.zeros((1, 2), np.int32),
+    np.ones((0, 5)),
+    1.0,
+    True,
+    np.zeros((1, 4), np.float32),
+)
 BUDGET = THREE, np.full(3, 9), 3, np.zeros(3, np.int64), UNSET, np.full(3, 9), 1  # of choose_landmarks
 CONES = POINTS, np.ones((5, 3), np.float32), np.ones(5, np.float32), np.ones(5, np.float32)
 VIEW = 1.0, 10.0, np.pi, 1.2  # scale of distances, margin, angle, scale of octaves
@@ -159,6 +168,7 @@ FILTER = InvariantFilter(
         (lambda: core.blend(PLANE, POINTS[:3], PLANE, HEIGHTS, HEIGHTS, 1 << 14, 1 << 14), "width, height"),
         (lambda: core.BoxGrid(np.ones((1, 8)), ZERO, np.array([1.0, 1.0, 5e3]), 1.0), "cell_m"),
         (lambda: core.BoxGrid(np.full((9, 8), 2e3), ZERO, np.array([256.0, 256.0, 256.0]), 1.0), "boxes"),
+        (lambda: core.BoxGrid(np.ones((1, 8)), ZERO, THREE * 1.0, 1.0).bake(*BAKED[:3], FARTHEST, *BAKED[3:]), "owner_shift"),
         (lambda: core.ScenePainter(np.full(6, np.nan), np.zeros((0, 0, 4), np.float32)), "plane"),
         (lambda: core.spare_keyframes(THREE, BOUNDS, THREE[:2], BOUNDS, THREE, LEVELS, 1, 1, 0.5, 1), "keyframes: one"),
         (lambda: core.spare_keyframes(THREE, BOUNDS, THREE, BOUNDS, THREE, LEVELS[:2], 1, 1, 0.5, 1), "octaves: one"),
@@ -370,6 +380,7 @@ def test_no_number_of_a_track_or_sample_harms_the_filter(numbers: Array, seen: l
         window.predict_random_walk(np.eye(4), *numbers[0])
     tracks = np.array([0, 1, 3, 6]), np.array(seen), numbers, np.arange(3), numbers[:3].copy()
     assert len(window.update_by_tracks(*tracks, 2, np.eye(4), 1.0)) == 3
+    window.predict_inertial(np.arange(6), numbers, numbers, -(2**63), 2**63 - 1, (0.0,) * 4, (0.0,) * 4)
     window.predict_inertial(np.arange(6), numbers, numbers, 0, 9, (1.0, np.nan, np.inf, 0.0), (0.0,) * 4)
     window.correct_by_wheels(numbers[0], 1.0, 1.0, 0.0, numbers[1], np.eye(4), 10.0)
     window.correct_by_rest(numbers[0], 0.0, np.inf)

@@ -20,7 +20,7 @@ from fleetmap import _core  # type: ignore[attr-defined]
 from fleetmap.geometry import Array
 from fleetmap.odometry.settings import FilterSettings
 
-EXAMPLES = int(os.environ.get("FLEETMAP_HOSTILE_EXAMPLES", "12"))  # of each function; of a class, times its methods
+EXAMPLES = int(os.environ.get("FLEETMAP_HOSTILE_EXAMPLES", "6"))  # of each function; of a class, times its methods
 SANITIZED = "FLEETMAP_CORE" in os.environ
 SECONDS, BYTES = 5.0, 1 << 30  # the most that a call may take
 SIZES = 0, 1, 2, 3, 4, 6, 9, 15, 40

@@ -149,6 +149,7 @@ void bake_of(const BoxGrid& grid, const Quads& quads, const Numbers& numbers, co
              const Array<double, -1, 5>& lamps, double reach_m, bool has_shadows, const MutableArray<float, -1, -1>& light) {
   const size_t count = quads.shape(0);
   if (numbers.shape(0) != count || owners.shape(0) != count) throw nb::value_error("numbers, owners: one for each of quads");
+  if (std::abs(double(owner_shift)) > double(1u << 31)) throw nb::value_error("owner_shift: within 2^31");
   for (size_t f = 0; f < count; ++f) {
     const int64_t first = numbers(f, 3), columns = numbers(f, 4), rows = numbers(f, 5);
     if (first < 0 || columns < 0 || rows < 0 || first + columns * rows > int64_t(light.shape(1)))
