@@ -1,4 +1,4 @@
-"""Checks a decoded failure recording before any kernel sees it: robots write it, and a robot may be anybody's.
+"""Checks a decoded failure recording before anything computes with it: robots write it, and a robot may be anybody's.
 
 Every array is in ARRAYS by its field's name, or by class and field, with dtype, shape and a check of its values. Letters in a shape are
 lengths that all arrays of one object share.

@@ -319,7 +319,7 @@ def _decode(stored: StoredImage) -> AnyArray:
     row_bytes = stored.width_px * channels * wire_type.itemsize
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
-    # writable, as all images: one kind for kernels
+    # writable, as all images
     pixels: AnyArray = rows.copy().view(wire_type).astype(dtype, copy=False)
     return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
 

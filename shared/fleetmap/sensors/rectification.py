@@ -34,7 +34,7 @@ class StereoCamera:
 
     @property
     def lens(self) -> Array:
-        """(4,) as kernels take it: focal, cx, cy, focal * baseline."""
+        """(4,) as the core takes it: focal, cx, cy, focal * baseline."""
         return np.array([self.focal_px, self.cx_px, self.cy_px, self.focal_px * self.baseline_m])
 
     @property

@@ -32,7 +32,7 @@ _FACTORS = np.array([_CORNERS[name] for name in FACE_NAMES], np.float64)  # (6 f
 
 @dataclass(frozen=True, slots=True)
 class Faces:
-    """F faces ready for the kernels.
+    """F faces ready for the core.
 
     quads (F, 9): O, U, V in map, metres. values (F, 6): texels along U and V, tint, offset of the dirt (for floors: of
     the concrete) in texels x2, emission. numbers (F, 6): material, texture, lamp group, first light sample, light

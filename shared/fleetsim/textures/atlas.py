@@ -1,4 +1,4 @@
-"""All textures in one flat store with their mip pyramids: what the shading kernels read."""
+"""All textures in one flat store with their mip pyramids: what shading reads."""
 
 from dataclasses import dataclass
 

@@ -37,7 +37,7 @@ from support.fleet.tls_site import TlsSite
 
 ROBOTS = ("tote-1", "tote-2")
 SILENT_S = (8.0, 12.0)  # of every second lap
-SETTLED_S = 120.0  # before it, kernels are loaded and queues fill
+SETTLED_S = 120.0  # before it, libraries are loaded and queues fill
 POSE_WITHIN_S = 180.0
 
 

@@ -65,7 +65,7 @@ def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
     with open_recording(path) as recording:
         odd = np.arange(1, len(recording.frame_stamps_ns), 2)
     fixed, cpu_ms, errors_mm, slow = 0, [], [], []
-    played(path, store, LocalizerSettings(), ":40")  # loads the kernels
+    played(path, store, LocalizerSettings(), ":40")  # loads what computes
     for number in odd[np.linspace(0, len(odd) - 1, _STARTS).astype(int)].tolist():
         (frame,) = played(path, store, LocalizerSettings(), f"{number}:{number + 1}").frames
         fixed += frame.has_fix

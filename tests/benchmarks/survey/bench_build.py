@@ -3,7 +3,7 @@
     PYTHONPATH=tests python tests/benchmarks/survey/bench_build.py [--recording FILE] [--minutes M] [--threads N] [--out FILE.json]
 
 The speed is that of the five aisles, recorded on the way unless --recording names them, after a build of a short piece that loads
-the compiled kernels. It is told for 20 frames a second whatever the recording's rate is: frames / 20 Hz / seconds, which is less than
+the libraries. It is told for 20 frames a second whatever the recording's rate is: frames / 20 Hz / seconds, which is less than
 what the recording itself would give, as half of a build goes by keyframes. The long recording is the same drive again and again,
 left and entered where place, heading and velocity agree, stamps going on. So every lap is a revisit of all laps before: the worst case
 for whatever grows with revisits.
