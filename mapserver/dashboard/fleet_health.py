@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from scipy.special import bdtr
+import scipy
 
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import FailureSummary, decode_summary
@@ -198,8 +198,11 @@ def trend_words(day: Counters, week: Counters) -> str:
     if total == 0:
         return "none in the week before either"
     share = day.robot_days / (day.robot_days + week.robot_days)
-    if 2 * (1 - float(bdtr(day.position_failures - 1, total, share)) if day.position_failures else 1.0) < _SIGNIFICANCE:
+    if (
+        2 * (1 - float(scipy.special.bdtr(day.position_failures - 1, total, share)) if day.position_failures else 1.0)
+        < _SIGNIFICANCE
+    ):
         return "more than in the week before"
-    if 2 * float(bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
+    if 2 * float(scipy.special.bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
         return "fewer than in the week before"
     return "no clear change from the week before"

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy.special import betaincinv
+import scipy
 
 from mapserver.fleet_statistics.kpis import Counters, Rate, figure, is_telling, kpis, rate
 
@@ -66,8 +66,8 @@ def _trend(name: str, now: Counters, before: Counters, tail: float | None) -> Ar
 def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
     """The interval of the ratio of two rates with `tail` outside on either side."""
     a, b = now.events, before.events
-    low = 0.0 if a == 0 else float(betaincinv(a, b + 1, tail))
-    high = 1.0 if b == 0 else float(betaincinv(a + 1, b, 1 - tail))
+    low = 0.0 if a == 0 else float(scipy.special.betaincinv(a, b + 1, tail))
+    high = 1.0 if b == 0 else float(scipy.special.betaincinv(a + 1, b, 1 - tail))
     odds = before.robot_days / now.robot_days
     return odds * low / (1 - low), None if high >= 1.0 else odds * high / (1 - high)
 

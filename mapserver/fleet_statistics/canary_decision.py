@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
-from scipy.special import gammainc, gammaincinv
+import scipy
 
 from fleetmap.config import Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, driven_words, format_rate, is_telling, rate
@@ -110,9 +110,9 @@ def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_ro
     """
     if canary.robot_days <= 0 or others.robot_days <= 0:
         return 0.5
-    other_rates = gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
+    other_rates = scipy.special.gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
     limits = margin_ratio * other_rates + margin_per_robot_day
-    return float(np.mean(gammainc(canary.events + 0.5, canary.robot_days * limits)))
+    return float(np.mean(scipy.special.gammainc(canary.events + 0.5, canary.robot_days * limits)))
 
 
 def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:

@@ -6,7 +6,7 @@ A robot-day is 16 h of driving. Intervals hold the true value with 95 %.
 from dataclasses import astuple, dataclass, fields
 from typing import Self
 
-from scipy.special import betaincinv, gammaincinv
+import scipy
 
 ROBOT_DAY_S = 16 * 3600.0
 HOUR_NS = 3_600_000_000_000
@@ -186,8 +186,10 @@ def poisson_interval(events: int) -> tuple[float, float]:
     Source: Garwood 1936, by quantiles of the gamma distribution.
     """
     if events == 0:
-        return 0.0, float(gammaincinv(1, 1 - _TAIL))
-    return float(gammaincinv(events, _TAIL / 2)), float(gammaincinv(events + 1, 1 - _TAIL / 2))
+        return 0.0, float(scipy.special.gammaincinv(1, 1 - _TAIL))
+    return float(scipy.special.gammaincinv(events, _TAIL / 2)), float(
+        scipy.special.gammaincinv(events + 1, 1 - _TAIL / 2)
+    )
 
 
 def share(hits: int, tries: int) -> Share:
@@ -199,8 +201,8 @@ def share(hits: int, tries: int) -> Share:
         return Share(hits, tries, None, None, None)
     one_sided = hits in {0, tries}
     tail = _TAIL if one_sided else _TAIL / 2
-    low = 0.0 if hits == 0 else float(betaincinv(hits, tries - hits + 1, tail))
-    high = 1.0 if hits == tries else float(betaincinv(hits + 1, tries - hits, 1 - tail))
+    low = 0.0 if hits == 0 else float(scipy.special.betaincinv(hits, tries - hits + 1, tail))
+    high = 1.0 if hits == tries else float(scipy.special.betaincinv(hits + 1, tries - hits, 1 - tail))
     return Share(hits, tries, hits / tries, low, high)
 
 

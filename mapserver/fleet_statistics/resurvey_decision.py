@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import msgspec
-from scipy.special import betainc
+import scipy
 
 from fleetmap.config import Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, kpis, rate
@@ -139,7 +139,7 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
     else:
         return []
     odds = settings.rising_ratio * max(now.robot_days, 1e-6) / days
-    chance = float(betainc(now.events, events + 1, odds / (1 + odds)))
+    chance = float(scipy.special.betainc(now.events, events + 1, odds / (1 + odds)))
     if chance * tests > _ALPHA:
         return []
     driven = f"{now.driving_ms / 3.6e6:.1f} h of driving"

@@ -5,7 +5,7 @@ from typing import Any, Protocol
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from fleetmap.geometry import Array, inside_rings
 
@@ -47,7 +47,7 @@ class SurveyRequest:
         inside = places_map_m[inside_rings(places_map_m, [np.array(self.corners_map_m)])]
         if not len(inside) or not len(driven_map_m):
             return 0.0
-        return float(np.mean(cKDTree(driven_map_m).query(inside)[0] <= _NEAR_M))
+        return float(np.mean(scipy.spatial.cKDTree(driven_map_m).query(inside)[0] <= _NEAR_M))
 
 
 class SiteFiles(Protocol):

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array
 from mapserver.quality.figures import TileDirections
@@ -89,7 +89,9 @@ def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDA
     """(K,) which places have another near them that looks the other way."""
     met = np.zeros(len(positions_map), bool)
     if len(positions_map):
-        first, second = cKDTree(positions_map).query_pairs(_NEAR_M, output_type="ndarray").reshape(-1, 2).T
+        first, second = (
+            scipy.spatial.cKDTree(positions_map).query_pairs(_NEAR_M, output_type="ndarray").reshape(-1, 2).T
+        )
         opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
         met[first[opposed]] = met[second[opposed]] = True
     return met

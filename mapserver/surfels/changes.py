@@ -9,10 +9,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from fleetmap import core
 from fleetmap.errors import UsageError
@@ -142,7 +140,7 @@ def _only_in(one: Surfels, other: Surfels) -> _Voxels:
     keys = core.voxel_keys(fine.points_map, np.full(len(fine), _VOXEL_LEVEL, np.uint8))
     _, first, of_voxel = np.unique(keys, return_index=True, return_inverse=True)
     voxels = np.floor(fine.points_map[first].astype(np.float64) / _VOXEL_M)
-    gaps_m = cKDTree(other.points_map).query((voxels + 0.5) * _VOXEL_M, distance_upper_bound=_REACH_M)[0]
+    gaps_m = scipy.spatial.cKDTree(other.points_map).query((voxels + 0.5) * _VOXEL_M, distance_upper_bound=_REACH_M)[0]
     rest = np.flatnonzero(np.isinf(gaps_m)[of_voxel])
     places, areas = fine.points_map[rest].astype(np.float64), fine.edges_m[rest].astype(np.float64) ** 2
     count, of_voxel = np.bincount(of_voxel[rest], minlength=len(voxels)), of_voxel[rest]
@@ -199,9 +197,11 @@ def _joined(points_map: Array) -> list[NDArray[np.int64]]:
     """Rows of points that hang together by steps of a voxel's diagonal."""
     if not len(points_map):
         return []
-    pairs = cKDTree(points_map).query_pairs(1.8 * _VOXEL_M, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points_map), len(points_map)))
-    count, labels = connected_components(links, directed=False)
+    pairs = scipy.spatial.cKDTree(points_map).query_pairs(1.8 * _VOXEL_M, output_type="ndarray")
+    links = scipy.sparse.coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points_map), len(points_map))
+    )
+    count, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.cumsum(np.bincount(labels, minlength=count))[:-1])
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array, vstack
-from scipy.sparse.linalg import lsmr
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
@@ -62,15 +61,19 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     rows = np.repeat(np.arange(count), FALLOFF + 2)
     columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views, first + shown])
     values = np.column_stack([_powers(every.squared), np.ones((count, 2))])
-    design = csr_array((values.ravel(), (rows, columns.ravel().astype(np.int64))), (count, first + len(points)))
+    design = scipy.sparse.csr_array(
+        (values.ravel(), (rows, columns.ravel().astype(np.int64))), (count, first + len(points))
+    )
     # All views brighter and all points darker would be the same; what is not seen stays at nothing.
-    prior = csr_array((np.full(first, _PRIOR), (np.arange(first), np.arange(first))), (first, design.shape[1]))
+    prior = scipy.sparse.csr_array(
+        (np.full(first, _PRIOR), (np.arange(first), np.arange(first))), (first, design.shape[1])
+    )
     weights, start = np.ones(count), np.zeros(design.shape[1])
     start[first:] = every.logs.mean()
     for _ in range(_ROUNDS):
-        whole = vstack([diags_array(weights) @ design, prior])
+        whole = scipy.sparse.vstack([scipy.sparse.diags_array(weights) @ design, prior])
         rest = np.concatenate([weights * every.logs, np.zeros(first)])
-        start = lsmr(whole, rest, atol=1e-6, btol=1e-6, maxiter=200, x0=start)[0]
+        start = scipy.sparse.linalg.lsmr(whole, rest, atol=1e-6, btol=1e-6, maxiter=200, x0=start)[0]
         off = np.abs(every.logs - design @ start)
         weights = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(off, 1e-9)))
     logs = start[FALLOFF:first]
