@@ -21,7 +21,7 @@ TIERS = {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays",
         "source": "kind sensors calibration endpoint recording device",
-        "output": "format endpoint map robot_height_m autostart",
+        "output": "format endpoint robot_height_m autostart",
         "topics": "*",
         "vda5050": "broker manufacturer serial_number interface username password_file ca map_id versions download_from "
         "download_token_file download_ca robot_actions factsheet frame",
@@ -32,7 +32,7 @@ TIERS = {
         "run.trial": "*",
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
-        "map_frame building_frame odom_frame base_frame sensor_frames publish_odom driver_odom_topic is_map_server transform_tolerance_s",
+        "map_frame building_frame odom_frame base_frame sensor_frames publish_odom driver_odom_topic transform_tolerance_s",
         "vda5050": "mqtt state_interval_s robot_silent_s initialize_s initial_sigma_m initial_sigma_rad",
         "localizer": "seed",
         "localizer.orb": "extractor count",

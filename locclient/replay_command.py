@@ -1,7 +1,6 @@
 """`locclient replay`: localization of a recording in a published map."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,11 +11,9 @@ from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, setting
 from fleetmap.errors import UsageError
 
 if TYPE_CHECKING:
-    from fleetmap.foxglove import ViewerAddress
-    from fleetmap.sources.replay_source import ReplaySource
     from locclient.config import LocclientConfig
     from locclient.identity import MapAddress
-    from locclient.replay.run_viewer import RunViewer
+    from locclient.replay.run_export import RunExport
 
 Insecure = Annotated[
     bool, typer.Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")
@@ -79,10 +76,6 @@ class PlaybackOptions:
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
     ] = False
-    foxglove: Annotated[
-        str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Show the run in Foxglove there; --realtime at its own speed."),
-    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +85,7 @@ class ResultFiles:
     report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
     trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames to this TUM file.")] = None
     picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
-    mcap: Annotated[Path | None, typer.Option(help="Write what --foxglove shows to this MCAP file.")] = None
+    mcap: Annotated[Path | None, typer.Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
 
     def check(self) -> None:
         """Raises UsageError for files that cannot be written."""
@@ -180,7 +173,7 @@ def _run(
 
     from fleetmap.console import plain_console
     from fleetmap.encoding import to_json
-    from fleetmap.foxglove import require_foxglove, viewer_address
+    from fleetmap.foxglove import require_foxglove
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
@@ -189,63 +182,41 @@ def _run(
     from locclient.replay.replay import ReplayOptions
     from locclient.replay.replay import replay as play
 
-    at = None if playback.foxglove is None else viewer_address(playback.foxglove, insecure=map_options.insecure)
-    if at is not None or files.mcap is not None:
-        require_foxglove("--mcap" if at is None else "--foxglove")
+    if files.mcap is not None:
+        require_foxglove("--mcap")
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = plain_console(stderr=True)
-    with open_recording(path, opening) as recording:
+    with ExitStack() as stack:
+        recording = stack.enter_context(open_recording(path, opening))
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
-        with _viewing(source, at, is_wanted=files.mcap is not None) as viewer:
-            with (
-                connected(address, map_options.cache, map_options.cache_bytes) as connection,
-                Progress(console=console, disable=not console.is_terminal) as bar,
-            ):
-                for issue in recording.issues:
-                    console.print(f"note: {issue.what} {issue.detail}".rstrip())
-                task = bar.add_task("replay", total=len(source))
-                options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), viewer)
-                result = play(source, connection, options, prior)
-            report = result.report
-            if files.report is not None:
-                files.report.write_bytes(to_json(report, indent=2) + b"\n")
-            if files.trajectory is not None:
-                write_tum(files.trajectory, result.trajectory)
-            if files.picture is not None:
-                result.save_picture(files.picture)
-            if viewer is not None and files.mcap is not None:
-                viewer.write_mcap(files.mcap)
-            table = Table("measure", "value")
-            for name, value in report.items():
-                table.add_row(name, _shown(value))
-            plain_console().print(table)
+        export: RunExport | None = None
+        if files.mcap is not None:
+            from locclient.replay.run_export import run_export
+
+            export = stack.enter_context(run_export(files.mcap))
+        connection = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
+        with Progress(console=console, disable=not console.is_terminal) as bar:
+            for issue in recording.issues:
+                console.print(f"note: {issue.what} {issue.detail}".rstrip())
+            task = bar.add_task("replay", total=len(source))
+            options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), export)
+            result = play(source, connection, options, prior)
+    report = result.report
+    if files.report is not None:
+        files.report.write_bytes(to_json(report, indent=2) + b"\n")
+    if files.trajectory is not None:
+        write_tum(files.trajectory, result.trajectory)
+    if files.picture is not None:
+        result.save_picture(files.picture)
+    table = Table("measure", "value")
+    for name, value in report.items():
+        table.add_row(name, _shown(value))
+    plain_console().print(table)
     if result.search.is_lost_run:
         typer.echo(result.search.words, err=True)
         raise typer.Exit(NOT_LOCALISED_STATUS)
-
-
-@contextmanager
-def _viewing(source: "ReplaySource", at: "ViewerAddress | None", *, is_wanted: bool) -> "Iterator[RunViewer | None]":
-    """What shows a replay, None where nobody wants it."""
-    if at is None and not is_wanted:
-        yield None
-        return
-    import numpy as np
-
-    from fleetmap.foxglove.server import FoxgloveServer
-    from locclient.replay.run_viewer import RunViewer
-
-    recording = source.recording
-    with recording.part(np.arange(len(recording))) as images:
-        played = replace(source, recording=images)
-        if at is None:
-            yield RunViewer(played)
-            return
-        with FoxgloveServer(at, recording.name) as server:
-            typer.echo(f"foxglove: {server.url}")
-            yield RunViewer(played, server.show)
 
 
 def _shown(value: object) -> str:

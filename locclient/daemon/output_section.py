@@ -9,16 +9,12 @@ from fleetmap.config import Section
 from fleetmap.errors import UsageError
 from fleetmap.version_grid import FLOOR_M, TOP_M
 
-OF_VERSION = "version"
-"""Value of `map`: the grid that planners get is that of the version which the robot runs."""
-
 
 class OutputSection(Section, frozen=True):
     """Format and endpoint of estimates. Without an endpoint they go to the map server's, or nowhere where there is none."""
 
     format: str = "messagepack"
     endpoint: str | None = None
-    map: str = "version"
     robot_height_m: Annotated[float, msgspec.Meta(gt=FLOOR_M, le=TOP_M)] = 1.1
     autostart: bool = True
     domain: int = 0
@@ -38,7 +34,6 @@ class OutputSection(Section, frozen=True):
     sensor_frames: str = "fleetmap_"
     publish_odom: bool = True
     driver_odom_topic: str = ""
-    is_map_server: bool = False
     transform_tolerance_s: float = 0.0
 
 

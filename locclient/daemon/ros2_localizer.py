@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from pathlib import Path
-from urllib.parse import unquote, urlparse
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
-from fleetmap.occupancy_grid import GridImageError, MissingGridError, OccupancyGrid, read_grid
+from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.recordings.ros2.graph import LATCHED, Qos, key_layout
@@ -37,18 +35,16 @@ from fleetmap.recordings.ros2.navigation_messages import (
     Motion,
     decode_bond,
     decode_initial_pose,
-    decode_text,
     encode_bond,
     encode_diagnostics,
     encode_grid,
-    encode_loaded_map,
     encode_motion,
 )
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.intake import Intake
 from locclient.daemon.driver_odometry import DriverOdometry
-from locclient.daemon.output_section import OF_VERSION, OutputSection
+from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import Publisher
 from locclient.localization.estimate import Estimate
 from locclient.localization.pose_covariance import transport_cov
@@ -156,8 +152,6 @@ _OK, _WARN, _ERROR = 0, 1, 2
 _LEVELS = {Status.TRACKING: _OK, Status.LOST: _ERROR}
 _OWN_TF = 256  # messages, by which the own ones are known when they come back
 _OTHER_S = 5.0  # another program is named for so long after its last transform
-# nav2_msgs/srv/LoadMap
-_LOADED, _NO_MAP, _BAD_IMAGE, _BAD_ENTRIES = 0, 1, 2, 3
 # Of the motion between two frames: radians, metres, share of the distance; and where the odometry does not hold.
 _MEASURED, _GUESSED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _log = logging.getLogger(__name__)
@@ -172,13 +166,11 @@ class Ros2Localizer(Publisher):
     def __init__(
         self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
     ) -> None:
-        """section: from `completed_for_ros2`. Raises UsageError for names that are none, FleetmapError for a grid that cannot be read."""
+        """section: from `completed_for_ros2`. Raises UsageError for names that are none."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
-        # A file, also one that `load_map` named, stays in the place of the version's grid.
-        self.grid_height_m = section.robot_height_m if section.map == OF_VERSION else None
-        is_file = section.map not in {OF_VERSION, ""}
-        self._grid = read_grid(Path(section.map)) if is_file else None
-        self._map_words = f"file {section.map}" if is_file else "none yet"
+        self.grid_height_m = section.robot_height_m if section.map_topic else None
+        self._grid: OccupancyGrid | None = None
+        self._map_words = "none yet"
         self._state = LifecycleState.ACTIVE if section.autostart else LifecycleState.UNCONFIGURED
         self._lock = threading.Lock()  # of the state
         self._last: tuple[Estimate, PublishedPose] | None = None
@@ -211,7 +203,8 @@ class Ros2Localizer(Publisher):
         self._send_tf_static = node.publisher(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", LATCHED)
         self._send_odom = node.publisher(section.odom_topic, "nav_msgs/Odometry")
         self._send_status = node.publisher(section.status_topic, "std_msgs/String")
-        self._send_map = node.publisher(section.map_topic, "nav_msgs/OccupancyGrid", LATCHED)
+        if section.map_topic:
+            self._send_map = node.publisher(section.map_topic, "nav_msgs/OccupancyGrid", LATCHED)
         self._send_diagnostics = node.publisher("/diagnostics", "diagnostic_msgs/DiagnosticArray")
         self._send_bond = node.publisher("bond", "bond/Status")
         self._send_event = node.publisher("~/transition_event", "lifecycle_msgs/TransitionEvent")
@@ -232,8 +225,6 @@ class Ros2Localizer(Publisher):
         node.serve("set_initial_pose", "nav2_msgs/srv/SetInitialPose", self._set_initial_pose)
         node.serve("reinitialize_global_localization", "std_srvs/srv/Empty", self._search_anew)
         node.serve("request_nomotion_update", "std_srvs/srv/Empty", lambda _: EMPTY)
-        for name in ("~/load_map", *(["map_server/load_map"] if section.is_map_server else [])):
-            node.serve(name, "nav2_msgs/srv/LoadMap", self._load_map)
 
     # --- called by the thread that localizes --------------------------------------------------------------------------
 
@@ -325,8 +316,6 @@ class Ros2Localizer(Publisher):
 
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
         """Without a grid the last one stays on the topic: the map's frame is the same in every version."""
-        if self._map_words.startswith("file "):
-            return
         self._map_words = why if grid is None else f"grid of version {version}"
         if grid is None:
             _log.warning("planners get no new map: %s", why)
@@ -392,20 +381,6 @@ class Ros2Localizer(Publisher):
     def _search_anew(self, _: bytes) -> bytes:
         self._intake.put_forget()
         return EMPTY
-
-    def _load_map(self, request: bytes) -> bytes:
-        result, grid = _LOADED, None
-        try:
-            grid = _grid_at(url := decode_text(request))
-        except FleetmapError as error:
-            _log.warning("load_map: %s", error)
-            kinds = {MissingGridError: _NO_MAP, GridImageError: _BAD_IMAGE}
-            result = kinds.get(type(error), _BAD_ENTRIES)
-        if grid is not None:
-            self._grid, self._map_words = grid, f"file {url}"
-            if self._state is LifecycleState.ACTIVE:
-                self._send_latched()
-        return encode_loaded_map(time.time_ns(), self._section.map_frame, grid, result)
 
     def _send_latched(self) -> None:
         self._send_static_frames()
@@ -473,10 +448,3 @@ def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[Fr
     for number, camera in enumerate(calibration.cameras):
         links.append(FrameLink(body, f"{section.sensor_frames}cam{number}_optical", camera.body_from_cam))
     return links
-
-
-def _grid_at(url: str) -> OccupancyGrid:
-    parsed = urlparse(url)
-    if parsed.scheme not in {"", "file"}:
-        raise MissingGridError(f"{url!r}: without ROS only files are found; write file:///path/to/map.yaml")
-    return read_grid(Path(unquote(parsed.path)))

@@ -36,7 +36,7 @@ from locclient.robot.robot import Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 
 if TYPE_CHECKING:  # needs the extra `foxglove`
-    from locclient.replay.run_viewer import RunViewer
+    from locclient.replay.run_export import RunExport
 
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
@@ -44,12 +44,12 @@ TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Settings of the localizer, whether the recording is played at its own speed, a call with the number of each frame, who shows it."""
+    """Settings of the localizer, whether the recording is played at its own speed, a call with the number of each frame, a file."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
-    viewer: "RunViewer | None" = None
+    export: "RunExport | None" = None
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
@@ -94,9 +94,9 @@ def replay(
     clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
     profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
     reporter = RunReporter(connection, result, profile)
-    if options.viewer is not None:
-        options.viewer.begin(loaded, profile, rectifier)
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
+    if options.export is not None:
+        options.export.begin(first_ns, loaded, profile, rectifier)
     unread: list[str] = []
     for number, imu in enumerate(source.imu_before_each()):
         decode_s = time.process_time()
@@ -120,8 +120,8 @@ def replay(
         result.estimates.append(outcome.estimate)
         result.truths.append(truth)
         reporter.handle(outcome)
-        if options.viewer is not None:
-            options.viewer.handle(outcome)
+        if options.export is not None:
+            options.export.handle(raw, outcome)
         options.progress(number)
     if robot.ring is not None:
         robot.ring.finish()

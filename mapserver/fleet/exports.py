@@ -58,17 +58,13 @@ def write_mcap(store: MapStore, wanted: FailureFilter, path: Path) -> int:
     from fleetmap.foxglove import channels
 
     count = 0
-
-    def messages() -> "Iterator[ChannelMessage]":
-        nonlocal count
+    with appearing_file(path) as file, channels.ChannelWriter(file) as writer:
         for found in failures_oldest_first(store, wanted):
             if not count and wanted.site is not None and (current := store.current(wanted.site)) is not None:
-                yield map_message(store, wanted.site, current.version, found.failure.happened_ns)
+                writer.write(map_message(store, wanted.site, current.version, found.failure.happened_ns))
             count += 1
-            yield from failure_messages(store, found)
-
-    with appearing_file(path) as file:
-        channels.write_mcap(file, messages())
+            for message in failure_messages(store, found):
+                writer.write(message)
     return count
 
 

@@ -4,6 +4,7 @@ Settings come in three tiers. A file may set user and tuning settings; each prog
 field of a section is an internal constant: it has its reason beside it in the code, and no key in a file.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -24,13 +25,16 @@ _OF_PEOPLE = (
     "a proxy that signs people in, such as oauth2-proxy, stands in front: `--sign-in-proxy ADDRESS --sign-in-group GROUP=ROLE`; "
     "docs/security.md shows it"
 )
-RETIRED = {  # keys of files, and options of commands with _ for -; what replaces them
+RETIRED = {  # keys of files (behind their section where that decides), and options of commands with _ for -; what replaces them
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "manifest": "`--version N` names another version of `--store DIR`",
     "walls": "`mapserver align --pin ...` replaces it; delete the key",
     "frozen": _IN_A_VERSION,
     "map": _IN_A_VERSION,
+    "output.map": '`map_topic = ""` leaves /map to nav2\'s map_server, which shows files; delete the key',
+    "output.is_map_server": "nav2's map_server loads files; delete the key",
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},
+    "foxglove": "`locclient replay --mcap FILE` writes the run, which Foxglove opens; delete the key",
     "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
     "spool": "it is called `outbox` now",
     "spool_bytes": "it is called `outbox_bytes` now",
@@ -91,10 +95,11 @@ def _decoded(path: Path, kind: Any) -> Any:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
     # tomllib's own errors for bytes that are no UTF-8, for impossible dates, and for deep nesting
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        replaced = "".join(f"; {new}" for key, new in RETIRED.items() if f"unknown field `{key}`" in str(error))
-        raise UsageError(
-            f"configuration file {path}: {str(error)[:500]}{replaced}; docs/settings.md lists the settings"
-        ) from error
+        text = str(error)[:500]
+        unknown = re.search(r"unknown field `(\w+)`(?: - at `\$\.([\w.]+)`)?", text)
+        new = (RETIRED.get(f"{unknown[2]}.{unknown[1]}") or RETIRED.get(unknown[1])) if unknown else None
+        replaced = f"; {new}" if new else ""
+        raise UsageError(f"configuration file {path}: {text}{replaced}; docs/settings.md lists the settings") from error
 
 
 def settings_in(section: Section, name: str = "") -> Iterator[Setting]:

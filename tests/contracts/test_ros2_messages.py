@@ -23,7 +23,6 @@ from fleetmap.recordings.ros2.navigation_messages import (
     encode_bond,
     encode_diagnostics,
     encode_grid,
-    encode_loaded_map,
     encode_motion,
 )
 from fleetmap.sensors.samples import PositionPrior, WheelSample
@@ -119,8 +118,6 @@ def written() -> list[Written]:
             response("lifecycle_msgs/srv/GetAvailableTransitions"), transitions,
             {"available_transitions.0.goal_state.id": 10, "available_transitions.7.transition.label": "transition_success"},
         ),
-        Written(response("nav2_msgs/srv/LoadMap"), encode_loaded_map(STAMP_NS, "map", GRID, 0), {"result": 0, "map.info.width": 3}),
-        Written(response("nav2_msgs/srv/LoadMap"), encode_loaded_map(STAMP_NS, "map", None, 2), {"result": 2, "map.info.width": 0}),
         Written(response("std_srvs/srv/Empty"), EMPTY, {}),
     ]  # fmt: skip
 

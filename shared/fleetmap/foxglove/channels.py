@@ -5,7 +5,7 @@ Messages are protobuf in Foxglove's own schemas; a failure's whole report is JSO
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
 from foxglove import Schema
@@ -127,20 +127,31 @@ def encoding_of(schema: Schema) -> str:
     return "json" if schema.encoding == "jsonschema" else "protobuf"
 
 
-def write_mcap(file: BinaryIO, messages: Iterable[ChannelMessage]) -> None:
+class ChannelWriter:
     """Writes an MCAP file; the same messages make the same bytes. A channel is in it with its first message."""
-    writer = Writer(file, compression=CompressionType.NONE)
-    writer.start(profile="", library="fleetmap")
-    schemas, channels = dict[str, int](), dict[str, int]()
-    for number, message in enumerate(messages):
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._writer = Writer(file, compression=CompressionType.NONE)
+        self._schemas, self._channels, self._count = dict[str, int](), dict[str, int](), 0
+
+    def __enter__(self) -> Self:
+        self._writer.start(profile="", library="fleetmap")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def write(self, message: ChannelMessage) -> None:
+        """One more message, in any order of stamps."""
         topic, schema = message.topic, CHANNELS[message.topic]
-        if schema.name not in schemas:
-            schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        if topic not in channels:
-            channels[topic] = writer.register_channel(topic, encoding_of(schema), schemas[schema.name])
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        if topic not in self._channels:
+            schema_id = self._schemas[schema.name]
+            self._channels[topic] = self._writer.register_channel(topic, encoding_of(schema), schema_id)
         stamp_ns = max(0, message.stamp_ns)
-        writer.add_message(channels[topic], stamp_ns, message.data, stamp_ns, number)
-    writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.add_message(self._channels[topic], stamp_ns, message.data, stamp_ns, self._count)
+        self._count += 1
 
 
 def points(stamp_ns: int, points_map: Array, topic: str = "/map", frame: str = MAP) -> ChannelMessage:

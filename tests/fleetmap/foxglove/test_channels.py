@@ -172,7 +172,9 @@ def test_an_mcap_file_holds_the_same_channels() -> None:
     ]
     files = [io.BytesIO(), io.BytesIO()]
     for file in files:
-        channels.write_mcap(file, messages)
+        with channels.ChannelWriter(file) as writer:
+            for message in messages:
+                writer.write(message)
         file.seek(0)
     assert files[0].getvalue() == files[1].getvalue()
     reader = make_reader(files[0], decoder_factories=[DecoderFactory()])

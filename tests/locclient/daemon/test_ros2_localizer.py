@@ -3,15 +3,13 @@
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.bus import Bus
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
@@ -64,7 +62,7 @@ class Robot:
 
 @pytest.fixture
 def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
-    settings = {"format": "ros2", "autostart": False, "is_map_server": True} | getattr(request, "param", {})
+    settings = {"format": "ros2", "autostart": False} | getattr(request, "param", {})
     programs: list[LifecycleManager] = []
     with rmw_router(free_port()) as endpoint, Bus.connect(endpoint, is_ros=True) as bus:
         intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
@@ -107,9 +105,9 @@ def test_the_graph_shows_one_node_with_all_that_nav2_asks_for(robot: Robot) -> N
     tokens: list[list[str]] = []
 
     def is_complete() -> bool:
-        """The node, nine publishers, three subscriptions, ten services."""
+        """The node, nine publishers, three subscriptions, eight services."""
         tokens[:] = [parts for parts in program.graph() if parts[8] == NODE]
-        return len(tokens) == 23
+        return len(tokens) == 21
 
     assert eventually(is_complete)
     (node,) = [parts for parts in tokens if parts[5] == "NN"]
@@ -126,8 +124,8 @@ def test_the_graph_shows_one_node_with_all_that_nav2_asks_for(robot: Robot) -> N
     services = {name for kind, name in qos if kind == "SS"}
     private = ("get_state", "change_state", "get_available_states", "get_available_transitions")
     assert services == {
-        *(f"%{NODE}%{name}" for name in (*private, "get_transition_graph", "load_map")), "%set_initial_pose",
-        "%reinitialize_global_localization", "%request_nomotion_update", "%map_server%load_map",
+        *(f"%{NODE}%{name}" for name in (*private, "get_transition_graph")), "%set_initial_pose",
+        "%reinitialize_global_localization", "%request_nomotion_update",
     }  # fmt: skip
     store = get_typestore(Stores.ROS2_JAZZY)
     for parts in tokens:
@@ -284,9 +282,8 @@ def test_bytes_that_are_no_message_change_nothing(robot: Robot, caplog: pytest.L
     for raw in (b"", b"\x00\x01\x00\x00", b"nonsense", b"\x00\x01\x00\x00" + bytes(17)):
         program.publish("/initialpose", POSE, raw)
         program.publish("/bond", "bond/msg/Status", raw)
-        for service in ("lifecycle_msgs/srv/ChangeState", "nav2_msgs/srv/SetInitialPose", "nav2_msgs/srv/LoadMap"):
-            names = {"ChangeState": f"/{NODE}/change_state", "LoadMap": f"/{NODE}/load_map"}
-            name = names.get(service.rsplit("/", 1)[1], "/set_initial_pose")
+        for service in ("lifecycle_msgs/srv/ChangeState", "nav2_msgs/srv/SetInitialPose"):
+            name = f"/{NODE}/change_state" if "ChangeState" in service else "/set_initial_pose"
             answer = program.call(name, service, raw=raw)
             assert answer is None or not getattr(answer, "success", False)
     assert program.state() == UNCONFIGURED
@@ -324,34 +321,7 @@ def test_diagnostics_say_status_and_cause(statuses: list[Status], silent: bool, 
     assert (told.name, told.hardware_id) == (f"{NODE}: localization", "r1")
 
 
-def write_map(folder: Path, **changes: object) -> Path:
-    """Two rows: occupied, free and unknown below; free above."""
-    cv2.imwrite(str(folder / "grid.pgm"), np.array([[254, 254, 254], [0, 254, 205]], np.uint8))
-    entries = {
-        "image": "grid.pgm", "mode": "trinary", "resolution": 0.5, "origin": [1.0, 2.0, 0.5], "negate": 0,
-        "occupied_thresh": 0.65, "free_thresh": 0.196,
-    } | changes  # fmt: skip
-    (folder / "grid.yaml").write_text("".join(f"{key}: {value}\n" for key, value in entries.items()))
-    return folder / "grid.yaml"
-
-
-def test_a_map_is_loaded_and_late_planners_get_it(robot: Robot, tmp_path: Path) -> None:
-    program = robot.open()
-    assert program.startup()
-    path = write_map(tmp_path)
-    answer = program.call("/map_server/load_map", "nav2_msgs/srv/LoadMap", f"file://{path}")
-    assert answer.result == 0
-    late = robot.open().listen("/map", "nav_msgs/msg/OccupancyGrid", is_transient_local=True)
-    assert eventually(lambda: len(late) == 1)
-    for grid in (answer.map, late[0]):
-        assert (grid.info.width, grid.info.height, grid.header.frame_id) == (3, 2, "map")
-        assert grid.info.resolution == pytest.approx(0.5)
-        assert (grid.info.origin.position.x, grid.info.origin.position.y) == (1.0, 2.0)
-        assert grid.info.origin.orientation.z == pytest.approx(np.sin(0.25))
-        assert grid.data.tolist() == [100, 0, -1, 0, 0, 0]
-
-
-def test_planners_get_the_grid_of_the_version_until_a_file_is_loaded(robot: Robot, tmp_path: Path) -> None:
+def test_planners_get_the_grid_of_the_version(robot: Robot) -> None:
     program = robot.open()
     assert program.startup()
     diagnoses = program.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
@@ -364,30 +334,13 @@ def test_planners_get_the_grid_of_the_version_until_a_file_is_loaded(robot: Robo
     assert eventually(lambda: len(early) == len(late) == 1)
     assert early[0].data.tolist() == late[0].data.tolist() == [0, 100, -1, 0]
     assert (late[0].info.width, late[0].info.origin.position.x, late[0].header.frame_id) == (2, -1.5, "map")
-    program.call("/map_server/load_map", "nav2_msgs/srv/LoadMap", str(write_map(tmp_path)))
-    robot.localizer.show_grid(6, shown, "")
-    assert eventually(lambda: [grid.info.width for grid in early] == [2, 3])
-    assert eventually(lambda: robot.localizer.alive(False) or "file " in str(diagnoses[-1].status[0].values))
+    assert eventually(
+        lambda: robot.localizer.alive(False) or "grid of version 5" in str(diagnoses[-1].status[0].values)
+    )
     assert "version 4 has no grid" in str(diagnoses[0].status[0].values)
 
 
-def test_a_map_that_cannot_be_loaded_gets_its_result_code(robot: Robot, tmp_path: Path) -> None:
-    program = robot.open()
-
-    def result(url: object) -> tuple[int, int]:
-        answer = program.call(f"/{NODE}/load_map", "nav2_msgs/srv/LoadMap", str(url))
-        return int(answer.result), len(answer.map.data)
-
-    assert result(tmp_path / "absent.yaml") == (1, 0)
-    assert result("package://nav2_bringup/maps/depot.yaml") == (1, 0)
-    assert result(write_map(tmp_path, image="absent.pgm")) == (2, 0)
-    assert result(write_map(tmp_path, resolution=-0.05)) == (3, 0)
-    assert result(write_map(tmp_path, mode="quaternary")) == (3, 0)
-    assert result(write_map(tmp_path, origin="[0, .nan, 0]")) == (3, 0)
-    assert result(write_map(tmp_path)) == (0, 6), "the control"
-
-
-def test_names_that_are_none_and_maps_that_are_not_there_are_refused_at_once(tmp_path: Path) -> None:
+def test_names_that_are_none_are_refused_at_once() -> None:
     with MemoryBus(MemoryHub()) as bus:
         inputs = PublisherInputs(
             bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0)
@@ -396,5 +349,6 @@ def test_names_that_are_none_and_maps_that_are_not_there_are_refused_at_once(tmp
             open_publisher(inputs, OutputSection(format="ros2", pose_topic="a b"))
         with pytest.raises(UsageError, match="cyclone"):
             open_publisher(inputs, OutputSection(format="ros2", keys="cyclone"))
-        with pytest.raises(FleetmapError, match="no file"):
-            open_publisher(inputs, OutputSection(format="ros2", map=str(tmp_path / "absent.yaml")))
+        plain = open_publisher(inputs, OutputSection(format="ros2", map_topic=""))
+        assert plain.grid_height_m is None, "another program publishes the map"
+        plain.close()

@@ -416,5 +416,5 @@ def test_the_shipped_example_has_one_publisher_of_map_and_a_pose_of_the_driver()
     assert completed_for_ros2(config.output, config.topics.wheel).driver_odom_topic == "/odom"
     params = yaml.safe_load((folder / "nav2_params.yaml").read_text())
     assert params["lifecycle_manager_localization"]["ros__parameters"]["node_names"] == [config.output.node]
-    assert (config.output.map, config.output.is_map_server, config.output.autostart) == ("version", True, False)
+    assert (config.output.map_topic, config.output.autostart) == ("map", False)
     assert "map_server" not in params and "nav2_map_server" not in (folder / "localization.launch.py").read_text()

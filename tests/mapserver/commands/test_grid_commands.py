@@ -4,11 +4,13 @@ import json
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import yaml
+from numpy.typing import NDArray
 
 from fleetmap.mapformat.grid_tile import TILE_CELLS
-from fleetmap.occupancy_grid import read_grid
 from mapserver import releases
 from mapserver.store import MapStore, Retention
 from support.storage.map_samples import save_grid_draft, save_sample_draft
@@ -22,17 +24,23 @@ def site(tmp_path: Path) -> tuple[str, ...]:
     return ("--site", "lab", "--store", str(tmp_path / "store"))
 
 
+def read(path: Path) -> tuple[NDArray[np.uint8], list[float]]:
+    """The image of a grid's files, the row with the lowest y first, and its origin. Shades: 0 occupied, 254 free, 205 unknown."""
+    pixels = cv2.imread(str(path.with_suffix(".pgm")), cv2.IMREAD_UNCHANGED)
+    return np.asarray(pixels[::-1]), yaml.safe_load(path.read_text())["origin"]
+
+
 def test_a_grid_is_written_for_the_robots_height(run, site, tmp_path: Path) -> None:
     said = run("grid", "export", *site, tmp_path / "a.yaml", "--heights", tmp_path / "a.npz")
     assert "grid of version 1" in said
     assert "80 x 40 cells of 0.05 m, 7.8 m2 free" in said
-    grid = read_grid(tmp_path / "a.yaml")
-    assert grid.cells.shape == (40, 80)
-    np.testing.assert_allclose(grid.map_from_grid[:3, 3], [1.0, 3.0, 0.0])
-    assert (grid.cells[10:20, 20:30] == 100).all()
-    assert (grid.cells == 0).sum() == 40 * 80 - 100
+    shades, origin = read(tmp_path / "a.yaml")
+    assert shades.shape == (40, 80)
+    np.testing.assert_allclose(origin, [1.0, 3.0, 0.0])
+    assert (shades[10:20, 20:30] == 0).all()
+    assert (shades == 254).sum() == 40 * 80 - 100
     run("grid", "export", *site, tmp_path / "low.yaml", "--robot-height", "0.3")
-    assert (read_grid(tmp_path / "low.yaml").cells == 0).all()
+    assert (read(tmp_path / "low.yaml")[0] == 254).all()
     heights = np.load(tmp_path / "a.npz")
     row, column = ((np.array([4.0, 3.5])[::-1] - heights["corner_map_m"][::-1]) / heights["cell_m"]).astype(int)
     assert heights["lowest_m"][row, column] == pytest.approx(0.005)
@@ -56,7 +64,7 @@ def test_a_grid_travels_with_the_archive_and_goes_with_its_version(run, site, tm
     run("export", *site, tmp_path / "v.fmex")
     run("import", "--store", tmp_path / "other", tmp_path / "v.fmex")
     run("grid", "export", *other, tmp_path / "a.yaml", "--version", 1)
-    assert (read_grid(tmp_path / "a.yaml").cells == 100).any()
+    assert (read(tmp_path / "a.yaml")[0] == 0).any()
     # Robots fetch a file without it, of the format that they know.
     run("export", *site, tmp_path / "robots.fmex", "--without-archive")
     assert (tmp_path / "robots.fmex").read_bytes()[4:6] == b"\x01\x00"
@@ -106,11 +114,11 @@ def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site,
         "crossing: 2.0 m2, speed 30 %", "dock: 1.0 m2, keep-out", "door: 2.0 m2, speed 10 %", "3 areas",
     ]  # fmt: skip
     run("areas", "export", *site, "--keep-out", tmp_path / "keep.yaml", "--speed", tmp_path / "speed.yaml")
-    keep, speed = read_grid(tmp_path / "keep.yaml"), read_grid(tmp_path / "speed.yaml")
-    np.testing.assert_allclose(keep.map_from_grid[:2, 3], [1.0, 2.0])
-    assert (keep.cells[:20, :20] == 100).all()
-    values = speed.cells[10, [5, 15, 25, 35, 55]].tolist()
-    assert (speed.map_from_grid[0, 3], values) == (pytest.approx(4.0), [30, 30, 10, 10, 10])
+    (keep, keep_origin), (speed, speed_origin) = read(tmp_path / "keep.yaml"), read(tmp_path / "speed.yaml")
+    np.testing.assert_allclose(keep_origin[:2], [1.0, 2.0])
+    assert (keep[:20, :20] == 0).all()
+    values = speed[10, [5, 15, 25, 35, 55]].tolist()
+    assert (speed_origin[0], values) == (pytest.approx(4.0), [30, 30, 10, 10, 10])
     run("areas", "remove", *site)
     assert "0 areas" in run("areas", "list", *site)
     assert "no area with a speed mask" in run("areas", "export", *site, "--speed", tmp_path / "s.yaml", status=2)

@@ -26,7 +26,6 @@ SERVICES = {
     ),
     "std_srvs/srv/Empty": ("", ""),
     "nav2_msgs/srv/SetInitialPose": ("geometry_msgs/PoseWithCovarianceStamped pose", ""),
-    "nav2_msgs/srv/LoadMap": ("string map_url", "nav_msgs/OccupancyGrid map\nuint8 result"),
 }
 BOND = (
     "std_msgs/Header header\nstring id\nstring instance_id\nbool active\nfloat32 heartbeat_timeout\nfloat32 "

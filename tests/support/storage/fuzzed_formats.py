@@ -16,14 +16,12 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import decode_manifest, decode_tile, pack, unpack
 from fleetmap.mapformat.grid_tile import TILE_CELLS, decode_grid_tile
 from fleetmap.mapformat.version_file import open_export
-from fleetmap.occupancy_grid import OccupancyGrid, map_server_files, read_grid
 from fleetmap.version_grid import encode_grid
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 MAX_CPU_SECONDS = 2.0
 MAX_GROWTH_BYTES = 256 << 20
-_YAML_BYTES = 300
 _NUMBERS = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1]
 
 Edit = tuple[str, float, Any]
@@ -160,21 +158,6 @@ def exports() -> st.SearchStrategy[bytes]:
     )
 
 
-def planners_grids() -> st.SearchStrategy[bytes]:
-    """A map_server YAML file and its image, one after the other."""
-    cells = np.resize(np.array([-1, 0, 100], np.int8), (40, 50))
-    text, image = map_server_files(OccupancyGrid(cells, 0.05, np.eye(4)), "grid.pgm")
-    text += b"..." + b" " * (_YAML_BYTES - len(text) - 3)
-    return edits.map(lambda changes: edited(text + image, changes))
-
-
-def read_planners_grid(data: bytes, folder: Path) -> None:
-    """Both files, cut where the first one ends."""
-    (folder / "grid.yaml").write_bytes(data[:_YAML_BYTES])
-    (folder / "grid.pgm").write_bytes(data[_YAML_BYTES:])
-    read_grid(folder / "grid.yaml")
-
-
 def grid_tiles() -> st.SearchStrategy[bytes]:
     """Tiles of the grid that the store keeps."""
     cells = np.resize(np.arange(256, dtype=np.uint8), (TILE_CELLS, TILE_CELLS, 4))
@@ -197,7 +180,6 @@ FORMATS: dict[str, tuple[Callable[[], st.SearchStrategy[bytes]], Callable[[bytes
     "archive": (archives, lambda data, _: decode_archive(data)),
     "export": (exports, read_export),
     "grid tile": (grid_tiles, lambda data, _: decode_grid_tile(data)),
-    "planners' grid": (planners_grids, read_planners_grid),
 }
 
 

@@ -81,7 +81,6 @@ _SERVICES = {
     ),
     "std_srvs/srv/Empty": (_EMPTY, _EMPTY),
     "nav2_msgs/srv/SetInitialPose": ("geometry_msgs/PoseWithCovarianceStamped pose", _EMPTY),
-    "nav2_msgs/srv/LoadMap": ("string map_url", "nav_msgs/OccupancyGrid map\nuint8 result"),
 }
 
 

@@ -115,23 +115,10 @@ def decode_bond(data: bytes) -> BondStatus:
 
 def encode_grid(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> bytes:
     """nav_msgs/OccupancyGrid."""
-    return _put_grid(CdrWriter(), stamp_ns, frame_id, grid).message()
-
-
-def encode_loaded_map(stamp_ns: int, frame_id: str, grid: OccupancyGrid | None, result: int) -> bytes:
-    """The response of nav2_msgs/srv/LoadMap; its map is empty where there is none."""
-    grid = grid or OccupancyGrid(np.zeros((0, 0), np.int8), 0.0, np.eye(4))
-    return _put_grid(CdrWriter(), stamp_ns, frame_id, grid).byte(result).message()
-
-
-def decode_text(data: bytes) -> str:
-    """A message of one string, such as the request of nav2_msgs/srv/LoadMap."""
-    return CdrReader(data).text()
-
-
-def _put_grid(writer: CdrWriter, stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> CdrWriter:
     height, width = grid.cells.shape
     quat_wxyz = quat_wxyz_from_rotation(grid.map_from_grid[:3, :3])
-    writer.header(stamp_ns, frame_id).time(stamp_ns).single(grid.resolution_m).unsigned(width).unsigned(height)
+    writer = (
+        CdrWriter().header(stamp_ns, frame_id).time(stamp_ns).single(grid.resolution_m).unsigned(width).unsigned(height)
+    )
     writer.doubles(np.concatenate([grid.map_from_grid[:3, 3], quat_wxyz[1:], quat_wxyz[:1]]))
-    return writer.blob(np.ascontiguousarray(grid.cells, np.int8).tobytes())
+    return writer.blob(np.ascontiguousarray(grid.cells, np.int8).tobytes()).message()
