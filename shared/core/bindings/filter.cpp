@@ -7,6 +7,7 @@
 #include <optional>
 
 #include "filter.h"
+#include "in_turn.h"
 #include "pose_covariance.h"
 
 using namespace fleetmap;
@@ -19,6 +20,7 @@ using Indices = Array<int64_t, -1>;
 using Noise = std::tuple<double, double, double, double>;
 
 constexpr size_t kMostClones = 1000;
+using SharedFilter = Shared<Filter>;
 
 StereoLens lens_of(const Array<double, 4>& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
@@ -65,17 +67,17 @@ FilterModel model_of(const Array<double, 4>& lens, const Transform& body_from_ca
           set("still_sigma_mps")};
 }
 
-void make(Filter* filter, const Array<double, 3, 3>& rotation, const Vector& velocity, const Vector& position, const Vector& gyro_bias,
-          const Vector& accel_bias, const Array<double, 15, 15>& nav_covariance, const Array<double, 15, 15>& nav_true_error,
-          const Array<double, 4>& lens, const Transform& body_from_cam, const nb::object& settings, double gate_quantile,
-          double gravity_mps2) {
+void make(SharedFilter* filter, const Array<double, 3, 3>& rotation, const Vector& velocity, const Vector& position,
+          const Vector& gyro_bias, const Vector& accel_bias, const Array<double, 15, 15>& nav_covariance,
+          const Array<double, 15, 15>& nav_true_error, const Array<double, 4>& lens, const Transform& body_from_cam,
+          const nb::object& settings, double gate_quantile, double gravity_mps2) {
   const NavState start{mat3(rotation.data()), vec3(velocity.data()), vec3(position.data()), vec3(gyro_bias.data()),
                        vec3(accel_bias.data())};
   const FilterModel model = model_of(lens, body_from_cam, settings, gate_quantile, gravity_mps2);
-  new (filter) Filter(start, nav_covariance.data(), nav_true_error.data(), model);
+  new (filter) SharedFilter(start, nav_covariance.data(), nav_true_error.data(), model);
 }
 
-auto predict_inertial(Filter& filter, const Stamps& stamps_ns, const Rows3& gyro_radps, const Rows3& accel_mps2, int64_t start_ns,
+auto predict_inertial(SharedFilter& filter, const Stamps& stamps_ns, const Rows3& gyro_radps, const Rows3& accel_mps2, int64_t start_ns,
                       int64_t end_ns, const Noise& noise, const Noise& true_noise) {
   const ImuSamples imu = imu_samples(stamps_ns, gyro_radps, accel_mps2);
   const Vec3 rate = unlocked([&] {
@@ -84,18 +86,18 @@ auto predict_inertial(Filter& filter, const Stamps& stamps_ns, const Rows3& gyro
   return copied<1>(rate.at, {3});
 }
 
-void predict_random_walk(Filter& filter, const Transform& body_from_next, double rotation_sigma_rad, double translation_sigma_m,
+void predict_random_walk(SharedFilter& filter, const Transform& body_from_next, double rotation_sigma_rad, double translation_sigma_m,
                          double duration_s, const std::optional<Array<double, 6, 6>>& measured_cov) {
   filter.predict_random_walk(se3(body_from_next.data()), rotation_sigma_rad, translation_sigma_m, duration_s,
                              measured_cov ? measured_cov->data() : nullptr);
 }
 
-void add_clone(Filter& filter, int64_t clone_id, const Vector& rate_body_radps) {
+void add_clone(SharedFilter& filter, int64_t clone_id, const Vector& rate_body_radps) {
   if (filter.clone_ids().size() == kMostClones) throw nb::value_error("clone_id: at most 1000 clones are held");
   filter.add_clone(clone_id, vec3(rate_body_radps.data()));
 }
 
-auto update_by_tracks(Filter& filter, const Indices& starts, const Indices& clone_ids, const Rows3& pixels, const Indices& anchors,
+auto update_by_tracks(SharedFilter& filter, const Indices& starts, const Indices& clone_ids, const Rows3& pixels, const Indices& anchors,
                       const Rows3& points_cam, int iterations, const std::optional<Transform>& newest_odom_from_body, double sigma_scale) {
   const size_t count = anchors.shape(0), seen = clone_ids.shape(0);
   if (starts.shape(0) != count + 1 || points_cam.shape(0) != count) throw nb::value_error("starts, points_cam: one for each anchor");
@@ -117,31 +119,31 @@ auto update_by_tracks(Filter& filter, const Indices& starts, const Indices& clon
   return as_numpy<int8_t, 1>(std::move(used), {count});
 }
 
-double correct_by_wheels(Filter& filter, const Vector& velocity_base_mps, double yaw_rate_radps, double sigma_mps, double sigma_radps,
+double correct_by_wheels(SharedFilter& filter, const Vector& velocity_base_mps, double yaw_rate_radps, double sigma_mps, double sigma_radps,
                          const Vector& gyro_radps, const Transform& base_from_body, double gate) {
   return filter.correct_by_wheels(vec3(velocity_base_mps.data()), yaw_rate_radps, sigma_mps, sigma_radps, vec3(gyro_radps.data()),
                                   se3(base_from_body.data()), gate);
 }
 
-auto motion_since(const Filter& filter, int64_t clone_id) {
+auto motion_since(SharedFilter& filter, int64_t clone_id) {
   const size_t index = index_of(filter, clone_id);
   double covariance[36];
   filter.motion_covariance(index, covariance);
   return std::make_tuple(transform(filter.motion_between(index, newest(filter))), copied<2>(covariance, {6, 6}));
 }
 
-auto cam_from_earlier(const Filter& filter, int64_t clone_id, const Transform& cam_from_body) {
+auto cam_from_earlier(SharedFilter& filter, int64_t clone_id, const Transform& cam_from_body) {
   const SE3 body_from_earlier = inverse(filter.state.body()) * filter.clone(index_of(filter, clone_id));
   return transform(se3(cam_from_body.data()) * body_from_earlier * filter.body_from_cam());
 }
 
-auto body_covariance(const Filter& filter) {
+auto body_covariance(SharedFilter& filter) {
   double covariance[36];
   filter.body_covariance(covariance);
   return copied<2>(covariance, {6, 6});
 }
 
-auto state_of(const Filter& filter) {
+auto state_of(SharedFilter& filter) {
   const NavState& s = filter.state;
   return std::make_tuple(copied<2>(s.rotation[0], {3, 3}), copied<1>(s.velocity.at, {3}), copied<1>(s.position.at, {3}),
                          copied<1>(s.gyro_bias.at, {3}), copied<1>(s.accel_bias.at, {3}));
@@ -198,69 +200,59 @@ auto compose_pose(const Transform& map_from_body, const Array<double, 6, 6>& cov
 
 void bind_filter(nb::module_& module) {
   const auto clone_id = "clone_id"_a, gate = "gate"_a;
-  nb::class_<Filter>(module, "Filter")
+  nb::class_<SharedFilter>(module, "Filter")
       .def("__init__", &make, "rotation"_a.noconvert(), "velocity"_a.noconvert(), "position"_a.noconvert(), "gyro_bias"_a.noconvert(),
            "accel_bias"_a.noconvert(), "nav_covariance"_a.noconvert(), "nav_true_error"_a.noconvert(), "lens"_a.noconvert(),
            "body_from_cam"_a.noconvert(), "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
-      .def("predict_inertial", &predict_inertial, "stamps_ns"_a.noconvert(), "gyro_radps"_a.noconvert(), "accel_mps2"_a.noconvert(),
-           "start_ns"_a, "end_ns"_a, "noise"_a, "true_noise"_a)
-      .def("predict_random_walk", &predict_random_walk, "body_from_next"_a.noconvert(), "rotation_sigma_rad"_a, "translation_sigma_m"_a,
-           "duration_s"_a = 0.0, "measured_cov"_a.noconvert() = nb::none())
-      .def("add_clone", &add_clone, clone_id, "rate_body_radps"_a.noconvert())
-      .def(
-          "remove_clone", [](Filter& filter, int64_t id) { filter.remove_clone(index_of(filter, id)); }, clone_id)
-      .def(
-          "return_to_clone", [](Filter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }, clone_id)
-      .def("begin_frame_anew",
-           [](Filter& filter) {
+      .def("predict_inertial", in_turn(&predict_inertial), "stamps_ns"_a.noconvert(), "gyro_radps"_a.noconvert(),
+           "accel_mps2"_a.noconvert(), "start_ns"_a, "end_ns"_a, "noise"_a, "true_noise"_a)
+      .def("predict_random_walk", in_turn(&predict_random_walk), "body_from_next"_a.noconvert(), "rotation_sigma_rad"_a,
+           "translation_sigma_m"_a, "duration_s"_a = 0.0, "measured_cov"_a.noconvert() = nb::none())
+      .def("add_clone", in_turn(&add_clone), clone_id, "rate_body_radps"_a.noconvert())
+      .def("remove_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.remove_clone(index_of(filter, id)); }), clone_id)
+      .def("return_to_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }), clone_id)
+      .def("begin_frame_anew", in_turn(+[](SharedFilter& filter) {
              newest(filter);
              return transform({kIdentity, -filter.begin_frame_anew()});
-           })
-      .def("update_by_tracks", &update_by_tracks, "starts"_a.noconvert(), "clone_ids"_a.noconvert(), "pixels"_a.noconvert(),
+           }))
+      .def("update_by_tracks", in_turn(&update_by_tracks), "starts"_a.noconvert(), "clone_ids"_a.noconvert(), "pixels"_a.noconvert(),
            "anchors"_a.noconvert(), "points_cam"_a.noconvert(), "iterations"_a, "newest_odom_from_body"_a.noconvert().none(),
            "sigma_scale"_a)
-      .def("correct_by_wheels", &correct_by_wheels, "velocity_base_mps"_a.noconvert(), "yaw_rate_radps"_a, "sigma_mps"_a, "sigma_radps"_a,
-           "gyro_radps"_a.noconvert(), "base_from_body"_a.noconvert(), gate)
-      .def(
-          "correct_by_rest",
-          [](Filter& filter, const Vector& gyro, double sigma, double most) {
-            return filter.correct_by_rest(vec3(gyro.data()), sigma, most);
-          },
-          "gyro_mean_radps"_a.noconvert(), "gyro_sigma_radps"_a, gate)
-      .def(
-          "inflate",
-          [](Filter& filter, int64_t id, const Transform& seen, double gap_s) {
-            return filter.inflate(index_of(filter, id), se3(seen.data()).translation, gap_s);
-          },
-          clone_id, "seen_odom_from_body"_a.noconvert(), "gap_s"_a)
-      .def("inflate_velocity", &Filter::inflate_velocity, "sigma_mps"_a)
-      .def(
-          "motion_between",
-          [](const Filter& filter, int64_t earlier, int64_t later) {
-            return transform(filter.motion_between(index_of(filter, earlier), index_of(filter, later)));
-          },
-          "earlier_id"_a, "later_id"_a)
-      .def(
-          "body_since",
-          [](const Filter& filter, int64_t id) { return transform(filter.motion_between(index_of(filter, id), newest(filter))); }, clone_id)
-      .def("motion_since", &motion_since, clone_id)
-      .def("cam_from_earlier", &cam_from_earlier, clone_id, "cam_from_body"_a.noconvert())
-      .def(
-          "odom_from_clone", [](const Filter& filter, int64_t id) { return transform(filter.clone(index_of(filter, id))); }, clone_id)
-      .def("odom_from_body", [](const Filter& filter) { return transform(filter.state.body()); })
-      .def("body_covariance", &body_covariance)
-      .def("nav_state", &state_of)
-      .def_prop_ro("clone_ids", &Filter::clone_ids)
-      .def_prop_ro(
-          "covariance", [](const Filter& filter) { return matrix(filter.covariance); }, nb::rv_policy::automatic)
-      .def_prop_ro(
-          "true_error_cov", [](const Filter& filter) { return matrix(filter.true_error_cov); }, nb::rv_policy::automatic)
-      .def_prop_ro("offset_sigma_s",
-                   [](const Filter& filter) {
+      .def("correct_by_wheels", in_turn(&correct_by_wheels), "velocity_base_mps"_a.noconvert(), "yaw_rate_radps"_a, "sigma_mps"_a,
+           "sigma_radps"_a, "gyro_radps"_a.noconvert(), "base_from_body"_a.noconvert(), gate)
+      .def("correct_by_rest", in_turn(+[](SharedFilter& filter, const Vector& gyro, double sigma, double most) {
+             return filter.correct_by_rest(vec3(gyro.data()), sigma, most);
+           }),
+           "gyro_mean_radps"_a.noconvert(), "gyro_sigma_radps"_a, gate)
+      .def("inflate", in_turn(+[](SharedFilter& filter, int64_t id, const Transform& seen, double gap_s) {
+             return filter.inflate(index_of(filter, id), se3(seen.data()).translation, gap_s);
+           }),
+           clone_id, "seen_odom_from_body"_a.noconvert(), "gap_s"_a)
+      .def("inflate_velocity", in_turn(+[](SharedFilter& filter, double sigma_mps) { filter.inflate_velocity(sigma_mps); }), "sigma_mps"_a)
+      .def("motion_between", in_turn(+[](SharedFilter& filter, int64_t earlier, int64_t later) {
+             return transform(filter.motion_between(index_of(filter, earlier), index_of(filter, later)));
+           }),
+           "earlier_id"_a, "later_id"_a)
+      .def("body_since", in_turn(+[](SharedFilter& filter, int64_t id) {
+             return transform(filter.motion_between(index_of(filter, id), newest(filter)));
+           }),
+           clone_id)
+      .def("motion_since", in_turn(&motion_since), clone_id)
+      .def("cam_from_earlier", in_turn(&cam_from_earlier), clone_id, "cam_from_body"_a.noconvert())
+      .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return transform(filter.clone(index_of(filter, id))); }),
+           clone_id)
+      .def("odom_from_body", in_turn(+[](SharedFilter& filter) { return transform(filter.state.body()); }))
+      .def("body_covariance", in_turn(&body_covariance))
+      .def("nav_state", in_turn(&state_of))
+      .def_prop_ro("clone_ids", in_turn(+[](SharedFilter& filter) { return filter.clone_ids(); }))
+      .def_prop_ro("covariance", in_turn(+[](SharedFilter& filter) { return matrix(filter.covariance); }), nb::rv_policy::automatic)
+      .def_prop_ro("true_error_cov", in_turn(+[](SharedFilter& filter) { return matrix(filter.true_error_cov); }), nb::rv_policy::automatic)
+      .def_prop_ro("offset_sigma_s", in_turn(+[](SharedFilter& filter) {
                      constexpr size_t offset = Filter::kConsidered + Filter::kOffset;
                      return std::sqrt(filter.true_error_cov[offset][offset]);
-                   })
-      .def_rw("imu_minus_cam_s", &Filter::imu_minus_cam_s);
+                   }))
+      .def_prop_rw("imu_minus_cam_s", in_turn(+[](SharedFilter& filter) { return filter.imu_minus_cam_s; }),
+                   in_turn(+[](SharedFilter& filter, double seconds) { filter.imu_minus_cam_s = seconds; }));
   module.def("compose_pose", &compose_pose, "map_from_body"_a.noconvert(), "covariance"_a.noconvert(), "body_from_next"_a.noconvert(),
              "cov_step"_a.noconvert());
   module.def("share_that_passes", &share_that_passes, "limit"_a, "mean_square"_a);

@@ -142,7 +142,7 @@ class WindowMode(Mode):
         window_filter, used = self.window.filter, step.used
         state = window_filter.state
         status = OdometryStatus.INITIALISING if self.waits_for_gravity else OdometryStatus.TRACKING
-        if frame_index > 0 and tracked.lost:
+        if frame_index > 0 and (tracked.lost or self.window.contradicts_images):
             status = OdometryStatus.DEGRADED
         offset_s = self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0
         return OdometryEstimate(

@@ -15,7 +15,7 @@ from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
-from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.settings import FilterSettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -29,8 +29,11 @@ IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 FRAME_NS = 50_000_000
 
 
-def run(frames: Iterable[RectifiedFrame], imu: ImuNoise | None) -> tuple[Odometry, list[OdometryEstimate]]:
-    odometry = Odometry(rig(imu), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+def run(
+    frames: Iterable[RectifiedFrame], imu: ImuNoise | None, filtering: FilterSettings | None = None
+) -> tuple[Odometry, list[OdometryEstimate]]:
+    settings = OdometrySettings(filter=filtering or FilterSettings())
+    odometry = Odometry(rig(imu), CAMERA, BODY_FROM_CAM, 0.0, settings)
     samples = noisy_imu(
         np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
     )
@@ -183,6 +186,14 @@ def test_a_gap_over_known_walls_is_bridged() -> None:
     assert estimates[11].status is OdometryStatus.TRACKING
     error = relative_error(estimates[10], estimates[-1])
     assert np.linalg.norm(error[3:]) < 0.06
+
+
+@pytest.mark.parametrize("imu", [None, IMU])
+def test_a_filter_that_refuses_every_track_is_not_trusted(imu: ImuNoise | None) -> None:
+    """Once each track was due and none was taken, the state goes on by prediction alone."""
+    _, estimates = run((stereo_frame(k * FRAME_NS) for k in range(1, 41)), imu, FilterSettings(chi_square_share=1e-300))
+    assert [e.inertial for e in estimates[-3:]] == [imu is not None] * 3
+    assert [e.status for e in estimates[-3:]] == [OdometryStatus.DEGRADED] * 3
 
 
 def test_tracks_are_where_the_points_went() -> None:

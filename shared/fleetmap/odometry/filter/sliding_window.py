@@ -42,6 +42,8 @@ class SlidingWindow:
         self.rig, self.stamp_ns = rig, stamp_ns
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
+        self.contradicts_images = False
+        self._refused_frames = 0  # in a row, since the filter refused tracks and took none
         settings = rig.settings.filter
         true_error_cov = settings.real_start_share**2 * covariance
         if rig.imu is not None:  # the mean of a steady gyro is far better than what it is weighed by
@@ -134,6 +136,11 @@ class SlidingWindow:
         else:
             scale = self.rig.settings.filter.descriptor_sigma_scale
             used = self.filter.update(chosen, 4, newest_odom_from_body=seen[1], sigma_scale=scale)
+        if (used == 1).any():
+            self._refused_frames = 0
+        elif self._refused_frames or (used == -1).any():
+            self._refused_frames += 1
+        self.contradicts_images = self._refused_frames >= chunk_frames  # in which every track was due once
         self._prune()
         return used
 

@@ -1,5 +1,7 @@
 """The multi-state filter on synthetic features: consistency, observability, large corrections, relative motion."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -421,3 +423,19 @@ def test_gaps_and_distance_leave_a_covariance(away_m: float, unseen_steps: int) 
             assert largest < 1e-3 or k < 2 * pair
         for _ in range(unseen_steps):
             estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
+
+
+def test_threads_may_share_a_filter() -> None:
+    """One call at a time: while one thread updates, without Python's lock, another adds clones and removes them."""
+    rng = np.random.default_rng(3)
+    points = room(rng)
+    held, seen = clones_at([0.0, 0.1, 0.2, 0.3], points, rng)
+    tracks = tracks_of(seen, np.arange(len(points)))
+    with ThreadPoolExecutor(1) as pool:
+        updated = pool.submit(lambda: [held.update(tracks, iterations=4) for _ in range(20)])
+        while not updated.done():
+            held.add_clone(100, np.zeros(3))
+            assert len(held.covariance) == 16 + 6 * 5
+            held.remove_clone(100)
+    assert len(updated.result()) == 20
+    assert held.clone_ids == [0, 1, 2, 3]
