@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -20,11 +21,12 @@ from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParamete
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import begin_survey
-from mapserver.survey.state import Keyframe, SurveyState
-from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
+from mapserver.survey.state import Keyframe, Landmarks, SurveyState
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
 P = CalibrationParameter
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
+Follow = Callable[[Recording, RigCalibration], CalibrationData]
 LONGEST_S = 30.0  # of a recording: its busiest stretch
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
 _PASSES = 3
@@ -46,10 +48,12 @@ def estimate_calibration(
     settings: SurveySettings,
     tools: SurveyTools | None = None,
     is_enough: IsEnough = lambda *_: False,
+    follow: Follow | None = None,
 ) -> CalibrationEstimate:
     """The calibration that recordings of one rig show together.
 
     is_enough: whether an estimate need not be any better, however far the parameters that are named are from the given calibration.
+    follow: gives what a recording shows under a calibration; None for its busiest stretch.
     RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
     """
     if not recordings:
@@ -61,12 +65,17 @@ def estimate_calibration(
                 f"{other.path} has another calibration than {recordings[0].path}; calibrate the rigs one by one, or name the "
                 "calibration that both have with --calibration FILE"
             )
-    settings = structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES))
+    if follow is None:
+        fewer, tools = (
+            structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES)),
+            tools or SurveyTools(),
+        )
+        follow = partial(followed, settings=fewer, tools=tools)
     estimate, before = None, np.zeros(len(COLUMNS))
     for _ in range(_PASSES):
         axes = RigAxes.of(rig, Rectifier(rig))
         current = corrected_rig(rig, axes, before) if before.any() else rig
-        found = estimate_from([followed(r, current, settings, tools or SurveyTools()) for r in recordings])
+        found = estimate_from([follow(each, current) for each in recordings])
         estimate = continued_from(before, found)
         after = estimate.corrections()
         moved = [p for p, limit in _ANEW.items() if abs(after[INDEX[p]] - before[INDEX[p]]) > limit]
@@ -97,8 +106,7 @@ def followed(
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in chosen)
     inputs = SurveyInputs(frames, len(chosen), recording.imu, rig, rectifier, recording.wheel)
-    chain = begin_survey(inputs, settings, tools)
-    return _stretch_of_survey(chain.state, chain.odometry.keyframes, (rig, rectifier), recording.wheel)
+    return busiest_stretch(begin_survey(inputs, settings, tools), (rig, rectifier), recording.wheel)
 
 
 def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
@@ -118,23 +126,20 @@ def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
     return np.arange(best, last[best], dtype=np.int64)
 
 
-MOST_KEYFRAMES = 120  # of one stretch: more would cost time and say little more
+MOST_KEYFRAMES, _SEEN = 120, 300  # of one stretch, and landmarks of each: more would cost time and say little more
 _ROW_SIGMA_PX = 0.15
 # Stereo windows are off by 0.02 px on slanted surfaces, measured in the simulator
 _BIAS_PX = 0.02
 _ROW_SEARCH_PX = 3.0
 
 
-def _stretch_of_survey(
-    state: SurveyState,
-    keyframes: Sequence[Keyframe],
-    rig: tuple[RigCalibration, Rectifier],
-    wheel: Sequence[WheelSample] = (),
+def busiest_stretch(
+    begun: AdjustedChain, rig: tuple[RigCalibration, Rectifier], wheel: Sequence[WheelSample]
 ) -> CalibrationData:
     """The keyframes of a survey that turn most, with what they see. rig: the calibration that the survey used, and its rectifier."""
-    chosen = _busiest(state)
-    part = state.of(chosen)
-    marks, motion = part.landmarks, part.motion
+    chosen, keyframes = _busiest(begun.state), begun.odometry.keyframes
+    part = begun.state.of(chosen)
+    marks, motion = _thinned(part.landmarks, len(part.stamps_ns)), part.motion
     order = np.argsort(marks.obs_landmark, kind="stable")
     number = np.flatnonzero(chosen).tolist()
     pixels = _with_rows(marks.obs_pixels, marks.obs_keyframe, [keyframes[k] for k in number])
@@ -156,6 +161,13 @@ def _stretch_of_survey(
         wheel=wheel,
         bias_px=_BIAS_PX,
     )
+
+
+def _thinned(marks: Landmarks, keyframes: int) -> Landmarks:
+    """An even choice of the landmarks, with about _SEEN of them in each keyframe."""
+    share = min(1.0, _SEEN * keyframes / max(len(marks.obs_landmark), 1))
+    kept = np.diff(np.floor(share * np.arange(len(marks.points_map) + 1))) > 0
+    return marks.keep_observations(kept[marks.obs_landmark], 1)
 
 
 def _busiest(state: SurveyState) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
 from mapserver.calibration.parameters import RANGES, SHOWN
-from mapserver.calibration.recordings import busiest_frames
+from mapserver.calibration.recordings import Follow, busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.sensors import SPARSE_S, median_period_s
 from mapserver.survey.executor import Executor
@@ -89,8 +89,10 @@ def followed_frames(recording: Recording) -> int:
     return len(busiest_frames(recording.frame_stamps_ns, recording.imu)) if is_judged else 0
 
 
-def measure_calibration(recording: Recording, on_frame: Callable[[], None], executor: Executor) -> MeasuredCalibration:
-    """What the busiest stretch of a recording with a pair of cameras says about every parameter of its calibration.
+def measure_calibration(
+    recording: Recording, on_frame: Callable[[], None], executor: Executor, follow: Follow | None = None
+) -> MeasuredCalibration:
+    """What a recording with a pair of cameras says about every parameter of its calibration, as `estimate_calibration` follows it.
 
     Where nothing is wrong the calibration is used as it is: a finer measure would change nothing.
     """
@@ -101,7 +103,7 @@ def measure_calibration(recording: Recording, on_frame: Callable[[], None], exec
     try:
         focal_px = Rectifier(recording.calibration).camera.focal_px
         enough = partial(_is_good, focal_px)
-        estimate = estimate_calibration([recording], SurveySettings(), tools, enough)
+        estimate = estimate_calibration([recording], SurveySettings(), tools, enough, follow)
     except (FleetmapError, np.linalg.LinAlgError) as error:
         return unknown_calibration(
             f"the frames could not be followed: {error}", "record a drive in the light, with every frame"

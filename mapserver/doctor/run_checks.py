@@ -10,6 +10,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from mapserver.calibration.recordings import Follow
 from mapserver.doctor import accelerometer_images, images, sensors
 from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accelerometer
 from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
@@ -76,11 +77,12 @@ def run_checks(
     sampled: int = SAMPLED_FRAMES,
     turn_frames: int = TURN_FRAMES,
     executor: Executor = SERIAL,
+    follow: Follow | None = None,
 ) -> CheckResults:
     """Everything the checks say about a recording.
 
-    Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair the busiest 30 s; `on_frame` is
-    called after each.
+    Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair what `follow` reads, the busiest
+    30 s without it; `on_frame` is called after each.
     """
     imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
@@ -114,7 +116,7 @@ def run_checks(
         calibration = unknown_calibration(reason, "stamp both by one clock, each image at its exposure")
     elif has_pair:
         used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
-        calibration = measure_calibration(used, on_frame, executor)
+        calibration = measure_calibration(used, on_frame, executor, follow)
 
     findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres, *calibration.findings]
     findings += [images.sharpness(seen.variances), images.flicker_check(recording, frames.read), _readable(frames)]

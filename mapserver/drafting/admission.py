@@ -8,6 +8,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
+from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run_checks
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
@@ -106,6 +107,7 @@ def checked(
     recording: Recording,
     on_frame: Callable[[], None] = lambda: None,
     executor: Executor = SERIAL,
+    follow: Follow | None = None,
 ) -> CheckedRecording:
     """What is found in the recording, and the calibration to survey it with. RecordingError where a check that decides failed.
 
@@ -113,14 +115,14 @@ def checked(
     evidence conflicts, and a person must look at it.
     """
     limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
-    checks = run_checks(recording, on_frame, **limits, executor=executor)
+    checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow)
     _refuse(recording, checks.findings)
     used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
     rig, corrections = corrected(recording.calibration, checks.calibration)
     again: list[Finding] = []
     if corrections:
-        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor)
+        measured = measure_calibration(replace(used, calibration=rig), on_frame, executor, follow)
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
     elif checks.measured_offset_s is not None and abs(checks.measured_offset_s) >= _CORRECTED_FROM_S:
         corrections = {CalibrationParameter.TIME_OFFSET.value: round(checks.measured_offset_s, 7)}

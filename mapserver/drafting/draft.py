@@ -219,8 +219,8 @@ def _admitted(run: _Run) -> dict[Path, Admission]:
             run.console,
             needs_truth=options.frame_from_ground_truth,
             unusable=run.unusable,
-            executor=executor,
-            progress=view,
+            settings=run.settings,
+            tools=run.tools(executor, view),
             look_at=options.look_at,
         )
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _HELD = 64  # keyframes whose pictures stay in memory: more than one is compared with
 _SEGMENT_BYTES, _SEGMENTS_HELD = 1 << 24, 4  # of the file; those that were written leave memory
-_KEPT_BYTES = 1_000_000_000  # all that an examination decodes of a pair of 1280 x 720
+_KEPT_BYTES = 1_000_000_000  # the first minute of a pair of 752 x 480 at 20 Hz
 _ALIGNED_BYTES = 64
 
 
@@ -107,14 +107,14 @@ class MappedImageStore:
 
 
 class KeptFrames:
-    """Frames of another source. Those that are decoded while `keeps` holds are decoded once: a temporary file in `folder` has them."""
+    """Frames of another source, each decoded once: a temporary file in `folder` has them, up to a GB."""
 
     def __init__(self, source: "FrameSource", folder: Path) -> None:
         self._source, self._store = source, MappedImageStore(folder)
         self.stored, self.part, self.hash_into = source.stored, source.part, source.hash_into
         self._frames: dict[int, CameraFrame] = {}
         self._bytes = 0
-        self.keeps = True
+        self._keeps = True
 
     def frame(self, index: int) -> CameraFrame:
         """See FrameSource."""
@@ -123,14 +123,14 @@ class KeptFrames:
             return self._frames[index]
         frame = self._source.frame(index)
         images = (frame.left, frame.right, frame.depth_m)
-        if self.keeps:
+        if self._keeps:
             try:
                 kept: list[Any] = [None if image is None else self._store.keep([image])[0] for image in images]
                 self._frames[index] = CameraFrame(frame.stamp_ns, *kept)
                 self._bytes += sum(image.nbytes for image in images if image is not None)
-                self.keeps = self._bytes < _KEPT_BYTES
+                self._keeps = self._bytes < _KEPT_BYTES
             except StoreError:  # no room: what is not kept is decoded again
-                self.keeps = False
+                self._keeps = False
         return frame
 
     def close(self) -> None:

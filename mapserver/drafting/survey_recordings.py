@@ -18,9 +18,12 @@ from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
 from mapserver.calibration import CalibrationParameter
+from mapserver.calibration.problem import CalibrationData
+from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.doctor.run_checks import frames_to_check
 from mapserver.drafting.admission import SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
@@ -31,13 +34,13 @@ from mapserver.drafting.sensor_subset import reduced
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence
-from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import MergedMap, chained
-from mapserver.survey.stages import Survey, survey
-from mapserver.survey.survey_inputs import Progress, SurveyConfig, SurveyInputs, SurveyTools, no_progress
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import Survey, begin_survey, survey
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 
 _log = logging.getLogger(__name__)
 
@@ -85,10 +88,14 @@ class Surveyed:
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed, as the doctor found it, and its initial trajectory, None for our own odometry."""
+    """A recording fit to be surveyed, as the doctor found it.
+
+    given: its initial trajectory, None for our own odometry. begun: the first stages of its survey, where the doctor needed them.
+    """
 
     checked: CheckedRecording
     given: GivenPoses | None = None
+    begun: AdjustedChain | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,17 +109,18 @@ class RecordingOptions:
     use: SensorSet | None = None
     trajectory: OtherTrajectory | None = None
 
-    def opened(self, path: Path) -> tuple[Recording, NDArray[np.int64]]:
-        """The recording at `path`, to be closed, and the indices of its selected frames."""
-        whole = open_recording(path, self.opening)
+    def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
+        """The recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
+        recording = open_recording(path, self.opening)
         try:
-            recording = reduced(whole, self.use)
-            chosen, indices = with_depths(
-                recording, FrameSelection.parse(self.frames).apply(recording), self.trajectory
-            )
-            return chosen.readable(indices)
+            recording = reduced(recording, self.use)
+            selected = FrameSelection.parse(self.frames).apply(recording)
+            recording, indices = with_depths(recording, selected, self.trajectory)
+            if keep_in is not None:
+                recording = replace(recording, frames=KeptFrames(recording.frames, keep_in))
+            return recording.readable(indices)
         except FleetmapError:
-            whole.close()
+            recording.close()
             raise
 
     @contextmanager
@@ -150,13 +158,8 @@ class OpenRecordings:
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
         if path != self._path:
             self.__exit__()
-            recording, indices = self._options.opened(path)
-            self._opened = replace(recording, frames=KeptFrames(recording.frames, self._folder)), indices
-            self._path = path
+            self._opened, self._path = self._options.opened(path, self._folder), path
         yield self._opened
-        frames = self._opened[0].frames
-        assert isinstance(frames, KeptFrames)
-        frames.keeps = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +198,43 @@ def survey_inputs_of(
     return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)
 
 
+_LONGEST_S = 120.0  # of a drive that is followed as a whole before it is judged: of a longer one its busiest stretch tells sooner
+
+
+class BegunSurvey:
+    """The first stages of a recording's survey, from which its calibration is measured: they are gone through once where that is right."""
+
+    def __init__(self, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools) -> None:
+        """indices (F,): of the selected frames."""
+        self._indices, self._settings, self._tools = indices, settings, tools
+        self._made: tuple[RigCalibration, AdjustedChain] | None = None
+
+    def __call__(self, recording: Recording, rig: RigCalibration) -> CalibrationData:
+        """What the frames show under the calibration `rig`. SurveyError where they hold too little to be followed."""
+        rectifier = Rectifier(rig)
+        chain = begin_survey(
+            survey_inputs_of(replace(recording, calibration=rig), self._indices, rectifier, None),
+            self._settings,
+            self._tools,
+        )
+        self._tools.at("local adjustment", 1, 1)
+        if rig is recording.calibration:  # which is the one that is believed
+            self._made = rig, chain
+        return busiest_stretch(chain, (rig, rectifier), recording.wheel)
+
+    def chain_of(self, rig: RigCalibration) -> AdjustedChain | None:
+        """What was made under a calibration; None where the last one believed was another."""
+        return self._made[1] if self._made is not None and self._made[0] is rig else None
+
+    @staticmethod
+    def suits(recording: Recording, indices: NDArray[np.int64]) -> bool:
+        """Whether the selected frames follow each other, say as much as any stretch would, and are soon gone through."""
+        stamps_ns = recording.frame_stamps_ns[indices]
+        seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
+        is_run, is_enough = len(indices) == np.ptp(indices) + 1, len(indices) == len(recording) or seconds >= LONGEST_S
+        return bool(is_run and is_enough and seconds <= _LONGEST_S)
+
+
 def admit_recordings(
     paths: Sequence[Path],
     options: RecordingOptions | OpenRecordings,
@@ -202,19 +242,20 @@ def admit_recordings(
     *,
     needs_truth: bool,
     unusable: dict[Path, str] | None = None,
-    executor: Executor = SERIAL,
-    progress: Progress = no_progress,
+    settings: SurveySettings | None = None,
+    tools: SurveyTools | None = None,
     look_at: Callable[[Sequence[Path]], None] = lambda _: None,
 ) -> dict[Path, Admission]:
     """Checks all recordings, so that a hopeless one is refused before the work begins.
 
     unusable: takes those that are refused, with the reason; without it, or where all are, that is an error. look_at: told each path.
+    settings: of the surveys, which may be begun for the checks.
     """
     admitted: dict[Path, Admission] = {}
     for path in paths:
         look_at([path])
         with _noting(path, unusable):
-            admitted[path] = _admission(path, options, console, needs_truth, executor, progress)
+            admitted[path] = _admission(path, options, console, needs_truth, settings, tools or SurveyTools())
     if not admitted:
         raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
@@ -245,8 +286,8 @@ def _admission(
     options: RecordingOptions | OpenRecordings,
     console: Console,
     needs_truth: bool,
-    executor: Executor,
-    progress: Progress,
+    settings: SurveySettings | None,
+    tools: SurveyTools,
 ) -> Admission:
     with options.open(path) as (recording, indices):
         for issue in recording.issues:
@@ -254,11 +295,17 @@ def _admission(
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
         total, done = frames_to_check(recording, SAMPLED_FRAMES, TURN_FRAMES), count(1)
-        result = checked(recording, lambda: progress("examination", min(next(done), total), total), executor)
+        begun = None
+        if settings is not None and options.trajectory is None and BegunSurvey.suits(recording, indices):
+            begun = BegunSurvey(indices, settings, tools)
+        result = checked(
+            recording, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
+        )
+        tools.at("examination", total, total)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         if options.trajectory is None:
-            return Admission(result)
+            return Admission(result, begun=None if begun is None else begun.chain_of(result.rig))
         given = given_poses(replace(recording, calibration=result.rig), indices, options.trajectory)
         console.print(f"{recording.name}: {given.words}", markup=False)
         return Admission(result, given)
@@ -280,9 +327,11 @@ def survey_recording(
         if found.leaves_wheels_out:
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
-        done = survey(
-            survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory), options, tools
-        )
+        inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
+        begun = admission.begun
+        if begun is not None and begun.state.camera != rectifier.camera:
+            begun = None
+        done = survey(inputs, options, tools, begun)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),

@@ -78,10 +78,12 @@ class Survey:
     seen: NDArray[np.bool_]
 
 
-def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
-    """Maps one recording. Raises SurveyError where it holds too little to map."""
+def survey(
+    inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None, begun: AdjustedChain | None = None
+) -> Survey:
+    """Maps one recording; begun: its first stages, where they were made already. SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
-    return _finished(begin_survey(inputs, config.settings, tools), inputs, config, tools)
+    return _finished(begun or begin_survey(inputs, config.settings, tools), inputs, config, tools)
 
 
 def survey_from(

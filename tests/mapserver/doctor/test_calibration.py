@@ -91,7 +91,7 @@ def test_frames_are_followed_again_only_where_that_may_change_a_verdict(
     """A principal point that moved by 3.5 px is none that a robot would notice, and the recording is used as it is."""
     turned = {"camera_imu_y": off["principal_x"] / Rectifier(calibration()).camera.focal_px}  # which looks the same
     followed: list[object] = []
-    monkeypatch.setattr(recordings, "followed", lambda _, rig, *__: followed.append(rig))
+    monkeypatch.setattr(recordings, "followed", lambda _, rig, **__: followed.append(rig))
     monkeypatch.setattr(recordings, "estimate_from", lambda _: estimate(**off, **turned))
     stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
     recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))

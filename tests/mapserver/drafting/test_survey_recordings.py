@@ -1,5 +1,6 @@
-"""Recordings of a build: opened once, and frames of the examination decoded once."""
+"""Recordings of a build: opened once, and their frames decoded once."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,10 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings import image_series as series
 from fleetmap.sensors.samples import SensorSet
-from mapserver.drafting import mapped_images
-from mapserver.drafting.survey_recordings import (
-    OpenRecordings,
-    RecordingOptions,
-)
+from mapserver.drafting import mapped_images, survey_recordings
+from mapserver.drafting.survey_recordings import BegunSurvey, OpenRecordings, RecordingOptions
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
 
 
@@ -22,8 +22,8 @@ def euroc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_euroc(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
 
 
-@pytest.mark.parametrize(("has_room", "decodings"), [(True, 9), (False, 12)])
-def test_frames_of_the_first_use_are_decoded_once(
+@pytest.mark.parametrize(("has_room", "decodings"), [(True, 8), (False, 12)])
+def test_frames_are_decoded_once(
     euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_room: bool, decodings: int
 ) -> None:
     found: list[int] = []
@@ -76,3 +76,38 @@ def test_a_recording_that_cannot_be_used_is_closed(
     ):
         pass
     assert closed == [8]
+
+
+def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
+    euroc: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And from nothing else: a calibration that was tried on the way, or given before a correction, is not the survey's."""
+    monkeypatch.setattr(survey_recordings, "begin_survey", lambda *_: object())
+    monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
+    with open_recording(euroc) as recording:
+        begun = BegunSurvey(np.arange(8), SurveySettings(), SurveyTools())
+        given = recording.calibration
+        tried, corrected = replace(given), replace(given)
+        assert begun.chain_of(given) is None
+        first = begun(recording, given)
+        begun(recording, tried)
+        assert [begun.chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
+        second = begun(replace(recording, calibration=corrected), corrected)
+        assert [begun.chain_of(rig) for rig in (given, corrected)] == [None, second]
+
+
+@pytest.mark.parametrize(
+    ("frames", "hz", "chosen", "suits"),
+    [
+        (600, 20.0, slice(None), True),
+        (600, 20.0, slice(300), False),  # 15 s of it, where its busiest 30 s say more
+        (1200, 20.0, slice(700), True),
+        (1200, 20.0, slice(None, None, 2), False),
+        (1300, 10.0, slice(None), False),  # over two minutes
+        (1, 20.0, slice(None), True),
+    ],
+)
+def test_a_short_drive_is_followed_as_a_whole(euroc: Path, frames: int, hz: float, chosen: slice, suits: bool) -> None:
+    with open_recording(euroc) as recording:
+        stamps_ns = (np.arange(frames) * 1e9 / hz).astype(np.int64)
+        assert BegunSurvey.suits(replace(recording, frame_stamps_ns=stamps_ns), np.arange(frames)[chosen]) is suits
