@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numbers>
 
+#include "dense.h"
 #include "dispatch.h"
 
 namespace fleetmap {
@@ -12,6 +14,144 @@ namespace {
 constexpr double kNearestM = 0.2, kNearestDepthM = 1e-6;
 constexpr double kReachShare = 1.3;  // of the distance up to which a landmark was found: detection does not end sharply
 constexpr double kLeastScale = 0.5;  // of what appears smaller than at the finest octave
+constexpr double kFirstDoubt = 3.0;  // of the sigmas, while the place that matches were looked for around is only a guess
+constexpr double kNarrower = 0.6;    // of the guided radius, around the first answer
+constexpr double kWidestOctave = 3.0, kCoarsestOctave = 5.0;  // up to which windows, and pixels' errors, grow
+constexpr double kOctavesApart = 2.0;                         // of a feature from the one that is expected
+constexpr double kMostAcrossPx = 10.0;                        // that a landmark's own sigma counts for
+constexpr double kNearlyPx = 50.0;                            // beside the image
+constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // from where the survey saw what is covisible
+constexpr double kColumns = 8.0, kRows = 6.0;                 // the parts of an image
+
+// Landmarks of the map that features of a frame show.
+struct Matched {
+  std::vector<int64_t> features, rows;
+  std::vector<double> points, pixels, sigmas;
+};
+
+// Measures the depth of some features that were not tried before, near the disparities (P,) that are expected.
+void measure(const QueryFrame::Unmeasured& unmeasured, const std::vector<int64_t>& features, const std::vector<double>& expected,
+             const FixLimits& limits) {
+  std::vector<double> left, prior, found;
+  std::vector<int64_t> now;
+  for (size_t n = 0; n < features.size(); ++n) {
+    const int64_t at = features[n];
+    if (unmeasured.is_tried[at]) continue;
+    unmeasured.is_tried[at] = true;
+    now.push_back(at), prior.push_back(expected[n]);
+    left.insert(left.end(), unmeasured.pixels + 3 * at, unmeasured.pixels + 3 * at + 2);
+  }
+  found.resize(2 * now.size());
+  match_rows(unmeasured.images, unmeasured.images, left.data(), prior.data(), now.size(), limits.stereo, found.data());
+  for (size_t n = 0; n < now.size(); ++n) {
+    const bool is_known = found[2 * n] > limits.min_disparity_px;
+    unmeasured.pixels[3 * now[n] + 2] = is_known ? left[2 * n] - found[2 * n] : std::numeric_limits<double>::quiet_NaN();
+  }
+}
+
+// Sigmas of a pixel and of its disparity, by its octave and by the landmark's own uncertainty. That lies along the direction from which
+// the landmark was mapped: seen from there it hardly shows, from aside it does.
+void add_sigmas(const MapLandmarks& map, size_t row, int8_t octave, const StereoLens& lens, const FixLimits& limits, Vec3 place,
+                double doubt, std::vector<double>& sigmas) {
+  const double base = limits.feature_sigma_px * std::pow(limits.octave_scale, std::min(double(octave), kCoarsestOctave));
+  const Vec3 ray = vec3(map.cones.points_map + 3 * row) - place;
+  const float* direction = map.cones.directions_map + 3 * row;
+  const double distance = norm(ray);
+  const double along = std::abs(ray[0] * direction[0] + ray[1] * direction[1] + ray[2] * direction[2]) / distance;
+  const double off_px = lens.focal * map.sigmas_m[row] / distance;
+  const double across_px = std::min(off_px * std::sqrt(std::max(1.0 - along * along, 0.0)), kMostAcrossPx);
+  const double depth_px = off_px * along * (lens.focal_baseline / lens.focal) / distance;
+  sigmas.push_back(doubt * std::hypot(base, across_px));
+  sigmas.push_back(doubt * std::hypot(limits.disparity_sigma_px, depth_px));
+}
+
+// The features that show what should be visible from a place; nothing where they are fewer than a pose needs.
+std::optional<Matched> match_visible(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera, const FixLimits& limits,
+                                     const SE3& map_from_cam, double radius_px, double doubt) {
+  const VisibleLandmarks visible = visible_landmarks(map.cones, map_from_cam, camera, float(limits.distance_scale), radius_px,
+                                                     limits.max_view_angle_rad, limits.octave_scale);
+  const size_t count = visible.rows.size();
+  if (count < limits.min_inliers) return {};
+  std::vector<double> pixels, windows;
+  std::vector<int64_t> octaves, index(count);
+  std::vector<uint64_t> words;
+  std::vector<int32_t> distances(count);
+  for (size_t n = 0; n < count; ++n) {
+    const double octave = visible.octaves[n];
+    const uint64_t* descriptor = map.descriptors[size_t(visible.rows[n])];
+    pixels.insert(pixels.end(), {visible.pixels[3 * n], visible.pixels[3 * n + 1]});
+    windows.push_back(radius_px * std::pow(limits.octave_scale, std::clamp(octave, 0.0, kWidestOctave)));
+    octaves.insert(octaves.end(), {int64_t(std::floor(octave) - kOctavesApart), int64_t(std::ceil(octave) + kOctavesApart)});
+    words.insert(words.end(), descriptor, descriptor + 4);
+  }
+  match_projected({pixels.data(), windows.data(), octaves.data(), {words.data(), count}}, frame.features, limits.guided_distance,
+                  limits.guided_ratio, index.data(), distances.data());
+  Matched matched;
+  std::vector<double> expected;
+  for (size_t n = 0; n < count; ++n) {
+    if (index[n] < 0) continue;
+    const size_t row = size_t(visible.rows[n]);
+    const double* point = map.cones.points_map + 3 * row;
+    matched.features.push_back(index[n]), matched.rows.push_back(visible.rows[n]);
+    matched.points.insert(matched.points.end(), point, point + 3);
+    expected.push_back(visible.pixels[3 * n] - visible.pixels[3 * n + 2]);
+    add_sigmas(map, row, frame.features.octaves[index[n]], camera.lens, limits, map_from_cam.translation, doubt, matched.sigmas);
+  }
+  if (matched.rows.size() < limits.min_inliers) return {};
+  if (frame.unmeasured) measure(*frame.unmeasured, matched.features, expected, limits);
+  for (const int64_t at : matched.features) matched.pixels.insert(matched.pixels.end(), frame.pixels + 3 * at, frame.pixels + 3 * at + 3);
+  return matched;
+}
+
+// From the information on a left perturbation in camera axes to the covariance of the rotation about the camera and of its position, in
+// map axes; false where the information has no inverse.
+bool map_covariance(const double* information, const Mat3& map_from_cam, const FixLimits& limits, double* covariance) {
+  Matrix held(6, 6), inverse(6, 6);
+  for (size_t a = 0; a < 6; ++a) {
+    std::copy_n(information + 6 * a, 6, held[a]);
+    held[a][a] += 1e-9, inverse[a][a] = 1.0;
+  }
+  solve_in_place(held, inverse);
+  for (int a = 0; a < 6; a += 3)
+    for (int b = 0; b < 6; b += 3)
+      store(limits.covariance_scale * (map_from_cam * mat3(&inverse.values[size_t(6 * a + b)], 6) * transposed(map_from_cam)),
+            covariance + 6 * a + b, 6);
+  for (int a = 0; a < 6; ++a) {
+    const double floor = a < 3 ? limits.floor_rad : limits.floor_m;
+    covariance[7 * a] += floor * floor;
+  }
+  return is_finite(covariance, 36);
+}
+
+int image_cell(const double* pixel, const StereoImage& camera) {
+  const double column = std::clamp(pixel[0] / camera.width * kColumns, 0.0, kColumns - 1.0);
+  const double row = std::clamp(pixel[1] / camera.height * kRows, 0.0, kRows - 1.0);
+  return int(column) * int(kRows) + int(row);
+}
+
+// Landmarks in a camera's image that the survey saw from next to it, looking the same way: what racks hide is not among them. All that
+// may be visible where the survey did not pass.
+void add_covisible(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const Matched& matched, MapFix& fix) {
+  const SE3& here = fix.map_from_cam;
+  std::vector<uint8_t> seen(map.cones.count), found(map.cones.count);
+  fix.is_passed = false;
+  for (size_t k = 0; k < map.places; ++k) {
+    const SE3 place = se3(map.map_from_cam + 16 * k);
+    double cosine = 0.0;
+    for (int a = 0; a < 3; ++a) cosine += place.rotation[a][2] * here.rotation[a][2];
+    if (!(norm(place.translation - here.translation) < kPassedM && cosine > kPassedCosine)) continue;
+    fix.is_passed = true;
+    for (int64_t n = map.shown_from[k]; n < map.shown_from[k + 1]; ++n) seen[size_t(map.shown[n])] = true;
+  }
+  for (size_t n = 0; n < matched.rows.size(); ++n)
+    if (fix.inliers[n]) found[size_t(matched.rows[n])] = true;
+  const VisibleLandmarks visible =
+      visible_landmarks(map.cones, here, camera, float(limits.distance_scale), 0.0, std::numbers::pi, limits.octave_scale);
+  for (const int64_t row : visible.rows) {
+    if (fix.is_passed && !seen[size_t(row)]) continue;
+    fix.covisible.push_back(row), fix.is_found.push_back(found[size_t(row)]);
+  }
+}
 
 }  // namespace
 
@@ -40,6 +180,51 @@ VisibleLandmarks visible_landmarks(const ViewingCones& cones, const SE3& map_fro
     visible.octaves.push_back(std::log(std::max(reach / distance, kLeastScale)) / log_scale);
   }
   return visible;
+}
+
+std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera,
+                                        const FixLimits& limits, SE3 map_from_cam, double radius_px) {
+  std::optional<Matched> matched;
+  std::optional<Resection> found;
+  MapFix fix;
+  size_t inliers = 0;
+  for (const bool is_first : {true, false}) {
+    const double radius = is_first ? radius_px : std::min(radius_px, limits.guided_radius_px) * kNarrower;
+    matched = match_visible(map, frame, camera, limits, map_from_cam, radius, is_first ? kFirstDoubt : 1.0);
+    if (!matched) return {};
+    std::vector<double> weights;
+    for (const double sigma : matched->sigmas) weights.push_back(1.0 / sigma);
+    const Sightings seen{matched->points.data(), matched->pixels.data(), weights.data(), matched->rows.size()};
+    found = refine_pnp(seen, camera.lens, limits.refinement, nullptr, inverse(map_from_cam));
+    if (!found) return {};
+    fix.inliers.clear();
+    for (const double squared : found->squared) fix.inliers.push_back(squared < limits.refinement.gate_squared);
+    inliers = size_t(std::count(fix.inliers.begin(), fix.inliers.end(), true));
+    if (inliers < limits.min_inliers) return {};
+    map_from_cam = inverse(found->cam_from_source);
+  }
+  bool is_held[int(kColumns * kRows)] = {};
+  for (size_t n = 0; n < fix.inliers.size(); ++n)
+    if (fix.inliers[n]) is_held[image_cell(&matched->pixels[3 * n], camera)] = true;
+  fix.cells = int(std::count(std::begin(is_held), std::end(is_held), true));
+  fix.map_from_cam = map_from_cam;
+  if (fix.cells < limits.min_cells || double(inliers) < limits.min_inlier_share * double(fix.inliers.size())) return {};
+  if (!map_covariance(found->information, map_from_cam.rotation, limits, fix.covariance)) return {};
+  add_covisible(map, camera, limits, *matched, fix);
+  fix.features = std::move(matched->features), fix.rows = std::move(matched->rows);
+  fix.points_map = std::move(matched->points), fix.pixels = std::move(matched->pixels), fix.sigmas_px = std::move(matched->sigmas);
+  return fix;
+}
+
+double median_distance(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const SE3& map_from_cam) {
+  const VisibleLandmarks visible =
+      visible_landmarks(map.cones, map_from_cam, camera, float(limits.distance_scale), kNearlyPx, std::numbers::pi, limits.octave_scale);
+  std::vector<double> distances;
+  for (const int64_t row : visible.rows) distances.push_back(norm(vec3(map.cones.points_map + 3 * row) - map_from_cam.translation));
+  if (distances.empty()) return std::numeric_limits<double>::quiet_NaN();
+  const auto middle = distances.begin() + ptrdiff_t(distances.size() / 2);
+  std::nth_element(distances.begin(), middle, distances.end());
+  return distances.size() % 2 ? *middle : 0.5 * (*std::max_element(distances.begin(), middle) + *middle);
 }
 
 void nearest_cells(Descriptors descriptors, Descriptors centres, size_t wanted, int32_t* cells) {

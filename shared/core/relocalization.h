@@ -1,11 +1,15 @@
 // Where in a map a frame may be: landmarks that a camera should see, and what of a map looks like a picture.
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "camera.h"
 #include "lie.h"
 #include "matching.h"
+#include "pnp.h"
+#include "projection.h"
+#include "stereo.h"
 
 namespace fleetmap {
 
@@ -29,6 +33,67 @@ struct VisibleLandmarks {
 // Source: Mur-Artal et al. 2015, section V.D.
 VisibleLandmarks visible_landmarks(const ViewingCones& cones, const SE3& map_from_cam, const StereoImage& camera, float distance_scale,
                                    double margin_px, double max_view_angle_rad, double octave_scale);
+
+// What a robot holds of a map: landmarks, and the K places from which the survey saw them.
+struct MapLandmarks {
+  ViewingCones cones;
+  const float* sigmas_m;  // (count,) along the directions from which they were mapped
+  Descriptors descriptors;
+  const double* map_from_cam;         // (K, 4, 4)
+  const int64_t *shown, *shown_from;  // rows that place k shows: shown[shown_from[k]] to shown[shown_from[k + 1]]
+  size_t places;
+};
+
+// Features of a frame, pixels (N, 3) u_left v u_right. Where there is a pair of images depth is measured for those that match something
+// and are not tried yet, and kept.
+struct QueryFrame {
+  SeenFeatures features;  // pixels are those of the left image
+  const double* pixels;
+  struct Unmeasured {
+    StereoPair images;
+    double* pixels;  // those above
+    bool* is_tried;  // (N,)
+  };
+  std::optional<Unmeasured> unmeasured;
+};
+
+struct FixLimits {
+  size_t min_inliers;
+  int min_cells;                        // of the image with inliers
+  double min_inlier_share;              // of what is matched
+  double guided_radius_px;              // the smallest
+  double max_view_angle_rad;            // outside the cones
+  int guided_distance;                  // bits
+  double guided_ratio;                  // best over second best
+  double feature_sigma_px;              // at the finest octave
+  double disparity_sigma_px;            // at every octave
+  double covariance_scale;              // of the fix's own: matches share errors of the map
+  double floor_rad, floor_m;            // smallest sigmas
+  double octave_scale, distance_scale;  // as visible_landmarks takes them
+  double min_disparity_px;              // smaller ones count as unknown depth
+  StereoLimits stereo;
+  Refinement refinement;
+};
+
+// A verified place of a frame; covariance (6, 6) in map axes about the camera, rotation first.
+struct MapFix {
+  SE3 map_from_cam;
+  double covariance[36];
+  int cells;                                          // parts of the image that hold inliers
+  std::vector<int64_t> features, rows;                // matched at the end: features and landmarks
+  std::vector<uint8_t> inliers;                       // of them
+  std::vector<double> points_map, pixels, sigmas_px;  // (P, 3), (P, 3), (P, 2) of them
+  std::vector<int64_t> covisible;                     // landmarks that should be seen
+  std::vector<uint8_t> is_found;                      // which of them are inliers
+  bool is_passed;                                     // by the survey; else all that may be visible are covisible
+};
+
+// The fix by guided matching of all landmarks visible from a place, twice: wide, then narrow around the first answer.
+std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera,
+                                        const FixLimits& limits, SE3 map_from_cam, double radius_px);
+
+// The median distance of the landmarks that should be visible, or nearly so; NaN without any.
+double median_distance(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const SE3& map_from_cam);
 
 // Fills, for each descriptor, `wanted` numbers of the centres nearest to it, the nearest first, -1 where there are fewer. Ties go to the
 // lower number.

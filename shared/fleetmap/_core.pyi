@@ -129,6 +129,49 @@ def visible_landmarks(
     pinhole: focal, cx, cy, focal * baseline, width, height. max_view_angle_rad: how far outside its cone a landmark may be seen.
     """
 
+class FixFinder:
+    """Finds places of frames in the landmarks (N) and places (K) of one map, by the settings of relocalization and of disparities.
+
+    cones, pinhole, distance_scale, octave_scale: as of visible_landmarks. Place k shows landmarks shown[shown_from[k] : shown_from[k + 1]].
+    """
+
+    def __init__(
+        self,
+        cones: tuple[_Reals, _Floats, _Floats, _Floats],
+        sigmas_m: _Floats,
+        descriptors: _Descriptors,
+        map_from_cam: _Reals,
+        shown: _Indices,
+        shown_from: _Indices,
+        pinhole: _Reals,
+        distance_scale: float,
+        octave_scale: float,
+        fix: object,
+        stereo: object,
+        min_inlier_share: float,
+        refinement: tuple[float, float, tuple[int, int]],
+    ) -> None: ...
+    def median_distance_m(self, map_from_cam: _Reals) -> float:
+        """Of the landmarks that a camera should see; NaN without any."""
+
+    def by_projection(
+        self,
+        features: tuple[_Reals, _Reals, _Octaves, _Descriptors],
+        unmeasured: tuple[_Grey, _Grey, _Reals, _Flags] | None,
+        map_from_cam: _Reals,
+        radius_px: float,
+    ) -> (
+        tuple[_Reals, _Reals, int, _Indices, _Indices, _Flags, tuple[_Reals, _Reals, _Reals], _Indices, _Flags, bool]
+        | None
+    ):
+        """The verified place near map_from_cam, None without one.
+
+        features: pixels (M, 3) u_left v u_right, those in the left image (M, 2), octaves, descriptors. unmeasured: the pair of images,
+        pixels again and which features were tried (M,), both of which are written. Returns map_from_cam and its covariance, how many
+        parts of the image hold inliers, the features and landmarks matched at the end (P,), which of them are inliers, their points (P, 3),
+        pixels (P, 3) and sigmas (P, 2), the landmarks that should be seen (E,), which of them are, and whether the survey passed there.
+        """
+
 def nearest_cells(descriptors: _Descriptors, centres: _Descriptors, cells: int) -> _Numbers:
     """(N, cells) numbers of the nearest centres, the nearest first; -1 where there are fewer."""
 

@@ -14,10 +14,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleetmap import _core, core  # type: ignore[attr-defined]
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
+from fleetmap.pnp.pnp import REFINEMENT
+from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 from support.fleet.contracts_documents import text
 
@@ -108,6 +111,7 @@ BAKED = (
 )
 BUDGET = THREE, np.full(3, 9), 3, np.zeros(3, np.int64), UNSET, np.full(3, 9), 1  # of choose_landmarks
 CONES = POINTS, np.ones((5, 3), np.float32), np.ones(5, np.float32), np.ones(5, np.float32)
+
 VIEW = 1.0, 10.0, np.pi, 1.2  # scale of distances, margin, angle, scale of octaves
 WORDS, NUMBERS = np.zeros((3, 4), np.uint64), np.zeros(3, np.int32)
 IMAGE, PIXELS = np.zeros((20, 30), np.uint8), np.zeros((3, 2), np.float32)
@@ -127,6 +131,28 @@ FILTER = InvariantFilter(
 )
 
 
+def fix_finder(shown: tuple[int, ...] = (0, 1), shown_from: tuple[int, ...] = (0, 2)) -> core.FixFinder:
+    """In a map of five landmarks and one place."""
+    held = (
+        CONES,
+        np.ones(5, np.float32),
+        np.zeros((5, 4), np.uint64),
+        np.eye(4)[None],
+        np.array(shown),
+        np.array(shown_from),
+    )
+    return core.FixFinder(*held, np.ones(6), 1.0, 1.2, FixSettings(), StereoSettings(), 0.35, REFINEMENT)
+
+
+def frame_features(count: int) -> tuple[Array, Array, Array, Array]:
+    return np.ones((count, 3)), np.ones((count, 2)), np.zeros(count, np.int8), np.zeros((count, 4), np.uint64)
+
+
+def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
+    image = np.zeros((8, 8), np.uint8)
+    return image, image, np.ones((count, 3)), np.zeros(count, bool)
+
+
 @pytest.mark.parametrize(
     ("call", "told"),
     [
@@ -144,6 +170,9 @@ FILTER = InvariantFilter(
         (lambda: core.ransac_pnp(*SEEN, 1.0, 4, POINTS, 0.9), "draws"),
         (lambda: core.refine_pnp(*SEEN[:4], (4.0, 11.0, (10, 1001)), np.eye(4), None), "refinement"),
         (lambda: core.pnp_with_rotation(POINTS[:2], *SEEN[1:], 1.0, 4, np.eye(3), 0.1), "one row for each point"),
+        (lambda: fix_finder(shown=(0, 5)), "shown: rows of landmarks"),
+        (lambda: fix_finder(shown_from=(0, 1)), "shown_from"),
+        (lambda: fix_finder().by_projection(frame_features(3), unmeasured(2), np.eye(4), 9.0), "a row for each feature"),
         (lambda: core.visible_landmarks((POINTS, *CONES[1:3], CONES[3][:2]), np.eye(4), np.ones(6), *VIEW), "cones"),
         (lambda: core.nearest_cells(WORDS, WORDS, 0), "cells"),
         (lambda: core.near_descriptors(WORDS, WORDS, 1, WORDS, np.array([0, 1, 3]), 9), "starts: one more"),

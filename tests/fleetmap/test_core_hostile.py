@@ -17,8 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleetmap import _core  # type: ignore[attr-defined]
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.settings import FilterSettings
+from fleetmap.relocalization.settings import FixSettings
 
 EXAMPLES = int(os.environ.get("FLEETMAP_HOSTILE_EXAMPLES", "6"))  # of each function; of a class, times its methods
 SANITIZED = "FLEETMAP_CORE" in os.environ
@@ -88,7 +90,7 @@ class Arguments:
             "some": lambda: bool(self.rng.random() < 0.5),
             "several": lambda *parts: parts,
             "thrice": lambda one: [one] * 3,
-            "filter_settings": FilterSettings(),
+            "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, FilterSettings()),
         }
         made: list[object] = []
         for self.name, code in asked(function):
@@ -106,7 +108,7 @@ MAKERS = {
     r"\bint\b": "whole()",
     r"\bfloat\b": "real()",
     r"\bbool\b(?!')": "some()",
-    r"\bobject\b": "filter_settings",
+    r"\bobject\b": "given()",
 }
 
 

@@ -7,16 +7,18 @@ from numpy.typing import NDArray
 
 from fleetmap.features import orb, stereo
 from fleetmap.features.extraction import extract
+from fleetmap.features.matching import Packed, packed
 from fleetmap.features.settings import OrbSettings, StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import Image
 
 
 @dataclass(slots=True)
 class FrameFeatures:
     """Features of one frame: pixels (N, 3) u_left v u_right, NaN where unknown.
 
-    Depth is measured only for features that match something, while `frame` is held: `is_tried` (N,) says for which it was.
+    Of a pair, depth is measured only for features that match something, while `frame` is held: `is_tried` (N,) says for which it was.
     """
 
     features: orb.Features
@@ -24,15 +26,34 @@ class FrameFeatures:
     frame: RectifiedFrame | None = None
     is_tried: NDArray[np.bool_] | None = None
 
-    def measured(
-        self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings, prior_px: Array | None = None
-    ) -> Array:
-        """Pixels (P, 3) of some features, depth measured now where it was not tried before; prior_px (P,) narrows the search."""
+    @classmethod
+    def of(
+        cls, frame: RectifiedFrame, features: orb.Features, camera: StereoCamera, settings: StereoSettings
+    ) -> "FrameFeatures":
+        """Those of `frame`, not tried where it is a pair; a depth image is read at once."""
+        if frame.right is not None and frame.disparity_px is None:
+            pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
+            return cls(features, pixels, frame, np.zeros(len(features), bool))
+        return _with_depth(frame, features, camera, settings)
+
+    def packed(self) -> tuple[Array, Array, NDArray[np.int8], Packed]:
+        """As the core takes them."""
+        features = self.features
+        pixels, left = np.ascontiguousarray(self.pixels), np.ascontiguousarray(features.pixels, np.float64)
+        return pixels, left, np.ascontiguousarray(features.octaves), packed(features.descriptors)
+
+    def unmeasured(self) -> tuple[Image, Image, Array, NDArray[np.bool_]] | None:
+        """The pair of images, and what the core fills where it measures depth."""
+        if self.frame is None or self.is_tried is None:
+            return None
+        assert self.frame.right is not None
+        return self.frame.left, self.frame.right, self.pixels, self.is_tried
+
+    def measured(self, rows: NDArray[np.int64], camera: StereoCamera, settings: StereoSettings) -> Array:
+        """Pixels (P, 3) of some features, depth measured now where it was not tried before."""
         if self.frame is not None and self.is_tried is not None:
-            new = np.flatnonzero(~self.is_tried[rows])
-            at = rows[new]
-            prior = None if prior_px is None else prior_px[new]
-            found = stereo.disparities(self.frame, camera, self.features.pixels[at], settings, prior)
+            at = rows[~self.is_tried[rows]]
+            found = stereo.disparities(self.frame, camera, self.features.pixels[at], settings)
             self.pixels[at, 2] = self.pixels[at, 0] - found[:, 0]
             self.is_tried[at] = True
         return self.pixels[rows]
@@ -46,6 +67,11 @@ def features_with_depth(
     frame: RectifiedFrame, camera: StereoCamera, settings: OrbSettings, stereo_settings: StereoSettings
 ) -> FrameFeatures:
     """The features of one frame with the depth of all of them; the frame itself is not kept."""
-    features = extract(frame.left, settings)
-    found = stereo.disparities(frame, camera, features.pixels, stereo_settings)
+    return _with_depth(frame, extract(frame.left, settings), camera, stereo_settings)
+
+
+def _with_depth(
+    frame: RectifiedFrame, features: orb.Features, camera: StereoCamera, settings: StereoSettings
+) -> FrameFeatures:
+    found = stereo.disparities(frame, camera, features.pixels, settings)
     return FrameFeatures(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))

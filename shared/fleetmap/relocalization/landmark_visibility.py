@@ -55,9 +55,15 @@ def visible_landmarks(
 
     distance_scale: the camera's focal length as a multiple of the survey's; a longer lens sees a corner at the same scale from further.
     """
-    pinhole = np.array([*camera.lens, camera.width_px, camera.height_px])
     limits = distance_scale, margin_px, max_view_angle_rad, SCALE_FACTOR
-    return VisibleLandmarks(*core.visible_landmarks(cones, np.ascontiguousarray(map_from_cam), pinhole, *limits))
+    return VisibleLandmarks(
+        *core.visible_landmarks(cones, np.ascontiguousarray(map_from_cam), pinhole_of(camera), *limits)
+    )
+
+
+def pinhole_of(camera: StereoCamera) -> Array:
+    """(6,) as the core takes it: focal, cx, cy, focal * baseline, width, height."""
+    return np.array([*camera.lens, camera.width_px, camera.height_px])
 
 
 def match_visible(
@@ -98,11 +104,6 @@ def image_cells(pixels: Array, camera: StereoCamera) -> Rows:
     column = np.clip(pixels[:, 0] / camera.width_px * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
     row = np.clip(pixels[:, 1] / camera.height_px * ROWS, 0, ROWS - 1).astype(np.int64)
     return np.asarray(column * ROWS + row)
-
-
-def image_coverage(pixels: Array, camera: StereoCamera) -> int:
-    """How many of these parts hold one of the pixels."""
-    return len(np.unique(image_cells(pixels, camera)))
 
 
 def joined(parts: Sequence[AnyArray], empty: tuple[int, ...], dtype: type[np.generic]) -> Any:

@@ -10,23 +10,27 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.bow import Vocabulary
 from fleetmap.features.matching import Descriptors, packed
+from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile
+from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.landmark_visibility import (
     Rows,
     VisibleLandmarks,
     cones_of_tiles,
     joined,
+    pinhole_of,
     places_around,
     visible_landmarks,
 )
+from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
 
 _LEVEL = 2  # of the vocabulary's tree whose nodes are the cells of descriptors
 _CELLS = 4  # that are asked for each descriptor
 _NEAR_BITS = 40  # of 256: descriptors of one landmark days apart; two landmarks differ by more, but for look-alikes
 _UNSEEN_LANDMARKS = 8.0  # that no place has: a place of few landmarks is not much like anything
-_COVISIBLE_M, _COVISIBLE_COSINE = 1.0, 0.8
+_MIN_INLIER_SHARE = 0.35  # of what is matched at a fix
 _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE = 3.0, 0.5
 
 
@@ -107,25 +111,30 @@ class MapView:
         scale = camera.focal_px / self._survey_focal_px
         return visible_landmarks(self.cones, map_from_cam, camera, margin_px, max_view_angle_rad, scale)
 
-    def covisible(self, map_from_cam: Array, camera: StereoCamera) -> tuple[Rows, bool]:
-        """Rows of the landmarks in a camera's image that the survey saw from next to it, looking the same way: what racks hide is
-        not among them. All that may be visible, and False, where the survey did not pass."""
-        rows = self.visible(map_from_cam, camera, 0.0, np.pi).rows
-        places = np.flatnonzero(places_around(self.map_from_cam, map_from_cam, _COVISIBLE_M, _COVISIBLE_COSINE))
-        return (rows[self._seen_from(places)[rows]], True) if len(places) else (rows, False)
+    def fix_finder(self, camera: StereoCamera, settings: RelocalizerSettings) -> core.FixFinder:
+        """What finds fixes of a camera in this map."""
+        counts = [len(rows) for rows in self.place_rows]
+        return core.FixFinder(
+            self.cones,
+            self.sigmas_m,
+            packed(self.descriptors),
+            self.map_from_cam,
+            self._shown,
+            np.cumsum([0, *counts]),
+            pinhole_of(camera),
+            camera.focal_px / self._survey_focal_px,
+            SCALE_FACTOR,
+            settings.fix,
+            settings.stereo,
+            _MIN_INLIER_SHARE,
+            REFINEMENT,
+        )
 
     def neighbourhood(self, place: int) -> Rows:
         """Rows of all landmarks of places near one place that look a similar way."""
         map_from_place = self.map_from_cam[place]
         near = places_around(self.map_from_cam, map_from_place, _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
-        return np.flatnonzero(self._seen_from(np.flatnonzero(near)))
-
-    def _seen_from(self, places: Rows) -> NDArray[np.bool_]:
-        """(N,) which landmarks are seen from one of the places."""
-        seen = np.zeros(len(self), bool)
-        for place in places:
-            seen[self.place_rows[place]] = True
-        return seen
+        return np.unique(self._shown[near[self._place_of_shown]])
 
 
 def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: Rows) -> Rows:

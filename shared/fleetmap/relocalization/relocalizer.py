@@ -10,10 +10,10 @@ from fleetmap.features import orb
 from fleetmap.features.extraction import extract_in_slices
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.landmark_visibility import Rows, image_coverage, match_visible, places_around
+from fleetmap.relocalization.landmark_visibility import Rows, places_around
 from fleetmap.relocalization.map_view import CovisibleLandmarks, MapView
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -21,9 +21,8 @@ from fleetmap.time_sliced import TimeSliced
 
 _RANKED = 8  # so many times as many places are ranked as are tried
 _TRIALS_AT_A_PLACE = 2
-_FIRST_DOUBT = 3.0  # of the sigmas, while the place that matches were looked for around is only a guess
 _SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
-_MIN_INLIER_SHARE, _MIN_RANSAC_SHARE = 0.35, 0.15
+_MIN_RANSAC_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +60,12 @@ class Relocalizer:
         self.view = view
         self._camera = camera
         self._settings = settings
+        self._finder = view.fix_finder(camera, settings)
 
     def extract(self, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """The features of one frame, no depth measured yet, in slices: see `finished`."""
+        """The features of one frame, in slices: see `finished`; of a pair no depth is measured yet."""
         features = yield from extract_in_slices(frame.left, self._settings.orb)
-        pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
-        return FrameFeatures(features, pixels, frame, np.zeros(len(features), bool))
+        return FrameFeatures.of(frame, features, self._camera, self._settings.stereo)
 
     def near(self, query: FrameFeatures, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
         """The fix near a predicted place whose covariance (map axes) sets the search window; None where nothing agrees."""
@@ -122,32 +121,30 @@ class Relocalizer:
 
     def by_projection(self, query: FrameFeatures, map_from_cam: Array, radius_px: float) -> Fix | None:
         """The fix by guided matching of all landmarks visible from a place, twice: wide, then narrow around the first answer."""
-        settings = self._settings.fix
-        found: PnpResult | None = None
-        matches: NDArray[np.int64] = np.zeros((0, 2), np.int64)
-        max_angle_rad = np.radians(settings.max_view_angle_deg)
-        for radius, doubt in ((radius_px, _FIRST_DOUBT), (min(radius_px, settings.guided_radius_px) * 0.6, 1.0)):
-            expected = self.view.visible(map_from_cam, self._camera, radius, max_angle_rad)
-            rows, pixels, octaves = expected
-            if len(rows) < settings.min_inliers:
-                return None
-            windows_px = radius * orb.SCALE_FACTOR ** np.clip(octaves, 0, 3)
-            hit = match_visible(expected, self.view.descriptors[rows], windows_px, query.features, settings)
-            kept = np.flatnonzero(hit >= 0)
-            if len(kept) < settings.min_inliers:
-                return None
-            points = self.view.points_map[rows[kept]]
-            sigmas = doubt * self._sigmas(query, hit[kept], rows[kept], map_from_cam)
-            measured = self._measured(query, hit[kept], pixels[kept, 0] - pixels[kept, 2])
-            matched = Correspondences(self._camera, points, measured, sigmas)
-            found = refine_pnp(matched, se3_inverse(map_from_cam))
-            if found is None or found.inliers.sum() < settings.min_inliers:
-                return None
-            map_from_cam = se3_inverse(found.cam_from_source)
-            matches = np.column_stack([hit[kept], rows[kept]])[found.inliers]
-        assert found is not None
-        fix = self._verified(query, found, matches)
-        return None if fix is None else replace(fix, matched=matched)
+        place = np.ascontiguousarray(map_from_cam)
+        found = self._finder.by_projection(query.packed(), query.unmeasured(), place, radius_px)
+        if found is None:
+            return None
+        view = self.view
+        map_from_cam, covariance, cells, features, rows, inliers, matched, covisible, is_found, is_passed = found
+        seen = int(is_found.sum())
+        return Fix(
+            map_from_cam=map_from_cam,
+            cov_rot_trans=covariance,
+            inliers=int(inliers.sum()),
+            image_coverage=cells,
+            inlier_share=float(inliers.mean()),
+            landmark_recall=seen / max(len(covisible), 1),
+            expected=len(covisible),
+            seen=seen,
+            matches=np.column_stack([features, rows])[inliers],
+            covisible=CovisibleLandmarks(
+                view.landmark_ids[covisible], view.points_map[covisible], view.descriptors[covisible], is_found
+            )
+            if is_passed
+            else None,
+            matched=Correspondences(self._camera, *matched),
+        )
 
     def _ranked(self, query: FrameFeatures, allowed: NDArray[np.bool_] | None, failed: list[Array]) -> Rows:
         """The places to try, the most similar first; failed ones and what lies around several left out, unless no others are left."""
@@ -245,75 +242,23 @@ class Relocalizer:
             rotation_sigma_rad=sigma_rad,
         )
 
-    def _verified(self, query: FrameFeatures, found: PnpResult, matches: NDArray[np.int64]) -> Fix | None:
-        settings = self._settings.fix
-        coverage = image_coverage(query.pixels[matches[:, 0]], self._camera)
-        inlier_share = float(found.inliers.mean())
-        if coverage < settings.min_cells or inlier_share < _MIN_INLIER_SHARE:
-            return None
-        map_from_cam = se3_inverse(found.cam_from_source)
-        # From a left perturbation in camera axes to the rotation about the camera's place and its position, in map axes.
-        carry = np.zeros((6, 6))
-        carry[:3, :3] = carry[3:, 3:] = -map_from_cam[:3, :3]
-        covariance = settings.covariance_scale * carry @ found.cov_rot_trans @ carry.T
-        covariance += np.diag([settings.floor_rad**2] * 3 + [settings.floor_m**2] * 3)
-        rows, is_passed = self.view.covisible(map_from_cam, self._camera)
-        is_found = np.isin(rows, matches[:, 1])
-        seen = int(is_found.sum())
-        return Fix(
-            map_from_cam=map_from_cam,
-            cov_rot_trans=covariance,
-            inliers=int(found.inliers.sum()),
-            image_coverage=coverage,
-            inlier_share=inlier_share,
-            landmark_recall=seen / max(len(rows), 1),
-            expected=len(rows),
-            seen=seen,
-            matches=matches,
-            covisible=CovisibleLandmarks(
-                self.view.landmark_ids[rows], self.view.points_map[rows], self.view.descriptors[rows], is_found
-            )
-            if is_passed
-            else None,
-        )
-
     def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> Correspondences:
-        """Points (P, 3) of landmarks and the features that show them."""
-        measured = self._measured(query, features)
-        sigmas = self._sigmas(query, features, rows, None)
-        return Correspondences(self._camera, self.view.points_map[rows], measured, sigmas)
-
-    def _measured(self, query: FrameFeatures, features: NDArray[np.int64], prior_px: Array | None = None) -> Array:
-        return query.measured(features, self._camera, self._settings.stereo, prior_px)
-
-    def _sigmas(
-        self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows, map_from_cam: Array | None
-    ) -> Array:
-        """(N, 2): of pixels and of disparities, by octave and by the landmarks' own uncertainty.
-
-        That lies along the direction from which a landmark was mapped: seen from there it hardly shows, from aside it does.
-        """
-        settings, view = self._settings.fix, self.view
+        """Points (P, 3) of landmarks and the features that show them, whose place is not known."""
+        settings = self._settings
+        measured = query.measured(features, self._camera, settings.stereo)
         scale = orb.SCALE_FACTOR ** np.minimum(query.features.octaves[features], 5).astype(np.float64)
-        base = settings.feature_sigma_px * scale
-        if map_from_cam is None:
-            return np.column_stack([base, np.maximum(base, 1.0)])
-        rays = view.points_map[rows] - map_from_cam[:3, 3]
-        distances = np.linalg.norm(rays, axis=1)
-        along = np.abs((rays * view.cones.directions_map[rows]).sum(axis=1)) / distances
-        off_px = self._camera.focal_px * view.sigmas_m[rows] / distances
-        across_px = np.minimum(off_px * np.sqrt(np.maximum(1.0 - along**2, 0.0)), 10.0)
-        depth_px = off_px * along * self._camera.baseline_m / distances
-        return np.column_stack([np.hypot(base, across_px), np.hypot(settings.disparity_sigma_px, depth_px)])
+        sigmas = settings.fix.feature_sigma_px * scale
+        return Correspondences(
+            self._camera, self.view.points_map[rows], measured, np.column_stack([sigmas, np.maximum(sigmas, 1.0)])
+        )
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
         """Three sigmas of a landmark's predicted pixel, at the median distance of what should be visible."""
-        rows = self.view.visible(map_from_cam, self._camera, 50.0, np.pi).rows
-        if not len(rows):
+        depth = self._finder.median_distance_m(np.ascontiguousarray(map_from_cam))
+        if np.isnan(depth):
             return np.inf
-        depth = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
-        position = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
-        angle = float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[:3, :3])[-1]))
+        widest = np.linalg.eigvalsh(np.stack([cov_rot_trans[:3, :3], cov_rot_trans[3:, 3:]]))[:, -1]
+        angle, position = (float(sigma) for sigma in np.sqrt(widest))
         three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
         return max(self._settings.fix.guided_radius_px, three_sigmas_px)
 
