@@ -3,6 +3,8 @@
 
 #include <cstddef>
 
+#include "lie.h"
+
 namespace fleetmap {
 
 // A rectified pinhole pair: u = focal x / z + cx, v = focal y / z + cy, and in the right image u - focal_baseline / z. All in pixels,
@@ -24,8 +26,23 @@ struct RadialTangential {
 // Fills the points (x, y) of the plane z = 1 that the lens brings to the goals: Newton's method with a numeric Jacobian, not checked.
 void undistort(const RadialTangential& lens, const double* goal_x, const double* goal_y, size_t count, double* x, double* y);
 
-// Fills an image with the depth of the nearest point (count, 3) at each pixel, 0 where there is none; pixels (count, 2), NaN for unseen.
-// All four pixels around a point take it: with the nearest alone the background would shine through the foreground.
-void register_depth(const double* points, const double* pixels, size_t count, ptrdiff_t height, ptrdiff_t width, float* image);
+// Equidistant fisheye k1 k2 k3 k4. Source: Kannala and Brandt 2006.
+struct Equidistant {
+  double k1, k2, k3, k4;
+};
+
+// Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 of a radial-tangential lens at which
+// the image does not fold back yet.
+struct LensCamera {
+  double fx, fy, cx, cy, reach;
+  ptrdiff_t width, height;
+};
+
+// Fills colour, an image of the camera, with the depth of the nearest point at each of its pixels, 0 where there is none. The points are
+// depth (count) along rays (count, 3), which have z = 1 and are NaN for pixels without one. All four pixels around a point take it: with
+// the nearest alone the background would shine through the foreground.
+template <typename Lens>
+void register_depth(const float* depth, const double* rays, size_t count, const SE3& colour_from_depth, const LensCamera& camera,
+                    const Lens& lens, float* colour);
 
 }  // namespace fleetmap

@@ -231,8 +231,21 @@ def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
 def undistort(lens: _Reals, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
     """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 brings to the goals; not checked."""
 
-def register_depth(points: _Reals, pixels: _Reals, width: int, height: int) -> _Floats:
-    """(height, width) depth of the nearest point (N, 3) around each pixel (N, 2), NaN for unseen; 0 where there is none."""
+def register_depth(
+    depth: _Floats,
+    rays: _Reals,
+    colour_from_depth: _Reals,
+    intrinsics: _Reals,
+    lens: _Reals,
+    reach: float,
+    width: int,
+    height: int,
+) -> _Floats:
+    """(height, width) depth in a camera of the nearest point around each pixel, 0 where there is none.
+
+    depth (H, W) metres, 0 where unknown, along rays (H W, 3) with z = 1, NaN for none. intrinsics: fx fy cx cy. lens: 8 coefficients,
+    radial-tangential, whose image folds back where x^2 + y^2 reaches `reach`; or 4, equidistant.
+    """
 
 def spare_keyframes(
     rows: _Indices,

@@ -95,6 +95,7 @@ def test_an_array_of_another_type_is_refused(name: str) -> None:
 
 
 POINTS = np.ones((5, 3))
+DEPTH, COLOUR = np.ones((2, 2), np.float32), (np.eye(4), np.ones(4), np.zeros(8))
 SEEN = POINTS, POINTS, np.ones((5, 2)), np.ones(4), (4.0, 11.0, (10, 5))  # as PnP takes it
 THREE, BOUNDS, NEIGHBOURS = np.arange(3), np.arange(4), np.array([[0, 1]])
 HEIGHTS, PLANE, UNSET, LEVELS = np.ones(3), np.ones((3, 2)), np.zeros(3, bool), np.zeros(3, np.int8)
@@ -191,9 +192,10 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: core.thin(IMAGE, 0, 250), "every"),
         (lambda: core.row_steps(IMAGE, -1), "every"),
         (lambda: core.undistort(np.ones(8), HEIGHTS, HEIGHTS[:2]), "goals_y"),
-        (lambda: core.register_depth(POINTS, PLANE, 9, 9), "pixels"),
-        (lambda: core.register_depth(POINTS[:3], PLANE, 9, -1), "width, height"),
-        (lambda: core.register_depth(POINTS[:3], PLANE, 1 << 14, 1 << 14), "width, height"),
+        (lambda: core.register_depth(DEPTH, POINTS[:3], *COLOUR, 1.0, 9, 9), "rays"),
+        (lambda: core.register_depth(DEPTH, POINTS[:4], *COLOUR[:2], np.ones(5), 1.0, 9, 9), "lens"),
+        (lambda: core.register_depth(DEPTH, POINTS[:4], *COLOUR, 1.0, 9, -1), "width, height"),
+        (lambda: core.register_depth(DEPTH, POINTS[:4], *COLOUR, 1.0, 1 << 14, 1 << 14), "width, height"),
         (lambda: core.blend(PLANE, POINTS[:3], PLANE, HEIGHTS, HEIGHTS, 1 << 14, 1 << 14), "width, height"),
         (lambda: core.BoxGrid(np.ones((1, 8)), ZERO, np.array([1.0, 1.0, 5e3]), 1.0), "cell_m"),
         (lambda: core.BoxGrid(np.full((9, 8), 2e3), ZERO, np.array([256.0, 256.0, 256.0]), 1.0), "boxes"),
@@ -309,7 +311,10 @@ def test_what_is_not_finite_or_outside_gives_values() -> None:
         place = points[:3], PLANE * strange, UNSET
         assert len(core.block_log_odds(place, place, PLANE * [1.0, strange], CELL_MODEL, strange, 9)) == 9
         core.undistort(np.full(8, strange), HEIGHTS * strange, HEIGHTS)
-        core.register_depth(points[:3], PLANE * strange, 9, 9)
+        for lens in (np.full(8, strange), np.full(4, strange)):
+            core.register_depth(
+                DEPTH * np.float32(strange), points[:4], np.eye(4), np.full(4, strange), lens, strange, 9, 9
+            )
         core.choose_landmarks(THREE, BOUNDS, THREE, HEIGHTS * strange, *BUDGET)
         core.twins(WORDS, points[:3], 6, 9, 60, strange, strange)
         core.visible_landmarks((points, *CONES[1:]), np.full((4, 4), strange), np.full(6, strange), *VIEW)

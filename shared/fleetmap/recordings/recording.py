@@ -147,12 +147,14 @@ class Recording:
         was opened. RecordingError where most are damaged.
         """
         faults: dict[int, str] = {}
+        has_jpeg = False
         for index in indices.tolist():
             try:
-                stored = self.stored_frame(index)
-                if any(
-                    image and file_kind(image.data) == "jpeg" for image in (stored.left, stored.right, stored.depth)
-                ):
+                if not has_jpeg:
+                    stored = self.stored_frame(index)
+                    images = stored.left, stored.right, stored.depth
+                    has_jpeg = any(image and file_kind(image.data) == "jpeg" for image in images)
+                if has_jpeg:
                     self.read_frame(index)
             except RecordingError as error:
                 faults[index] = str(error)

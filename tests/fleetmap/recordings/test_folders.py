@@ -7,8 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings.folders.seven_scenes import DepthRegistration
+from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import SensorSet
 from support.recordings.recording_samples import (
     BASELINE_M,
@@ -185,3 +187,22 @@ def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Pat
     assert near[-1] == pytest.approx(WIDTH // 2 - 1 + 300 * 0.05 / 2, abs=1)
     assert far[0] == near[-1] + 1
     assert far[-1] == WIDTH - 1
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [("radial-tangential", (0.1, -0.05, 0.002, -0.001)), ("equidistant", (0.03, -0.01, 0.004, -0.001))],
+)
+def test_depth_lands_where_the_colour_lens_sees_it(model: str, distortion: tuple[float, ...]) -> None:
+    intrinsics = np.array([60.0, 61.0, 40.0, 30.0])
+    depth_camera = CameraCalibration("radial-tangential", 80, 60, intrinsics, np.zeros(0), np.eye(4))
+    shifted = se3(so3_exp(np.array([0.02, -0.03, 0.1])), np.array([0.05, -0.02, 0.01]))
+    colour = CameraCalibration(model, 80, 60, intrinsics, np.array(distortion), shifted)
+    depth_m = np.zeros((60, 80), np.float32)
+    depth_m[12, 60] = 1.5
+    registered = DepthRegistration(colour, depth_camera).registered(depth_m, "here")
+    ray = depth_camera.ray_from_pixel(np.array([[60.0, 12.0]]))
+    point = transform_points(se3_inverse(shifted), 1.5 * ray / ray[:, 2:])
+    (u, v), (rows, columns) = np.floor(colour.pixel_from_ray(point)[0]).astype(int), np.nonzero(registered)
+    assert {*zip(rows.tolist(), columns.tolist(), strict=True)} == {(v, u), (v, u + 1), (v + 1, u), (v + 1, u + 1)}
+    assert registered[rows, columns] == pytest.approx(point[0, 2])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, se3, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.layout import ImageFiles, existing_images, file_frames, read_image, read_table
 from fleetmap.recordings.image_series import pair_images
@@ -23,6 +23,7 @@ from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import Trajectory
 
 _COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0  # of images that are 640 px wide
@@ -76,7 +77,7 @@ class DepthRegistration:
         else:
             rays = depth.ray_from_pixel(_pixels(depth))
             self._rays_depth = rays / rays[:, 2:]
-            self._has_ray = np.isfinite(self._rays_depth).all(axis=1)
+            self._lens = CAMERA_MODELS[colour.model].core_lens(colour.distortion)
 
     def registered(self, depth_m: Depth, where: str) -> Depth:
         """(H, W) metres along the colour camera's axis, 0 where unknown, of a depth image in the depth camera's pixels.
@@ -92,11 +93,11 @@ class DepthRegistration:
             )
         if self._is_same_place:
             return np.asarray(cv2.remap(depth_m, self._map, None, cv2.INTER_NEAREST, borderValue=0.0), np.float32)  # type: ignore[call-overload]
-        known = (depth_m.ravel() > 0) & self._has_ray
-        points_depth = self._rays_depth[known] * depth_m.ravel()[known, None]
-        points_colour = transform_points(self._colour_from_depth, points_depth.astype(np.float64))
-        pixels = np.ascontiguousarray(self._colour.pixel_from_ray(points_colour))
-        return core.register_depth(points_colour, pixels, self._colour.width_px, self._colour.height_px)
+        colour, motion = self._colour, self._colour_from_depth
+        intrinsics = np.array(colour.intrinsics_px, np.float64)
+        return core.register_depth(
+            depth_m, self._rays_depth, motion, intrinsics, *self._lens, colour.width_px, colour.height_px
+        )
 
 
 def _files(path: Path, kind: str, log: ReadLog) -> ImageFiles:

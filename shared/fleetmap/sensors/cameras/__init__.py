@@ -1,6 +1,7 @@
 """Camera models: pixel_from_ray and ray_from_pixel for each. To add one: a file here, a line in CAMERA_MODELS, and one in _NAMES
 for each name that calibration files have for it. Parameters beyond fx, fy, cx and cy are its `distortion`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -25,16 +26,21 @@ class CameraModel:
 
     pixel_from_ray(intrinsics_px (4,) fx fy cx cy, distortion (k,), rays_cam (N, 3)) -> (N, 2) px, NaN where the lens cannot see.
     ray_from_pixel(intrinsics_px, distortion, pixels (N, 2)) -> (N, 3) unit rays, NaN where no ray maps to the pixel.
+    core_lens(distortion) -> the coefficients as the core takes them, and the x^2 + y^2 at which a radial-tangential image folds back.
     """
 
     pixel_from_ray: _Project
     ray_from_pixel: _Unproject
+    core_lens: Callable[[Array], tuple[Array, float]]
     distortion_counts: tuple[int, ...]
 
 
 CAMERA_MODELS = {
-    "radial-tangential": CameraModel(radial_tangential.pixel_from_ray, radial_tangential.ray_from_pixel, (0, 4, 5, 8)),
-    "equidistant": CameraModel(equidistant.pixel_from_ray, equidistant.ray_from_pixel, (4,)),
+    name: CameraModel(lens.pixel_from_ray, lens.ray_from_pixel, lens.core_lens, counts)
+    for name, lens, counts in (
+        ("radial-tangential", radial_tangential, (0, 4, 5, 8)),
+        ("equidistant", equidistant, (4,)),
+    )
 }
 
 # Names by which ROS, Kalibr, EuRoC, OpenCV and OpenVINS call a lens; ROS leaves it empty where it means plumb_bob

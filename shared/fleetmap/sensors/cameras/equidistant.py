@@ -31,6 +31,11 @@ def pixel_from_ray(intrinsics_px: Array, distortion: Array, rays_cam: Array) -> 
     return pixels
 
 
+def core_lens(distortion: Array) -> tuple[Array, float]:
+    """See CameraModel."""
+    return np.array(distortion, np.float64), np.inf
+
+
 def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
     """(N, 3) unit rays of pixels (N, 2). Newton's method on the radius; NaN where no angle gives it."""
     fx, fy, cx, cy = intrinsics_px

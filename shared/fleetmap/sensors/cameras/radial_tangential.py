@@ -53,6 +53,12 @@ def pixel_from_ray(intrinsics_px: Array, distortion: Array, rays_cam: Array) -> 
     return pixels
 
 
+def core_lens(distortion: Array) -> tuple[Array, float]:
+    """See CameraModel."""
+    lens = _coefficients(distortion)
+    return np.array(lens), _radial_limit(lens)
+
+
 def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
     """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN where it does not come back to the pixel."""
     fx, fy, cx, cy = intrinsics_px
