@@ -20,7 +20,7 @@ from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
 APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
 _BUSY_TIMEOUT_MS = 30_000
 _INCREMENTAL = 2
-_HEAD_BYTES, _FORMAT_AT = 100, 60  # of a file of SQLite, and its user_version in it
+_HEAD_BYTES, _FORMAT_AT, _APPLICATION_AT = 100, 60, 68  # of a file of SQLite, its user_version and application_id in it
 
 
 Row = TypeVar("Row")
@@ -150,14 +150,25 @@ def _opened_for_reading(path: Path) -> Database:
         ) from error
 
 
-def is_older(path: Path) -> bool:
-    """True if the database would be migrated by whoever opens it to write; looks at nothing but its head."""
+def format_of(path: Path) -> int | None:
+    """The format of a store's database, None for one that is no store's; looks at nothing but its head, without SQLite."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
     except OSError:
-        return False
-    return len(head) == _HEAD_BYTES and 0 < int.from_bytes(head[_FORMAT_AT : _FORMAT_AT + 4], "big") < FORMAT
+        return None
+    number, application = (int.from_bytes(head[at : at + 4], "big") for at in (_FORMAT_AT, _APPLICATION_AT))
+    return number if len(head) == _HEAD_BYTES and application == APPLICATION_ID else None
+
+
+def is_older(path: Path) -> bool:
+    """True if the database would be migrated by whoever opens it to write."""
+    return 0 < (format_of(path) or 0) < FORMAT
+
+
+def can_be_read(path: Path) -> bool:
+    """True unless the database is refused for its format, or is no store's."""
+    return LAST_UNNAMED <= (format_of(path) or 0) <= FORMAT
 
 
 def _current(database: Database) -> Database:

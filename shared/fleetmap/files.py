@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,16 +12,20 @@ from fleetmap.errors import disk_errors
 
 OWN_FILE = 0o600  # maps, positions and pictures are nobody else's business on a shared machine
 TEMPORARY_SUFFIX = ".tmp"
+_LEFT_AFTER_S = 86_400.0  # nobody writes one file for a day: what is older is of a process that was killed
 
 
 def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) -> None:
     """The file at `path` holds the chunks afterwards, or what it held before.
 
-    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either.
+    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either; what a killed process
+    left of the same file goes after a day.
 
     Raises OSError where the disk refuses.
     """
-    temporary = path.with_name(f".{path.name[:16]}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
+    prefix = f".{path.name[:16]}."
+    _remove_leftovers(path.parent, prefix)
+    temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_EXCL | os.O_CREAT | os.O_CLOEXEC, mode)
     try:
         try:
@@ -59,6 +64,14 @@ def appearing_file(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def _remove_leftovers(folder: Path, prefix: str) -> None:
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            is_temporary = entry.name.startswith(prefix) and entry.name.endswith(TEMPORARY_SUFFIX)
+            if is_temporary and time.time() - entry.stat(follow_symlinks=False).st_mtime > _LEFT_AFTER_S:
+                os.unlink(entry.path)  # noqa: PTH108
 
 
 def _write_all(descriptor: int, chunk: bytes) -> None:

@@ -31,6 +31,7 @@ def gc(
     Current versions, targets of a rollback and versions that robots run are always kept.
     """
     from mapserver.store import Retention
+    from mapserver.store.database import can_be_read
     from mapserver.store.files import keep_reserve, release_reserve
 
     retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
@@ -42,8 +43,8 @@ def gc(
     try:
         garbage = collect()
     except StoreError:
-        open_store(store, read_only=True).close()  # a store that is refused keeps its reserve
-        if dry_run or not release_reserve(store):
+        # A store of another format is refused for that, and keeps its reserve.
+        if dry_run or not can_be_read(store / "store.sqlite3") or not release_reserve(store):
             raise
         try:
             garbage = collect()  # the disk was full

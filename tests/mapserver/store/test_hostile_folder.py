@@ -233,12 +233,20 @@ run("gc", "--keep-versions", "0", "--keep-days", "0", "--keep-drafts", "0")
 """
 
 
-@pytest.mark.parametrize("reserve", ["with reserve", "without"])
-def test_a_full_disk_can_be_read_and_cleared(root: Path, reserve: str) -> None:
-    """A process of its own, because what it does to `os` and SQLite cannot be undone."""
+@pytest.mark.parametrize(
+    ("reserve", "is_killed"), [("with reserve", False), ("with reserve", True), ("without", False)]
+)
+def test_a_full_disk_can_be_read_and_cleared(root: Path, reserve: str, is_killed: bool) -> None:
+    """A process of its own, because what it does to `os` and SQLite cannot be undone. A server that was killed leaves its log, which
+    nobody reads without writing: the store is cleared all the same."""
     with MapStore.open(root) as store:
         save_sample_draft(store, seed=5)
         publish_samples(store, 1)
+        log = (root / "store.sqlite3-wal").read_bytes()
+        database = (root / "store.sqlite3").read_bytes()
+    if is_killed:
+        (root / "store.sqlite3").write_bytes(database)
+        (root / "store.sqlite3-wal").write_bytes(log)
     files = len([path for path in (root / "blobs").rglob("*") if path.is_file()])
     paths = ":".join([str(TESTS), *sys.path])
     done = subprocess.run(
@@ -253,12 +261,9 @@ def test_a_full_disk_can_be_read_and_cleared(root: Path, reserve: str) -> None:
         for line in done.stdout.splitlines()
         if line.split()[0] in {"versions", "inspect", "diff", "gc"} and len(line.split()) == 2
     )
-    assert {name: statuses[name] for name in ("versions", "inspect", "diff")} == {
-        "versions": "0",
-        "inspect": "0",
-        "diff": "0",
-    }, done.stderr
-    assert "verify 0" in done.stdout
+    if not is_killed:
+        assert [statuses[name] for name in ("versions", "inspect", "diff")] == ["0", "0", "0"], done.stderr
+        assert "verify 0" in done.stdout
     left = len([path for path in (root / "blobs").rglob("*") if path.is_file()])
     if reserve == "with reserve":
         assert statuses["gc"] == "0", done.stderr

@@ -5,6 +5,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fleetmap.mapformat import blob_path, current_path, decode_tile, sha256_hex
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore, map_store, queries, schema
 from mapserver.store.schema import FORMAT
-from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
 
 
 @pytest.fixture
@@ -240,6 +241,17 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(store: MapStore, tm
     monkeypatch.undo()
     assert not list((tmp_path / "store").rglob("*.tmp"))
     assert store.sites() == []
+
+
+def test_what_a_killed_writer_left_goes_after_a_day(store: MapStore, tmp_path: Path) -> None:
+    publish_samples(store, 1)
+    current = tmp_path / "store" / current_path("lab")
+    old, new = (current.with_name(f".current.{mark * 16}.tmp") for mark in "ab")
+    for path, age_s in ((old, 2 * 86_400), (new, 60)):
+        path.write_bytes(b"half")
+        os.utime(path, (time.time() - age_s,) * 2)
+    publish_samples(store, 1)
+    assert (old.exists(), new.exists()) == (False, True)
 
 
 def test_the_table_names_every_served_kind_of_a_version() -> None:
