@@ -88,7 +88,7 @@ def record(night: int, run: str, seed: int = SEED) -> str:
     day = night if run != "robot" else night + 1
     try:
         order = Order(SCENARIO, seed=seed, day=day, light=light, robot=f"{run}-{night}")
-        record_order(order, path.with_suffix(".part"), "mcap")
+        record_order(order, path.with_suffix(".part"))
     finally:
         del SCENARIOS[SCENARIO]
     path.with_suffix(".part").rename(path)

@@ -3,29 +3,76 @@
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
+from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import chi2
 
-from studies.robot_days import rendered
-from studies.robot_days.closeness import KINDS
-from studies.robot_days.configurations import CONFIGURATIONS, FULL
-from studies.robot_days.drives import is_restart, row_of
-from studies.robot_days.rates import DayRate, Stratum, combined, day_rate
+from studies.robot_days.drives import CONFIGURATIONS, FULL, row_of
 from studies.robot_days.situations import SITUATIONS
-from studies.robot_days.tails import TailStratum
 from studies.study import Column, Row, publish, results, table
 
-_BESIDE = "with pictures and without: "
 SEED = 163  # of the site
-EXTRAPOLATED = f"{FULL}, extrapolated"
-_ROUNDS, _ABLATED, _ABLATED_SHORT = (
-    8,
+_ROUNDS = 8
+_ABLATED, _ABLATED_SHORT, _SHORT_M = (
     1,
     6,
+    60.0,
 )  # drives of each situation under every other configuration, of short ones more
-_SHORT_M = 60.0
+_LEVEL = 0.95
+
+
+class Stratum(NamedTuple):
+    """What was simulated of one situation.
+
+    per_day: hours or events of it in a robot-day. exposure: hours or events that were simulated, in the same unit. failures: those of
+    each drive.
+    """
+
+    per_day: float
+    exposure: float
+    failures: tuple[int, ...]
+
+    @property
+    def weight(self) -> float:
+        """Robot-days' worth of one failure: what one that was seen adds to the rate."""
+        return self.per_day / self.exposure
+
+
+class DayRate(NamedTuple):
+    """Failures per robot-day with the interval that holds the true rate with 95 %.
+
+    robot_days: of a plain simulation of whole robot-days whose rate would be as uncertain. least_days: of the situation that was
+    simulated least, which bounds what no failure at all may be taken to mean.
+    """
+
+    rate: float
+    low: float
+    high: float
+    robot_days: float
+    least_days: float
+
+
+def day_rate(strata: Sequence[Stratum]) -> DayRate:
+    """Weighted sum of the strata's failures, with the gamma interval of Fay and Feuer 1997.
+
+    A stratum without failures widens the upper end through the largest weight: where nothing failed at all, the end is 3.0 of it, the
+    rule of three. Failures of one drive are counted as one event of their number (compound Poisson), since they may have one cause.
+    """
+    rate = sum(s.weight * sum(s.failures) for s in strata)
+    variance = sum(s.weight**2 * sum(n * n for n in s.failures) for s in strata)
+    largest = max(s.weight for s in strata)
+    tail = (1 - _LEVEL) / 2
+    if rate == 0.0:
+        high = largest / 2 * float(chi2.ppf(_LEVEL, 2))
+        return DayRate(0.0, 0.0, high, 1 / largest, 1 / largest)
+    low = variance / (2 * rate) * float(chi2.ppf(tail, 2 * rate**2 / variance))
+    wider, above = variance + largest**2, rate + largest
+    high = wider / (2 * above) * float(chi2.ppf(1 - tail, 2 * above**2 / wider))
+    return DayRate(rate, low, high, rate / variance, 1 / largest)
 
 
 def cases() -> dict[str, partial[Row]]:
@@ -42,27 +89,18 @@ def cases() -> dict[str, partial[Row]]:
             for name in [name for name in CONFIGURATIONS if _is_ablated(situation, number, name)]:
                 one = partial(row_of, situation, SEED, number, CONFIGURATIONS[name])
                 out[f"{situation}, {number}: {name}"] = one
-        if round_number == 0:
-            out |= {f"{_BESIDE}{name}": partial(rendered.row_of, name) for name in rendered.RENDERED}
     return out
 
 
 def _is_ablated(situation: str, number: int, name: str) -> bool:
     """Whether another configuration than the whole system drives it."""
     is_short = SITUATIONS[situation].length_m < _SHORT_M
-    return name != FULL and _has_own_drives(situation, name) and number < (_ABLATED_SHORT if is_short else _ABLATED)
-
-
-def _has_own_drives(situation: str, name: str) -> bool:
-    """Where a restart has lost the robot's map and nothing else is missing, all other drives are the whole system's."""
-    about = CONFIGURATIONS[name]
-    return about.has_shared_map or not about.has_imu or is_restart(situation)
+    return name != FULL and number < (_ABLATED_SHORT if is_short else _ABLATED)
 
 
 def own(rows: list[Row], situation: str, name: str) -> list[Row]:
     """The drives of a situation under a configuration."""
-    driven = name if _has_own_drives(situation, name) else FULL
-    return [r for r in rows if r.get("situation") == situation and r["case"].endswith(f": {driven}")]
+    return [row for row in rows if row["situation"] == situation and row["case"].endswith(f": {name}")]
 
 
 def strata(rows: list[Row], name: str, count: str) -> dict[str, Stratum]:
@@ -74,17 +112,6 @@ def strata(rows: list[Row], name: str, count: str) -> dict[str, Stratum]:
             exposure = sum(row["exposure"] for row in drives)
             out[situation] = Stratum(about.per_day, exposure, tuple(row[count] for row in drives))
     return out
-
-
-def extrapolated(rows: list[Row], count: str) -> DayRate:
-    """The whole system's rate; where a drive that began at a dock never failed, by how near it came."""
-    found = strata(rows, FULL, count)
-    modelled = [s for s, stratum in found.items() if not sum(stratum.failures) and not is_restart(s)]
-    tails = [
-        [TailStratum(found[s].weight, [np.array(row[kind].split(), float) for row in own(rows, s, FULL)]) for s in modelled]
-        for kind in (KINDS if count == "failures" else KINDS[:1])
-    ]  # fmt: skip
-    return combined([stratum for s, stratum in found.items() if s not in modelled], tails, SEED)
 
 
 def written(rate: DayRate) -> str:
@@ -105,55 +132,31 @@ def configuration_row(rows: list[Row], name: str) -> Row:
     }  # fmt: skip
 
 
-def extrapolated_row(rows: list[Row]) -> Row:
-    """The whole system's rates with what its drives came near to."""
-    failures, silent = extrapolated(rows, "failures"), extrapolated(rows, "silent")
-    return {
-        "name": EXTRAPOLATED, "failures": written(failures), "silent": written(silent), "robot_days": failures.robot_days,
-        "causes": "", "rate": failures,
-    }  # fmt: skip
-
-
 def situation_rows(rows: list[Row]) -> list[Row]:
-    """What the whole system did in each situation, and the nearest that it came to a failure in each way."""
+    """What the whole system did in each situation."""
     out = []
     for situation, stratum in strata(rows, FULL, "failures").items():
         about, rate, drives = SITUATIONS[situation], day_rate([stratum]), own(rows, situation, FULL)
         p99 = [r["p99_mm"] for r in drives if r["p99_mm"] is not None]
-        nearest = {kind: max((float(v) for r in drives for v in r[kind].split()), default=0.0) for kind in KINDS}
         out.append({
             "name": situation, "per_day": f"{about.per_day:g} {'h' if about.kind == 'hours' else ''}".strip(),
             "source": about.source, "simulated": f"{stratum.exposure:.3g}", "failures": sum(stratum.failures),
             "silent": sum(strata(rows, FULL, "silent")[situation].failures), "rate": written(rate),
             "p99": max(p99) if p99 else None,
-        } | nearest)  # fmt: skip
+        })  # fmt: skip
     return out
 
 
-def beside_rows(rows: list[Row]) -> list[Row]:
-    """Rendered runs beside those without pictures, one above the other."""
-    return [
-        {
-            "name": f"{row['situation']}, {kind}",
-            **{k.removeprefix(f"{kind}_"): v for k, v in row.items() if k.startswith(kind)},
-        }
-        for row in rows
-        if row["case"].startswith(_BESIDE)
-        for kind in ("pictures", "landmarks")
-    ]
-
-
 def draw(found: list[Row]) -> Figure:
-    """Rates with their intervals on a logarithmic axis; from what was counted alone, but for the first one."""
+    """Rates with their intervals on a logarithmic axis."""
     figure = Figure(figsize=(9, 0.55 * len(found) + 1.4), layout="constrained")
     axes = figure.subplots()
     for place, row in enumerate(found[::-1]):
         rate: DayRate = row["rate"]
         low = max(rate.low, 1e-4)
-        is_whole = row["name"] in (FULL, EXTRAPOLATED)
         axes.plot([low, rate.high], [place, place], color="#9ca3af", linewidth=5, solid_capstyle="butt")
         if rate.rate > 0:
-            axes.plot(rate.rate, place, "o", color="#14924b" if is_whole else "#d1342f", markersize=7)
+            axes.plot(rate.rate, place, "o", color="#14924b" if row["name"] == FULL else "#d1342f", markersize=7)
     axes.axvline(0.02, color="#14924b", linestyle="--", linewidth=1, label="the target: at most 0.02")
     axes.set_yticks(np.arange(len(found)), [row["name"] for row in found[::-1]])
     axes.set_xscale("log")
@@ -165,9 +168,9 @@ def draw(found: list[Row]) -> Figure:
 
 def main() -> None:
     """Rows, tables and picture of docs/studies/warehouse.md."""
-    rows = results("warehouse", cases(), [SEED, rendered.SEED])
+    rows = results("warehouse", cases(), [SEED])
     driven = [name for name in CONFIGURATIONS if strata(rows, name, "failures")]
-    found = [extrapolated_row(rows), *(configuration_row(rows, name) for name in driven)]
+    found = [configuration_row(rows, name) for name in driven]
     shown = [
         Column("name", "configuration"), Column("situations", "situations"), Column("failures", "failures per robot-day"),
         Column("silent", "silent ones"),
@@ -177,14 +180,9 @@ def main() -> None:
     parts = [
         Column("name", "situation"), Column("per_day", "in a robot-day"), Column("source", "source"), Column("simulated", "simulated"),
         Column("failures", "failures"), Column("silent", "silent"), Column("rate", "per robot-day"),
-        Column("p99", "p99 error, mm", "{:.0f}"), *(Column(kind, f"nearest: {kind}", "{:.2f}") for kind in KINDS),
+        Column("p99", "p99 error, mm", "{:.0f}"),
     ]  # fmt: skip
-    beside = [
-        Column("name", "drive"), Column("tracking", "TRACKING", "{:.0%}"), Column("fixes", "fixes"), Column("inliers", "inliers of a fix"),
-        Column("median_mm", "median error, mm"), Column("p95_mm", "p95"), Column("failures", "failures"),
-    ]  # fmt: skip
-    tables = [table(found, shown), table(situation_rows(rows), parts), table(beside_rows(rows), beside)]
-    publish("warehouse", tables, draw(found))
+    publish("warehouse", [table(found, shown), table(situation_rows(rows), parts)], draw(found))
 
 
 if __name__ == "__main__":

@@ -151,7 +151,7 @@ def recorded(shot: Shot, work: Path) -> Path:
 
         SCENARIOS[f"{site.scenario}-half"] = make
         order = Order(f"{site.scenario}-half", site.seed, shot.day, shot.light, shot.robot, frames=_FRAMES)
-        record_order(order, path.with_suffix(".part"), "mcap")
+        record_order(order, path.with_suffix(".part"))
         path.with_suffix(".part").rename(path)
     return path
 

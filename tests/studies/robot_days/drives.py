@@ -3,22 +3,21 @@
 import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import inf
 
+import msgspec
 import numpy as np
 
 from benchmarks.common import estimator_loop
-from benchmarks.robot.aliased_starts import RememberingSession, prior_at
+from benchmarks.robot.aliased_starts import WHOLE_SITE, RememberingSession, prior_at
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.sensors.samples import ImuSamples, PositionPrior
 from locclient.localization.estimate import Estimate
+from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_metrics import FrameRecord
-from studies.robot_days import own_map
-from studies.robot_days.closeness import KINDS, Blocks, closeness
-from studies.robot_days.configurations import Configuration
-from studies.robot_days.site import LAYOUT, Trip, driven, surveyed_site
+from studies.robot_days.site import LAYOUT, Trip, driven, surveyed_view
 from studies.robot_days.situations import SITUATIONS, Prior
-from studies.robot_days.ungated_map import ungated_view
 
 _DOCK_SIGMA_M, _TOLD_SIGMA_M = 0.05, 0.5
 _SILENT_S = 1.0
@@ -26,15 +25,40 @@ _COUNTED_S = 3.0  # an event that begins later than so long before the end is no
 
 
 @dataclass(frozen=True, slots=True)
+class Configuration:
+    """The whole system but for what is taken away. day: nights since the survey on every trip, None for each trip's own."""
+
+    settings: LocalizerSettings = WHOLE_SITE
+    has_imu: bool = True
+    day: int | None = None
+
+
+def _tracks(**changes: float) -> LocalizerSettings:
+    return msgspec.structs.replace(WHOLE_SITE, track=msgspec.structs.replace(WHOLE_SITE.track, **changes))
+
+
+_TAKES_BEST = {
+    "competitor_share": inf, "competitor_recall_share": inf, "strong_alias_share": inf, "confirming_fixes": 1, "confirming_distance_m": 0.0,
+}  # fmt: skip
+FULL = "the whole system"
+CONFIGURATIONS = {
+    FULL: Configuration(),
+    "no IMU, no wheels": Configuration(has_imu=False),
+    "map 7 nights old": Configuration(day=7),
+    "no AMBIGUOUS": Configuration(_tracks(**_TAKES_BEST)),
+    "no covariance gate": Configuration(_tracks(innovation_limit=inf)),
+}
+
+
+@dataclass(frozen=True, slots=True)
 class Drive:
-    """One drive's outcome. kinds: how many failures of each kind; one failure may be of two. blocks: how near it came to more."""
+    """One drive's outcome. kinds: how many failures of each kind; one failure may be of two."""
 
     hours: float
     failures: int
     silent: int
     kinds: dict[str, int]
     errors_m: Array
-    blocks: Blocks
 
 
 @lru_cache(maxsize=1)
@@ -63,22 +87,6 @@ def _without_imu(session: RememberingSession) -> RememberingSession:
     return blind
 
 
-def is_restart(situation: str) -> bool:
-    """Whether it begins, or goes on, where the robot does not know."""
-    return SITUATIONS[situation].prior != "dock" or situation.startswith("carried")
-
-
-def _estimates(
-    session: RememberingSession, situation: str, seed: int, prior: PositionPrior | None, configuration: Configuration
-) -> list[Estimate]:
-    seen = session if configuration.has_imu else _without_imu(session)
-    if is_restart(situation) and not configuration.has_shared_map:
-        return own_map.estimates(seen, prior)
-    view = ungated_view(seed) if configuration.survey == "ungated" else surveyed_site(seed).view
-    has_wheels = configuration.has_imu
-    return estimator_loop.run_localizer(seen, view, prior, has_wheels=has_wheels, settings=configuration.settings)
-
-
 def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]) -> Drive:
     """Failures of the estimates against the truth."""
     moved_m = np.linalg.norm(np.diff(map_from_body[:, :3, 3], axis=0, prepend=map_from_body[:1, :3, 3]), axis=1)
@@ -94,7 +102,7 @@ def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]
     kinds["blind"] = int(failures > 0 and not any(kinds.values())) * failures
     errors = np.array([f.error_m for f in frames if f.error_m is not None and f.status == "TRACKING"])
     hours = (stamps_ns[-1] - stamps_ns[0]) / 3.6e12
-    return Drive(hours, failures, kinds["silent"], kinds, errors, closeness(frames))
+    return Drive(hours, failures, kinds["silent"], kinds, errors)
 
 
 def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
@@ -111,13 +119,15 @@ def _record(estimate: Estimate, truth: Array, speed_mps: float) -> FrameRecord:
 def row_of(situation: str, seed: int, number: int, configuration: Configuration) -> dict[str, object]:
     """A situation's drive of that number under a configuration, as it is kept; equal arguments give equal rows.
 
-    exposure: hours, or events where the situation has some. The figures of `closeness` are kept to three digits.
+    exposure: hours, or events where the situation has some.
     """
     about = SITUATIONS[situation]
     day = configuration.day or about.day(number)
     trip, session = _session(situation, seed, number, day)
     prior = _prior(session, about.prior, np.random.default_rng([seed, 7004, number]))
-    estimates = _estimates(session, situation, seed, prior, configuration)
+    seen = session if configuration.has_imu else _without_imu(session)
+    view, has_wheels = surveyed_view(seed), configuration.has_imu
+    estimates = estimator_loop.run_localizer(seen, view, prior, has_wheels=has_wheels, settings=configuration.settings)
     found = judged(estimates, session.map_from_body, session.stamps_ns)
     events = len(trip.movers) or sum(fault.start_s < 3600 * found.hours - _COUNTED_S for fault in trip.faults) or 1
     hours = round(found.hours, 5)
@@ -127,4 +137,4 @@ def row_of(situation: str, seed: int, number: int, configuration: Configuration)
         "failures": found.failures, "silent": found.silent,
         "kinds": ", ".join(f"{kind} {count}" for kind, count in found.kinds.items() if count),
         "p99_mm": round(1e3 * float(np.percentile(found.errors_m, 99)), 1) if len(found.errors_m) else None,
-    } | {kind: " ".join(f"{value:.3g}" for value in values) for kind, values in zip(KINDS, found.blocks, strict=True)}  # fmt: skip
+    }  # fmt: skip

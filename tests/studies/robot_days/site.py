@@ -8,7 +8,6 @@ import numpy as np
 
 from benchmarks.common import estimator_loop
 from benchmarks.robot.aliased_starts import RememberingSession, within_budget
-from fleetmap.mapformat import Tile
 from fleetmap.relocalization.map_view import MapView
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
@@ -97,17 +96,6 @@ def random_route(rng: np.random.Generator, length_m: float, stop_s: float = 0.0)
     return Route(tuple(points), stops)
 
 
-@dataclass(frozen=True, slots=True)
-class SurveyedSite:
-    """The map that robots get of a survey on day 0, when every aisle looks like every other: `tile`, made by a camera of
-    focal_px, and as a robot holds it in memory."""
-
-    seed: int
-    tile: Tile
-    focal_px: float
-    view: MapView
-
-
 def prepared(seed: int, day: int, name: str, run: Run, movers: tuple[Mover, ...] = ()) -> Session:
     """A run ready but for pictures, of which there are none; motion's ripple and the sensors' errors follow from the name."""
     scenario = Scenario("a block of the fulfilment centre", LAYOUT, {name: run}, movers)
@@ -118,15 +106,17 @@ def prepared(seed: int, day: int, name: str, run: Run, movers: tuple[Mover, ...]
 
 
 @lru_cache(maxsize=1)
-def surveyed_site(seed: int) -> SurveyedSite:
-    """Minutes of CPU; true places with an error of 10 mm to each landmark, and no more landmarks than `mapserver` publishes."""
+def surveyed_view(seed: int) -> MapView:
+    """The map that robots get of a survey on day 0, when every aisle looks like every other.
+
+    Minutes of CPU; true places with an error of 10 mm to each landmark, and no more landmarks than `mapserver` publishes.
+    """
     run = Run("surveyor", (survey_route(),), rate_hz=_SURVEY_RATE_HZ, is_sharp=True)
     survey = EstimatorSession(prepared(seed, 0, "survey", run))
     rng = np.random.default_rng(seed)
     (tile,), vocabulary = estimator_loop.survey_map(survey, rng, every_m=_PLACE_EVERY_M)
     tile = within_budget(tile, survey.camera, survey.body_from_cam)
-    focal_px = survey.camera.focal_px
-    return SurveyedSite(seed, tile, focal_px, MapView([tile], vocabulary, focal_px))
+    return MapView([tile], vocabulary, survey.camera.focal_px)
 
 
 @lru_cache(maxsize=2)
