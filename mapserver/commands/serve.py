@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 from collections.abc import AsyncIterator
-from contextlib import AbstractContextManager, asynccontextmanager, nullcontext, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from fleetmap.bus import Bus
-    from fleetmap.foxglove.server import FoxgloveServer
     from mapserver.api.guard import GuardSettings
     from mapserver.api.sign_in_proxy import SignInProxy
     from mapserver.config import MapserverConfig
@@ -40,7 +39,6 @@ _END_WITHIN_S = 5.0  # and what works on threads so long after that
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
 _WARN_EVERY_S = 86_400.0
-_VIEW_EVERY_S = 0.5
 _LOOPBACK = frozenset({"127.0.0.1", "::1"})
 _INSECURE = (
     "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
@@ -51,7 +49,7 @@ _NO_TLS = "This server was started with --insecure. Passwords and sessions can b
 
 @dataclass(frozen=True, kw_only=True)
 class HttpOptions:
-    """Where HTTP is served, and by which names; and where viewers look at a site."""
+    """Where HTTP is served, and by which names."""
 
     http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
     http_cert: Annotated[
@@ -71,37 +69,6 @@ class HttpOptions:
         bool,
         typer.Option("--insecure", help="Serve other machines without TLS and operators, and say so on every page."),
     ] = False
-
-    foxglove: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="Show a site in Foxglove there; nobody signs in.")
-    ] = None
-    foxglove_site: Annotated[
-        str | None, typer.Option(metavar="NAME", help="The site that --foxglove shows, where there are several.")
-    ] = None
-
-    def viewers(self) -> "AbstractContextManager[FoxgloveServer | None]":
-        """The server of viewers, None without one; UsageError as `viewer_address`, `require_foxglove` and `FoxgloveServer`."""
-        from fleetmap.foxglove import require_foxglove, viewer_address
-        from fleetmap.mapformat import check_name
-
-        if self.foxglove_site is not None:
-            check_name(self.foxglove_site, "site")
-            if self.foxglove is None:
-                raise UsageError("--foxglove-site needs --foxglove PORT; give both")
-        if self.foxglove is None:
-            return nullcontext()
-        address = viewer_address(self.foxglove, insecure=self.insecure)
-        require_foxglove("--foxglove")
-        from fleetmap.foxglove.server import FoxgloveServer
-
-        return FoxgloveServer(address, "fleetmap")
-
-    def viewed_site(self, store: "MapStore") -> str:
-        """The site that viewers see; UsageError where none is named and there is not one alone."""
-        sites = [info.site for info in store.sites()]
-        if self.foxglove_site is None and len(sites) != 1:
-            raise UsageError(f"--foxglove shows one site and the store has {len(sites)}; name it with --foxglove-site")
-        return self.foxglove_site or sites[0]
 
     def host_and_port(self) -> tuple[str, int]:
         """Where to listen; UsageError for what is no address."""
@@ -185,12 +152,7 @@ def serve(
     certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
     # The sockets come before the store is read, so that a wrong address is reported at once.
     proxies = (_LOOPBACK if at.http_name else frozenset()) | (proxy.addresses if proxy else frozenset())
-    with (
-        _listening(host, port, proxies) as listener,
-        at.viewers() as viewers,
-        open_store(store) as maps,
-    ):
-        viewed_site = "" if viewers is None else at.viewed_site(maps)
+    with _listening(host, port, proxies) as listener, open_store(store) as maps:
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)
@@ -204,8 +166,6 @@ def serve(
                 guard=guard,
                 certificate=certificate,
                 proxies=proxies,
-                viewers=viewers,
-                viewed_site=viewed_site,
             )
     _end_process()
 
@@ -229,8 +189,6 @@ def _run(
     guard: "GuardSettings",
     certificate: "HttpCertificate | None",
     proxies: frozenset[str],
-    viewers: "FoxgloveServer | None",
-    viewed_site: str,
 ) -> None:
     import uvicorn
     from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
@@ -246,13 +204,11 @@ def _run(
     from mapserver.serving.background_tasks import (
         BackgroundTask,
         admission_tasks,
-        alert_tasks,
         run_background_tasks,
         server_tasks,
     )
     from mapserver.serving.bus_service import BusService
     from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
-    from mapserver.serving.webhook import Webhook
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
@@ -261,7 +217,6 @@ def _run(
         logging.getLogger(__name__).warning("%s", guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
-    webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
 
@@ -269,19 +224,13 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        groups = [tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook)]
-        if viewers is not None:  # apart from the others: no robot waits for a viewer
-            from mapserver.serving.fleet_viewer import FleetViewer
-
-            viewer = FleetViewer(maps, fleet, bus_service.surveys, viewed_site, viewers)
-            groups.append([BackgroundTask("showing the site to viewers", _VIEW_EVERY_S, viewer.look)])
-        background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
+        background = [
+            asyncio.create_task(run_background_tasks(some)) for some in (tasks, admission_tasks(robots, fleet))
+        ]
         background.append(asyncio.create_task(listener.watch(server.server_state.connections)))
         host, port = listener.getsockname()[:2]
         typer.echo(f"http: {'https' if certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
         typer.echo(f"zenoh: {bus.endpoint}")
-        if viewers is not None:
-            typer.echo(f"foxglove: {viewers.url}")
         typer.echo("ready")
         yield
         for task in background:
@@ -328,8 +277,6 @@ def _run(
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
             server.run(sockets=[listener])
     finally:
-        if webhook is not None:
-            webhook.close()
         bus_service.close()
         fleet.flush()
 

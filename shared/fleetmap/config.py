@@ -34,7 +34,8 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     "output.map": '`map_topic = ""` leaves /map to nav2\'s map_server, which shows files; delete the key',
     "output.is_map_server": "nav2's map_server loads files; delete the key",
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},
-    "foxglove": "`locclient replay --mcap FILE` writes the run, which Foxglove opens; delete the key",
+    "foxglove": "`locclient replay --mcap FILE` writes a run, which Foxglove opens, and the dashboard shows a site; delete the key",
+    "foxglove_site": "the dashboard shows every site, its robots and surveys, live; delete the key",
     "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
     "spool": "it is called `outbox` now",
     "spool_bytes": "it is called `outbox_bytes` now",
@@ -44,6 +45,8 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     "add": "`mapserver trust rotate root --stick DIR` makes another root key",
     **dict.fromkeys(("signer", "keys", "adopt"), "the account that serves also builds and signs; delete the key"),
     **dict.fromkeys(("with_trust", "root"), "an imported version is a draft that you judge; delete the key"),
+    "alerts": "Prometheus and its Alertmanager tell a webhook by deploy/prometheus-alerts.yml; delete the section",
+    "format": "the simulator writes MCAP, which every reader takes",
     "images": "the simulator stores pictures as PNG, without loss",
     "witness": "`mapserver audit --verify` checks the log by itself; delete the key",
     **{

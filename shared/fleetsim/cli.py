@@ -32,7 +32,7 @@ def scenarios() -> None:
 @app.command(cls=RetiringCommand)
 def record(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")],
-    out: Annotated[Path, Option(help="File to write (.mcap), or folder for --format euroc.")],
+    out: Annotated[Path, Option(help="File to write (.mcap).")],
     seed: Annotated[int, Option(help="Everything random follows from it: the site, its stock, noise, motion.")] = 0,
     day: Annotated[int, Option(help="Day of the site's life: stock moves from day to day.")] = 0,
     light: Annotated[str, Option(help="day, evening or night.")] = "day",
@@ -56,12 +56,9 @@ def record(
     camera_pipeline: Annotated[
         str, Option(metavar="NAME", help="What lens, sensor and codec make of the pictures: clean, soft, phone, ...")
     ] = "clean",
-    format_: Annotated[str, Option("--format", help="mcap or euroc.")] = "mcap",
     force: Annotated[bool, Option("--force", help="Write over an existing file.")] = False,
 ) -> None:
     """Records one robot's run: pictures, IMU, wheels, position priors, exact ground truth."""
-    if format_ not in ("mcap", "euroc"):
-        raise UsageError(f"unknown format {format_!r}; there are mcap and euroc")
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.recorder import Order
@@ -74,7 +71,7 @@ def record(
     )  # fmt: skip
     from fleetsim.commands import record_order
 
-    typer.echo(record_order(order, out, format_))
+    typer.echo(record_order(order, out))
 
 
 def _size_px(text: str | None) -> tuple[int, int] | None:

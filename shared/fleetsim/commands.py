@@ -11,7 +11,6 @@ from fleetmap.console import plain_console
 from fleetmap.recordings.images import StoredFrame, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.euroc_writer import EurocRecordingWriter
 from fleetsim.recorder import Order, Session, prepare, write_session
 
 
@@ -21,10 +20,10 @@ def _progress() -> Progress:
 
 
 def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Session:
-    """Builds the site and takes one picture, so that compiling (once per machine, half a minute) has its own line."""
+    """Builds the site and takes one picture, so that lighting it has its own line."""
     task = progress.add_task("building the warehouse", total=2)
     session = prepare(order, workers)
-    progress.update(task, advance=1, description="lighting it, compiling the painter (first time only)")
+    progress.update(task, advance=1, description="lighting it")
     session.renderer.shoot(session.frame_times_s[0])
     progress.update(task, advance=1, description="warehouse ready")
     return session
@@ -41,8 +40,8 @@ class _PngWriter(McapRecordingWriter):
         super().write_frame(frame)
 
 
-def record_order(order: Order, out: Path, format_: str) -> str:
-    """Records to `out`; a line with the amount and the time. format_: mcap or euroc."""
+def record_order(order: Order, out: Path) -> str:
+    """Records to `out`; a line with the amount and the time."""
     started = time.monotonic()
     with _progress() as progress, ThreadPoolExecutor(2) as workers:
         session = _ready(order, progress, workers)
@@ -50,13 +49,8 @@ def record_order(order: Order, out: Path, format_: str) -> str:
         task = progress.add_task(f"recording {order.scenario}", total=count)
         name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"
         try:
-            if format_ == "euroc":
-                folder = EurocRecordingWriter(out, session.nominal)
-                write_session(session, folder, lambda done: progress.update(task, completed=done))
-                folder.close()
-            else:
-                with _PngWriter(out, session.nominal, name=name) as writer:
-                    write_session(session, writer, lambda done: progress.update(task, completed=done))
+            with _PngWriter(out, session.nominal, name=name) as writer:
+                write_session(session, writer, lambda done: progress.update(task, completed=done))
         finally:
             session.renderer.close()
     path_m = float(np.linalg.norm(np.diff(session.truth.positions_m, axis=0), axis=1).sum())

@@ -12,7 +12,6 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
-from fleetsim.euroc_writer import EurocRecordingWriter
 from fleetsim.imaging.pipelines import find_pipeline, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
@@ -27,7 +26,6 @@ from fleetsim.sensors.measurements import measure_imu, measure_priors, measure_w
 from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
-Writer = McapRecordingWriter | EurocRecordingWriter
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +150,7 @@ def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajecto
 
 def write_session(
     session: Session,
-    writer: Writer,
+    writer: McapRecordingWriter,
     on_frame: Callable[[int], None] = lambda done: None,
 ) -> None:
     """Writes everything in the order of time, a frame's worth at a time."""
@@ -165,7 +163,7 @@ def write_session(
     _write_between(session, writer, start_ns, 1 << 62)
 
 
-def _write_between(session: Session, writer: Writer, start_ns: int, end_ns: int) -> None:
+def _write_between(session: Session, writer: McapRecordingWriter, start_ns: int, end_ns: int) -> None:
     """Writes the samples with start <= stamp < end."""
     truth = session.truth
     first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])

@@ -44,7 +44,7 @@ def run_notebook(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> di
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with survey.mcap and, made by `build_a_map.py`, the published map of the site `lab` in `maps`."""
     folder = tmp_path_factory.mktemp("examples")
-    record_order(Order("clip", frames=45), folder / "survey.mcap", "mcap")
+    record_order(Order("clip", frames=45), folder / "survey.mcap")
     said = run("build_a_map", folder, "survey.mcap", "maps", "lab", "map.png", "known-rig")
     assert "45 frames over" in said
     assert "version 1: " in said

@@ -114,12 +114,11 @@ class Shown(NamedTuple):
 
 
 class RobotMark(NamedTuple):
-    """A robot, or a place where it may be: map_from_base (4, 4), a Status by name; is_silent: nothing was heard of it lately."""
+    """A robot, or a place where it may be: map_from_base (4, 4), a Status by name."""
 
     name: str
     map_from_base: Array
     status: str
-    is_silent: bool = False
 
 
 def encoding_of(schema: Schema) -> str:
@@ -198,7 +197,7 @@ def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", fr
     """All robots as arrows with words, in the place of those that were shown before."""
     entities = []
     for mark in marks:
-        colour, above = _QUIET if mark.is_silent else _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
+        colour, above = _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
         above[2, 3] += 0.6
         arrow = ArrowPrimitive(
             pose=_located(mark.map_from_base),
@@ -208,9 +207,13 @@ def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", fr
             head_diameter=0.35,
             color=_colour(colour),
         )
-        words = f"{mark.name}: {mark.status}{', silent' if mark.is_silent else ''}"
         text = TextPrimitive(
-            pose=_located(above), billboard=True, font_size=14, scale_invariant=True, color=_colour(colour), text=words
+            pose=_located(above),
+            billboard=True,
+            font_size=14,
+            scale_invariant=True,
+            color=_colour(colour),
+            text=f"{mark.name}: {mark.status}",
         )
         entities.append(_entity(stamp_ns, frame, mark.name, arrows=[arrow], texts=[text]))
     return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, entities))

@@ -77,12 +77,12 @@ def test_frames_and_robots_stand_where_they_are() -> None:
     np.testing.assert_allclose(xyz(link.translation), TURNED[:3, 3])
     turn = np.array([link.rotation.w, link.rotation.x, link.rotation.y, link.rotation.z])
     np.testing.assert_allclose(rotation_from_quat_wxyz(turn), TURNED[:3, :3], atol=1e-12)
-    marks = [RobotMark("a", TURNED, "TRACKING"), RobotMark("b", np.eye(4), "LOST", is_silent=True)]
+    marks = [RobotMark("a", TURNED, "TRACKING"), RobotMark("b", np.eye(4), "LOST")]
     scene = decoded(channels.robots(STAMP_NS, marks))
     assert [deletion.type for deletion in scene.deletions] == [1], "those of before go"
     assert [(entity.id, entity.frame_id) for entity in scene.entities] == [("a", "map"), ("b", "map")]
     np.testing.assert_allclose(matrix(scene.entities[0].arrows[0].pose), TURNED, atol=1e-12)
-    assert [entity.texts[0].text for entity in scene.entities] == ["a: TRACKING", "b: LOST, silent"]
+    assert [entity.texts[0].text for entity in scene.entities] == ["a: TRACKING", "b: LOST"]
     np.testing.assert_allclose(matrix(decoded(channels.place("/fixes", STAMP_NS, TURNED)).pose), TURNED, atol=1e-12)
 
 

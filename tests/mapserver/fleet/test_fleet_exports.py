@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
@@ -198,11 +199,15 @@ def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path
         assert frame.data.startswith(b"\xff\xd8")
 
 
-def test_the_grafana_dashboard_asks_for_metrics_that_exist(tmp_path: Path) -> None:
+def test_what_is_deployed_asks_for_metrics_that_exist(tmp_path: Path) -> None:
     from mapserver.api.metrics import Metrics
 
-    dashboard = Path(__file__).parents[3] / "deploy" / "grafana-dashboard.json"
-    queries = [target["expr"] for panel in json.loads(dashboard.read_text())["panels"] for target in panel["targets"]]
+    deploy = Path(__file__).parents[3] / "deploy"
+    panels = json.loads((deploy / "grafana-dashboard.json").read_text())["panels"]
+    (group,) = yaml.safe_load((deploy / "prometheus-alerts.yml").read_text())["groups"]
+    assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in group["rules"])
+    queries = [target["expr"] for panel in panels for target in panel["targets"]]
+    queries += [rule["expr"] for rule in group["rules"]]
     run_made_site(tmp_path, start_ns=10**18, seconds=30)
     with MapStore.open(tmp_path) as store:
         text = Metrics(store, Fleet(store)).text().decode()
