@@ -150,25 +150,20 @@ def _opened_for_reading(path: Path) -> Database:
         ) from error
 
 
-def format_of(path: Path) -> int | None:
-    """The format of a store's database, None for one that is no store's; looks at nothing but its head, without SQLite."""
+def format_of(path: Path) -> int:
+    """The format of a store's database, 0 for one that is no store's; looks at nothing but its head, without SQLite."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            head = file.read(_HEAD_BYTES).ljust(_HEAD_BYTES, b"\0")
     except OSError:
-        return None
+        return 0
     number, application = (int.from_bytes(head[at : at + 4], "big") for at in (_FORMAT_AT, _APPLICATION_AT))
-    return number if len(head) == _HEAD_BYTES and application == APPLICATION_ID else None
+    return number if application == APPLICATION_ID else 0
 
 
 def is_older(path: Path) -> bool:
     """True if the database would be migrated by whoever opens it to write."""
-    return 0 < (format_of(path) or 0) < FORMAT
-
-
-def can_be_read(path: Path) -> bool:
-    """True unless the database is refused for its format, or is no store's."""
-    return LAST_UNNAMED <= (format_of(path) or 0) <= FORMAT
+    return 0 < format_of(path) < FORMAT
 
 
 def _current(database: Database) -> Database:

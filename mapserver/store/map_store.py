@@ -128,9 +128,6 @@ class MapStore(StoreQueries):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def save_draft(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> int:
-        return self.save(site, content, actor=actor).version
-
     def save(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> VersionInfo:
         """A new draft version of `site`, whole on the disk, as it was made and not as the database tells it afterwards.
 

@@ -39,7 +39,7 @@ def write_store(folder: Path) -> None:
             blobs = encode_surfels(surfels)
             said = {"grid": grid_report(grid, {}), "surfels": surfel_report(blobs, len(surfels), {})}
             details = draft_details(path_m=12.5, **{name: msgspec.to_builtins(value) for name, value in said.items()})
-            store.save_draft(
+            store.save(
                 "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed, grid=grid,
                 surfels=blobs, evidence=EVIDENCE if seed == 3 else None),
             )  # fmt: skip

@@ -31,8 +31,9 @@ def gc(
     Current versions, targets of a rollback and versions that robots run are always kept.
     """
     from mapserver.store import Retention
-    from mapserver.store.database import can_be_read
+    from mapserver.store.database import format_of
     from mapserver.store.files import keep_reserve, release_reserve
+    from mapserver.store.schema import FORMAT, LAST_UNNAMED
 
     retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
 
@@ -44,7 +45,8 @@ def gc(
         garbage = collect()
     except StoreError:
         # A store of another format is refused for that, and keeps its reserve.
-        if dry_run or not can_be_read(store / "store.sqlite3") or not release_reserve(store):
+        is_ours = LAST_UNNAMED <= format_of(store / "store.sqlite3") <= FORMAT
+        if dry_run or not is_ours or not release_reserve(store):
             raise
         try:
             garbage = collect()  # the disk was full

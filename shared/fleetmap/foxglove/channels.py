@@ -207,13 +207,9 @@ def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", fr
             head_diameter=0.35,
             color=_colour(colour),
         )
+        words = f"{mark.name}: {mark.status}"
         text = TextPrimitive(
-            pose=_located(above),
-            billboard=True,
-            font_size=14,
-            scale_invariant=True,
-            color=_colour(colour),
-            text=f"{mark.name}: {mark.status}",
+            pose=_located(above), billboard=True, font_size=14, scale_invariant=True, color=_colour(colour), text=words
         )
         entities.append(_entity(stamp_ns, frame, mark.name, arrows=[arrow], texts=[text]))
     return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, entities))

@@ -210,7 +210,7 @@ def main() -> None:
         tiles = [random_tile(rng, cell=(x, 0)) for x in range(_TILES)]
         content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=100.0))
         with MapStore.open(store, create=True) as maps:
-            maps.save_draft(SITE, content)
+            maps.save(SITE, content)
             releases.publish(maps, SITE)
         found = {"load": measure_load(store, options.robots, options.seconds)}
         if options.month:

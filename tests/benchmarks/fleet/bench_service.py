@@ -50,7 +50,7 @@ def publish(folder: Path, tiles: list[Tile]) -> None:
     """Makes a version of these current, as another process than the server."""
     content = DraftContent(tiles=tiles, vocabulary=bytes(range(256)) * 4000, details=draft_details(path_m=1000.0))
     with MapStore.open(folder, create=True) as store:
-        store.save_draft(SITE, content)
+        store.save(SITE, content)
         releases.publish(store, SITE)
 
 

@@ -28,7 +28,7 @@ def row(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, MapSto
     rng = np.random.default_rng(0)
     with MapStore.open(folder, create=True) as store:
         tiles = [random_tile(rng, cell=(x, 0)) for x in range(10)]
-        store.save_draft(
+        store.save(
             "row", DraftContent(tiles=tiles, vocabulary=vocabulary(), details=draft_details(path_m=160.0), archive=b"a")
         )
         releases.publish(store, "row")

@@ -60,7 +60,7 @@ sys.argv = ["{package}", "--help"]
 def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)
-        maps.save_draft("empty", DraftContent(tiles=[], vocabulary=b"w", details=draft_details()))
+        maps.save("empty", DraftContent(tiles=[], vocabulary=b"w", details=draft_details()))
     to_store = ("--store", tmp_path / "store")
     assert status(monkeypatch, "versions", "--site", "lab", *to_store) == 0
     assert status(monkeypatch, "--help") == 0
@@ -87,7 +87,7 @@ def test_publishing_says_which_way_nobody_drove(
     with MapStore.open(tmp_path / "store", create=True) as maps:
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
-        maps.save_draft(
+        maps.save(
             "lab",
             DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen),
         )

@@ -117,7 +117,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
     rng = np.random.default_rng(0)
     with MapStore.open(tmp_path / "store", create=True) as store:
         tiles = [random_tile(rng, landmarks=5000, cell=(x, 0)) for x in range(6)]
-        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details()))
+        store.save("lab", DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details()))
         releases.publish(store, "lab")
     with ExitStack() as servers:
         process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))

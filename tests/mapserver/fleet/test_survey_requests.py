@@ -80,7 +80,7 @@ def test_a_published_survey_of_it_ends_it(store: MapStore) -> None:
     said = {half: 0.6, whole: 0.95, "ffffffff": 1.0, "x": "1"}
     details = draft_details(path_m=213.0, surveyed_requests=said)
     content = DraftContent(tiles=hall_tiles(1), vocabulary=b"words" * 50, details=details)
-    version = store.save_draft(SITE, content)
+    version = store.save(SITE, content).version
     assert {request.id for request in survey_requests(store, SITE)} == {half, whole}
     releases.publish(store, SITE, version)
     assert [request.id for request in survey_requests(store, SITE)] == [half]

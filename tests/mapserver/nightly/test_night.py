@@ -84,7 +84,7 @@ def built(
     options = request.options
     content = DraftContent(tiles=[tile], vocabulary=b"words", details=details, job=options.job)
     with MapStore.open(request.store) as maps:
-        version = maps.save_draft(request.site, content, actor=options.actor)
+        version = maps.save(request.site, content, actor=options.actor).version
     return Draft(version, f"draft {version}", {"keyframes": 2}, left_out), None
 
 

@@ -172,7 +172,7 @@ def test_what_cannot_be_tried_is_refused(world: World) -> None:
     with pytest.raises(StateError, match="no current version"):
         releases.start_canary(store, "empty", 1, 0.1)
     few = [random_tile(np.random.default_rng(1), landmarks=2, places=1)]
-    store.save_draft("lab", DraftContent(tiles=few, vocabulary=b"words" * 50, details=draft_details(path_m=1.0)))
+    store.save("lab", DraftContent(tiles=few, vocabulary=b"words" * 50, details=draft_details(path_m=1.0)))
     with pytest.raises(GateRefusedError):
         releases.start_canary(store, "lab", 3, 0.1)
 

@@ -66,7 +66,7 @@ def test_a_bad_version_is_not_gone_back_to(store: MapStore, tmp_path: Path) -> N
 def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
     publish_samples(store, 1)
     small = [random_tile(np.random.default_rng(3), landmarks=70, cell=(0, 0))]
-    store.save_draft("lab", DraftContent(tiles=small, vocabulary=b"words" * 50, details=draft_details()))
+    store.save("lab", DraftContent(tiles=small, vocabulary=b"words" * 50, details=draft_details()))
     with pytest.raises(GateRefusedError, match=r"coverage_share 0\.50 of version 1"):
         releases.publish(store, "lab", actor=ADA)
     with pytest.raises(UsageError, match="--reason"):
@@ -93,7 +93,7 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
     """A refused draft is refused in another store, too; the choice travels with the version, and is no second user's word."""
     report = {EVIDENCE_KEY: msgspec.to_builtins(STRAIGHT)}
     tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
-    store.save_draft(
+    store.save(
         "lab",
         DraftContent(tiles=tiles, vocabulary=b"w", details=draft_details(**report), archive=b"a", evidence=STRAIGHT),
     )
@@ -132,7 +132,7 @@ def test_an_import_with_damaged_evidence_is_refused(store: MapStore, tmp_path: P
         if key == TRUSTED_KEY:
             details = msgspec.structs.replace(details, configuration={TRUSTED_KEY: [{"rig": 4}]})
         tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
-        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"w", details=details))
+        store.save("lab", DraftContent(tiles=tiles, vocabulary=b"w", details=details))
         store.export_version("lab", number, tmp_path / "bad.fmex")
         with (
             MapStore.open(tmp_path / "other", create=True) as other,
@@ -160,7 +160,7 @@ def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(
 
 
 def test_hard_limits_are_not_forced(store: MapStore) -> None:
-    store.save_draft("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
+    store.save("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
     with pytest.raises(GateRefusedError, match="cannot be forced"):
         releases.publish(store, "lab", actor=ADA, force=True)
 
@@ -172,7 +172,7 @@ def test_a_difference_counts_tiles_landmarks_and_bytes(store: MapStore) -> None:
     shifted[:5, 2] += 0.5
     new = type(old)(**{name: getattr(old, name) for name in old.__dataclass_fields__} | {"points_map": shifted})
     for tiles, path_m in (([kept, old, gone], 10.0), ([kept, new, come], 11.0)):
-        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details(path_m=path_m)))
+        store.save("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details(path_m=path_m)))
     found = releases.difference(store, "lab", 1, 2)
     assert (found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept) == (1, 1, 1, 1)
     shared = np.intersect1d(gone.landmark_ids, come.landmark_ids)

@@ -79,7 +79,7 @@ def test_only_published_map_bytes_are_served(store: MapStore) -> None:
 def test_drafts_that_no_robot_could_use_are_refused(store: MapStore) -> None:
     empty = random_tile(np.random.default_rng(0), landmarks=0)
     for tiles in ([], [empty]):
-        store.save_draft("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details()))
+        store.save("lab", DraftContent(tiles=tiles, vocabulary=b"v", details=draft_details()))
         with pytest.raises(GateRefusedError, match="0 landmarks"):
             releases.publish(store, "lab")
     assert store.current("lab") is None

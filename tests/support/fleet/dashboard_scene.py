@@ -94,7 +94,7 @@ def fill_store(folder: Path) -> None:
                 "findings": {"monday": ["camera 1 is blurred in 3 % of the frames"] if number == 2 else []},
             }
             tiles = hall_tiles(1, shifted_m=shifted_m, length_m=LENGTH_M - (TILE_M if number == 1 else 0))
-            store.save_draft(SITE, DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(**report)))
+            store.save(SITE, DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(**report)))
             if number < 3:
                 releases.publish(store, SITE, number, actor=ada)
         done = store.begin_job(SITE, "nightly")

@@ -100,7 +100,7 @@ def save_sample_draft(
     rng = np.random.default_rng(seed)
     tiles = [random_tile(rng, cell=(1, 0)), random_tile(rng, cell=(0, 0))]
     content = DraftContent(tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive")
-    return store.save_draft(site, content, actor=actor)
+    return store.save(site, content, actor=actor).version
 
 
 def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfels: Surfels | None = None) -> int:
@@ -119,7 +119,7 @@ def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfel
     content = DraftContent(
         tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", grid=grid, surfels=blobs
     )
-    return store.save_draft(site, content)
+    return store.save(site, content).version
 
 
 def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Surfels:
@@ -146,7 +146,7 @@ def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -
     details = draft_details(path_m=12.5, surfels=msgspec.to_builtins(surfel_report(blobs, len(surfels), {})))
     tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
     content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", surfels=blobs)
-    return store.save_draft(site, content)
+    return store.save(site, content).version
 
 
 def publish_samples(store: MapStore, count: int) -> None:

@@ -64,7 +64,7 @@ class Scenario:
 def save(store: MapStore, seed: int) -> None:
     """A draft of two small tiles, one of which all drafts share."""
     tiles = [random_tile(np.random.default_rng(s), landmarks=6, places=1, cell=(s, 0)) for s in (0, seed)]
-    store.save_draft(
+    store.save(
         "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(), archive=b"archive" * seed)
     )
 

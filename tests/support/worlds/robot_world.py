@@ -174,7 +174,7 @@ def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = Non
         grid = encode_grid({(0, 0): cells})
     report = {"grid": msgspec.to_builtins(grid_report(grid, {}))} if has_grid else {}
     details = msgspec.structs.replace(draft_details(path_m=10.0, **report), tile_size_m=TILE_M, camera=entry)
-    number = store.save_draft(
+    number = store.save(
         site,
         DraftContent(
             tiles=list(tiles() if of is None else of),
@@ -183,7 +183,7 @@ def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = Non
             archive=b"archive",
             grid=grid,
         ),
-    )
+    ).version
     releases.publish(store, site)
     return number
 
