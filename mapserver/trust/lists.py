@@ -1,4 +1,4 @@
-"""The store's signed lists as files, as robots get them. Reads without tuf, because the server does so at every question.
+"""The store's signed lists as files, as robots get them.
 
 STORE/trust/1.root.json 2.root.json ...        which keys sign what; never removed, because robots follow them one by one
 STORE/trust/N.targets.json                     which keys sign the list of which site
@@ -9,54 +9,21 @@ STORE/trust/N.snapshot.json timestamp.json     which of these files are the pres
 import re
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from fleetmap.errors import StoreError, UntrustedError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
 from mapserver.store.files import is_plain_file
 
+if TYPE_CHECKING:
+    from tuf.api.metadata import DelegatedRole, Metadata
+
 TIMESTAMP = "timestamp"
 DAYS = {"root": 730, "targets": 365, "site": 14, "snapshot": 7, TIMESTAMP: 1}
 _RENEWED_DAYS_BEFORE = {"site": 13, "snapshot": 3, TIMESTAMP: 0.75}  # every night, every four days, every six hours
 _NAME = re.compile(r"(?:(timestamp)|[0-9]{1,10}\.(root|targets|snapshot|site-[a-z0-9_-]{1,64}))\.json")
 _NUMBERED = re.compile(r"([0-9]{1,10})\.([a-z0-9_-]+)\.json")
-
-
-class _Role(msgspec.Struct, frozen=True):
-    keyids: tuple[str, ...]
-    threshold: int
-
-
-class SiteRole(_Role, frozen=True):
-    """Which key signs the lists of a site. Lists of before may name several, or leave the version before out (previous: 0)."""
-
-    name: str
-    previous: int = 1
-
-
-class _Key(msgspec.Struct, frozen=True):
-    keytype: str
-
-
-class _Signed(msgspec.Struct, frozen=True):
-    version: int
-    expires: datetime
-    meta: dict[str, dict[str, Any]] = {}
-    delegations: dict[str, Any] | None = None
-    roles: dict[str, _Role] = {}
-    keys: dict[str, _Key] = {}
-
-
-class _Signature(msgspec.Struct, frozen=True):
-    keyid: str
-
-
-class _File(msgspec.Struct, frozen=True):
-    signed: _Signed
-    signatures: tuple[_Signature, ...] = ()
 
 
 def is_fresh(role: str, expires: datetime, now: datetime) -> bool:
@@ -96,27 +63,33 @@ class SignedLists:
         found = (_NUMBERED.fullmatch(path.name) for path in self.folder.glob(f"*.{role}.json"))
         return sorted(int(name[1]) for name in found if name is not None and name[2] == role)
 
-    def read(self, role: str, number: int | None = None) -> _Signed:
-        """What the newest file of a role says, or the file of this number; StoreError where it cannot be read."""
+    def metadata(self, role: str, number: int | None = None) -> "Metadata[Any]":
+        """The newest file of a role, or that of this number; StoreError where it cannot be read. No signature is verified."""
+        from tuf.api.exceptions import RepositoryError  # late: who only lists versions needs none of it
+        from tuf.api.metadata import Metadata
+
         path = self.path(role, self.newest(role) if number is None else number)
         try:
-            return msgspec.json.decode(path.read_bytes(), type=_File).signed
-        except (OSError, msgspec.MsgspecError) as error:
+            return Metadata.from_bytes(path.read_bytes())
+        except (OSError, RepositoryError) as error:
             raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
 
-    def site_roles(self) -> dict[str, SiteRole]:
-        """Who signs for which site, by the role's name, as the newest targets say; errors as of `read`."""
-        roles = (self.read("targets").delegations or {}).get("roles", [])
-        return {role.name: role for role in msgspec.convert(roles, list[SiteRole])}
+    def read(self, role: str, number: int | None = None) -> Any:
+        """What that file says: a Root, Targets, Snapshot or Timestamp of tuf. Errors as of `metadata`."""
+        return self.metadata(role, number).signed
 
-    def is_signed(self, role: SiteRole) -> bool:
+    def site_roles(self) -> "dict[str, DelegatedRole]":
+        """Who signs for which site, by the role's name, as the newest targets say; errors as of `metadata`."""
+        delegations = self.read("targets").delegations
+        return {} if delegations is None else dict(delegations.roles)
+
+    def is_signed(self, role: "DelegatedRole") -> bool:
         """Whether a site's newest list bears the name of its present key; the signature is not verified."""
         try:
-            data = self.path(role.name, self.newest(role.name)).read_bytes()
-            signatures = msgspec.json.decode(data, type=_File).signatures
-        except (OSError, msgspec.MsgspecError):
+            signatures = self.metadata(role.name).signatures
+        except StoreError:
             return False
-        return any(signature.keyid in role.keyids for signature in signatures)
+        return any(keyid in role.keyids for keyid in signatures)
 
     def retired(self) -> dict[str, str]:
         """By role, what an earlier fleetmap set up and this one cannot go on with: several keys, a token's, no predecessors."""
@@ -133,7 +106,8 @@ class SignedLists:
                     "or begin anew: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
                 )
         for name, signed_by in self.site_roles().items():
-            if signed_by.threshold > 1 or not signed_by.previous:
+            # Lists of before may leave the version before out.
+            if signed_by.threshold > 1 or not signed_by.unrecognized_fields.get("previous", 1):
                 site, fault = name.removeprefix("site-"), f"{signed_by.threshold} keys must sign its lists"
                 if signed_by.threshold == 1:
                     fault = "its lists admit no version but the current one"
@@ -165,11 +139,11 @@ class SignedLists:
             self._known = (mark, {})
         known = self._known[1]
         if site not in known:
-            snapshot = self.read("snapshot", self.read(TIMESTAMP).meta["snapshot.json"]["version"])
+            snapshot = self.read("snapshot", self.read(TIMESTAMP).snapshot_meta.version)
             entry = snapshot.meta.get(f"{site_role(site)}.json")
             if entry is None:
                 return None
-            known[site] = self.site_list(site, entry["version"])
+            known[site] = self.site_list(site, entry.version)
         return known[site]
 
     def admitted_or_current(self, wanted: WantedVersion) -> WantedVersion:

@@ -4,11 +4,11 @@ import logging
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, cast
 
 import msgspec
 from securesystemslib.signer import Key, Signer
-from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
+from tuf.api.exceptions import UnsignedMetadataError
 from tuf.api.metadata import (
     DelegatedRole,
     Delegations,
@@ -23,7 +23,7 @@ from tuf.api.metadata import (
 )
 from tuf.api.serialization.json import JSONSerializer
 
-from fleetmap.errors import StateError, StoreError, disk_errors
+from fleetmap.errors import StateError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.trust import AdmittedVersion, manifest_target, site_role
 from mapserver.store.files import make_folder
@@ -34,7 +34,6 @@ _MOST_FILES = 5  # of a role that robots ask for by number: one may have read th
 _ONLINE = ("snapshot", TIMESTAMP)
 _log = logging.getLogger(__name__)
 _COMPACT = JSONSerializer(compact=True)
-T = TypeVar("T", bound=Signed)
 
 
 class ListRepository:
@@ -44,21 +43,13 @@ class ListRepository:
         self.lists, self.keys = SignedLists(store), KeyFolder(store / "keys")
         self.now = now.astimezone(UTC).replace(microsecond=0)
 
-    def newest(self, role: str) -> Metadata[Any]:
-        """The newest file of a role; StoreError where there is none or it cannot be read."""
-        path = self.lists.path(role, 0 if role == TIMESTAMP else self.lists.newest(role))
-        try:
-            return Metadata.from_file(str(path))
-        except (RepositoryError, OSError) as error:
-            raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
-
     def root(self) -> Root:
-        """What the newest root says; errors as of `newest`."""
-        return _as(Root, self.newest("root").signed)
+        """What the newest root says; errors as of `SignedLists.metadata`."""
+        return cast(Root, self.lists.read("root"))
 
     def targets(self) -> Targets:
-        """What the newest targets say; errors as of `newest`."""
-        return _as(Targets, self.newest("targets").signed)
+        """What the newest targets say; errors as of `SignedLists.metadata`."""
+        return cast(Targets, self.lists.read("targets"))
 
     # --- with the root key --------------------------------------------------------------------------------------------
 
@@ -138,17 +129,17 @@ class ListRepository:
 
         Raises StateError where root and targets do not let this key sign.
         """
-        root, targets = self.root(), self.newest("targets")
+        root, targets = self.root(), self.lists.metadata("targets")
         _check(root, "targets", targets)
         meta = {"targets.json": MetaFile(targets.signed.version)}
         number, stamped = self.lists.newest("snapshot"), 0
         before = self._last_snapshot(root)
         for name in self.lists.site_roles():
             if newest := self.lists.newest(name):
-                entry = self._named(_as(Targets, targets.signed), name, newest, before)
+                entry = self._named(targets.signed, name, newest, before)
                 meta |= {} if entry is None else {f"{name}.json": entry}
         if self.lists.path(TIMESTAMP, 0).is_file():
-            stamped = self.newest(TIMESTAMP).signed.version
+            stamped = self.lists.read(TIMESTAMP).version
         if before is None or before.meta != meta or not is_fresh("snapshot", before.expires, self.now):
             number += 1
             self._sign("snapshot", Snapshot(version=number, meta=meta), online)
@@ -158,12 +149,12 @@ class ListRepository:
         """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""
         if not self.lists.newest("snapshot"):
             return None
-        last = self.newest("snapshot")
+        last = self.lists.metadata("snapshot")
         try:
             root.verify_delegate("snapshot", last.signed_bytes, last.signatures)
         except UnsignedMetadataError:
             return None
-        return _as(Snapshot, last.signed)
+        return cast(Snapshot, last.signed)
 
     def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
         """What a snapshot says of a site: its newest list, or what it said before where another key must sign first.
@@ -171,7 +162,7 @@ class ListRepository:
         Robots refuse a snapshot that has lost a role, those of other sites too.
         """
         try:
-            _check(targets, name, self.newest(name))
+            _check(targets, name, self.lists.metadata(name))
             return MetaFile(newest)
         except StateError as error:
             _log.warning("robots get no new list yet: %s", error)
@@ -220,8 +211,3 @@ def _check(judge: Root | Targets, role: str, metadata: Metadata[Any]) -> None:
         raise StateError(
             f"{role}.json is not signed as robots demand ({error}); sign it with the right keys"
         ) from error
-
-
-def _as(kind: type[T], signed: Signed) -> T:
-    assert isinstance(signed, kind)
-    return signed

@@ -244,7 +244,7 @@ def _entry(info: VersionInfo, state: str, files: Mapping[str, str] = MappingProx
 
 
 def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) -> bool:
-    """Whether anything is to be signed that can be signed here; asked every second, so without tuf."""
+    """Whether anything is to be signed that can be signed here; asked every second."""
     if keys.has("online") and _online_is_due(lists, now):
         return True
     known = lists.site_roles()
@@ -260,7 +260,7 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
     if not number or not lists.path(TIMESTAMP, 0).is_file():
         return True
     stamp, snapshot = lists.read(TIMESTAMP), lists.read("snapshot", number)
-    named = {name: entry["version"] for name, entry in snapshot.meta.items()}
+    named = {name: entry.version for name, entry in snapshot.meta.items()}
     present = {"targets.json": lists.newest("targets")}
     for name, role in lists.site_roles().items():
         if newest := lists.newest(name):
@@ -269,7 +269,7 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
             present |= {f"{name}.json": number_now} if number_now else {}
     return (
         named != present
-        or stamp.meta["snapshot.json"]["version"] != number
+        or stamp.snapshot_meta.version != number
         or not is_fresh(TIMESTAMP, stamp.expires, now)
         or not is_fresh("snapshot", snapshot.expires, now)
     )
