@@ -257,9 +257,7 @@ def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
 
 def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server) -> None:
     thin = random_tile(np.random.default_rng(5), landmarks=10, cell=(0, 0))
-    server.store.save(
-        "lab", DraftContent(tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0))
-    )
+    server.store.save("lab", DraftContent(tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0)))
     url = "/v1/sites/lab/versions/3"
     check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "landmarks_share")
     quality = server.client.get(f"{url}/quality").json()
@@ -275,9 +273,7 @@ def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server
 def test_an_operator_trusts_a_calibration_over_http(server: Server) -> None:
     evidence = Evidence(calibrations=[RigEvidence("a1", not_judged={"metric scale": "drive curves"})])
     tile = random_tile(np.random.default_rng(5), cell=(0, 0))
-    server.store.save(
-        "yard", DraftContent(tiles=[tile], vocabulary=b"w", details=draft_details(), evidence=evidence)
-    )
+    server.store.save("yard", DraftContent(tiles=[tile], vocabulary=b"w", details=draft_details(), evidence=evidence))
     url = "/v1/sites/yard/versions/1"
     check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "--trust-calibration")
     check_problem(server.client.post(f"{url}/publish", json={"actor": "ada", "trust_calibration": True}), 422, "reason")

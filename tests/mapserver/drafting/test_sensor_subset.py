@@ -70,9 +70,7 @@ def test_the_gate_refuses_a_map_without_metres(tmp_path: Path) -> None:
     tiles = [random_tile(np.random.default_rng(1))]
     with MapStore.open(tmp_path / "store", create=True) as maps:
         for scale in ("unknown", "metric"):
-            maps.save(
-                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(scale=scale))
-            )
+            maps.save("lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(scale=scale)))
         with pytest.raises(GateRefusedError, match="has a scale of its own"):
             releases.publish(maps, "lab", 1)
         assert releases.publish(maps, "lab", 2) == 2

@@ -34,9 +34,7 @@ class World:
 
     def publish(self, tiles: list[Tile]) -> WantedVersion:
         """Another version of site hall, which has none at first."""
-        self.store.save(
-            "hall", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5))
-        )
+        self.store.save("hall", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5)))
         releases.publish(self.store, "hall")
         return self.hall.wanted()
 
