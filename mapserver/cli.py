@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
+from mapserver.commands.align import align
+from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.build import build
 from mapserver.commands.calibrate import calibrate
 from mapserver.commands.config import CONFIG
@@ -14,22 +16,16 @@ from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
+from mapserver.commands.grid import GRID
 from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
-from mapserver.commands.releases.inspect import diff, inspect, versions
-from mapserver.commands.releases.promote import promote, publish, rollback
+from mapserver.commands.operators import OPERATORS
+from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
+from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
-from mapserver.commands.site.align import align
-from mapserver.commands.site.areas import AREAS_GROUP
-from mapserver.commands.site.grid import GRID
-from mapserver.commands.site.surfels import MAP
-from mapserver.commands.store.audit import audit
-from mapserver.commands.store.export import export, import_
-from mapserver.commands.store.gc import gc
-from mapserver.commands.store.operators import OPERATORS
-from mapserver.commands.store.robots import ROBOTS
-from mapserver.commands.store.trust import TRUST
-from mapserver.commands.store.verify import verify
+from mapserver.commands.store import audit, export, gc, import_, verify
+from mapserver.commands.surfels import MAP
+from mapserver.commands.trust import TRUST
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig

@@ -111,7 +111,7 @@ def test_a_new_user_follows_the_page(machine: Machine, tmp_path: Path) -> None:
         for folder in robots.values():
             assert "tls/maps.example:7447 wants version 1" in machine.connection(folder)
         machine.type(revoke, server)
-        until_s = time.monotonic() + 60  # the page's two seconds are measured by bench_bus_access
+        until_s = time.monotonic() + 60  # the page's two seconds are measured by bench_enrolled
         while "lets this certificate say nothing" not in (said := machine.connection(robots["tug-7"])):
             assert time.monotonic() < until_s, said
         assert machine.connection(robots["tug-8"]).startswith("ok")

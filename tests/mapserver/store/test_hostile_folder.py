@@ -215,7 +215,7 @@ from pathlib import Path
 from support.storage.faulty_disk import FullDisk, install
 from mapserver import cli
 store, reserve = Path(sys.argv[2]), sys.argv[3] == "with reserve"
-import mapserver.store.map_store, mapserver.commands.releases.inspect, mapserver.releases, mapserver.store.archive
+import mapserver.store.map_store, mapserver.commands.releases, mapserver.releases, mapserver.store.archive
 if not reserve:
     (store / "reserve").unlink()
 disk = FullDisk(str(store))

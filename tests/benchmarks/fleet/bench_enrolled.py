@@ -1,8 +1,8 @@
-"""One enrolled robot floods a running server over mutual TLS, in four ways; fifty others ask for their version and deliver failures.
+"""Enrolled robots: the bus of a thousand, a revocation, and floods: one robot floods a running server, fifty others are served.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_flood [--seconds 60] [--others 50] [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.fleet.bench_enrolled [--seconds 60] [--others 50] [--out FILE.json]
 
-The server, the robot that floods and the others are three processes on loopback. Row 8 of docs/security.md.
+Of a flood the server, the robot that floods and the others are three processes on loopback. Row 8 of docs/security.md.
 """
 
 import argparse
@@ -21,10 +21,10 @@ import msgspec
 import numpy as np
 import zenoh
 
-from benchmarks.fleet.bench_bus_access import SITE, open_register, robot_files
 from benchmarks.fleet.server_process import resident_mb, serving
 from fleetmap.access import ALIVE, ORDERS, QUESTIONS, REPORTS, Holder
 from fleetmap.bus import Bus, TlsFiles
+from fleetmap.errors import UnreachableError
 from fleetmap.messages import (
     FailureAck,
     FailureReport,
@@ -35,10 +35,83 @@ from fleetmap.messages import (
     robot_key,
 )
 from mapserver import releases
+from mapserver.serving.bus_access import BusGuard
+from mapserver.store import MapStore
+from mapserver.trust import init_here
+from mapserver.trust.enrolment import RobotRegister
+from support.storage.map_samples import save_sample_draft
 
+SITE, ENDPOINT = "lab", "tls/127.0.0.1:7447"
 KINDS = {"10,000 puts a second": 10_000, "1 MB strings": 100, "1000 failures a second": 1000, "20 MB pictures": 10}
 _EVERY_S = 2.0  # a robot asks this often, and delivers a failure with every third question
 _BLOCK = zenoh.CongestionControl.BLOCK
+
+
+def open_register(folder: Path) -> tuple[MapStore, RobotRegister]:
+    """A store with one draft, keys and authorities."""
+    store = MapStore.open(folder / "store", create=True)
+    save_sample_draft(store)
+    init_here(store)
+    register = RobotRegister(store)
+    register.authorities.init(["127.0.0.1"], None, None)
+    return store, register
+
+
+def robot_files(register: RobotRegister, holder: Holder, folder: Path) -> TlsFiles:
+    """An enrolled robot's key and certificate."""
+    own = folder / f"{holder.certificate}.pem"
+    own.write_bytes(register.authorities.make_own(holder.certificate, "robot"))
+    return TlsFiles(folder / "store" / "keys" / "servers-ca.crt", own)
+
+
+def _until(condition: Callable[[], bool], within_s: float = 20.0) -> float:
+    begun_s = time.perf_counter()
+    while not condition():
+        if time.perf_counter() - begun_s > within_s:
+            return float("nan")
+        time.sleep(0.01)
+    return time.perf_counter() - begun_s
+
+
+def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, float]:
+    """With `count` enrolled robots: seconds to open, memory (MB); seconds until a revoked one is out and all others are answered."""
+    store, register = open_register(folder)
+    names = [f"r{number}" for number in range(count)]
+    register.enrol(SITE, names, ENDPOINT)
+    holders = [Holder(entry.certificate, SITE, entry.robot) for entry in register.robots()[:connected]]
+    before_mb = resident_mb(os.getpid())
+    bus = Bus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access())
+    bus.queryable(robot_key("*", "*", "wanted"), lambda *_: b"1")
+    begun_s, cpu_s = time.perf_counter(), time.process_time()
+    bus.open()
+    cpu_s = time.process_time() - cpu_s
+    found = {"open_s": time.perf_counter() - begun_s, "open_cpu_s": cpu_s, "mb": resident_mb(os.getpid()) - before_mb}
+    guard, is_over = BusGuard(register, bus), threading.Event()
+
+    def follow() -> None:
+        while not is_over.wait(1.0):  # as the server's background task
+            guard.follow()
+
+    threading.Thread(target=follow, daemon=True).start()
+    robots = [Bus.connect(bus.endpoint, tls=robot_files(register, holder, folder)) for holder in holders]
+
+    def answered(number: int) -> bool:
+        try:
+            return robots[number].get(robot_key(SITE, holders[number].robot, "wanted"), timeout_s=0.2) == b"1"
+        except UnreachableError:
+            return False
+
+    _until(lambda: all(answered(number) for number in range(connected)))
+    register.revoke(SITE, [holders[0].robot])
+    found["revoked_is_out_s"] = _until(lambda: not answered(0))
+    found["others_again_s"] = _until(lambda: all(answered(number) for number in range(1, connected)))
+    found["revoked_stays_out"] = float(not answered(0))
+    is_over.set()
+    for robot in robots:
+        robot.close()
+    bus.close()
+    store.close()
+    return found
 
 
 def _failure(robot: str, number: int, pictures: int = 0, picture_bytes: int = 60_000, cause: str = "dark") -> bytes:
@@ -148,13 +221,13 @@ def _disk_mb(folder: Path) -> float:
     return sum(sizes) / 1e6
 
 
-def bench(folder: Path, seconds: float = 60.0, others: int = 50) -> dict[str, dict[str, float]]:
+def flooded(folder: Path, seconds: float = 60.0, others: int = 50) -> dict[str, dict[str, float]]:
     """For a quiet time and each kind of flood: messages sent, the others' waits (s), growth of the server's memory and folder (MB)."""
     evil = {kind: f"flood-{number}" for number, kind in enumerate(KINDS)}  # each with a fresh allowance of failures
     store, register = open_register(folder)
     with store:
         releases.publish(store, SITE)
-        register.enrol(SITE, [*evil.values(), *(f"r{number}" for number in range(others))], "tls/127.0.0.1:7447")
+        register.enrol(SITE, [*evil.values(), *(f"r{number}" for number in range(others))], ENDPOINT)
         entries = register.robots()
         files = {e.robot: robot_files(register, Holder(e.certificate, SITE, e.robot), folder) for e in entries}
     context, found = multiprocessing.get_context("spawn"), {}
@@ -201,7 +274,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        found = bench(Path(name), options.seconds, options.others)
+        found: dict[str, Any] = {"thousand": opening_and_revoking(Path(name) / "many", 1000, 12)}
+        print(json.dumps(found["thousand"], indent=1), flush=True)
+        found["floods"] = flooded(Path(name) / "flood", options.seconds, options.others)
     if options.out is not None:
         options.out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 

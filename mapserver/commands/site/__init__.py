@@ -1,1 +1,0 @@
-"""Commands over a site: its building and its areas."""

@@ -1,0 +1,171 @@
+"""`mapserver verify`, `gc`, `export`, `import` and `audit`: the store as a whole, and versions as files."""
+
+import shlex
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import expand_options
+from fleetmap.errors import StoreError
+from mapserver.commands.options import (
+    ActorOptions,
+    Json,
+    NewStoreFolder,
+    SiteName,
+    StoreFolder,
+    check_output,
+    open_store,
+    print_json,
+    version_named,
+)
+
+if TYPE_CHECKING:
+    from mapserver.store import AuditLine
+    from mapserver.store.garbage_collection import Garbage
+
+EXIT_STATUS_FAULTS = 3
+
+
+def verify(store: StoreFolder, json: Json = False) -> None:
+    """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
+    with open_store(store, read_only=True) as maps:
+        found = maps.verify()
+    if json:
+        print_json(found)
+    else:
+        typer.echo(f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes")
+        if found.orphans or found.leftovers:
+            typer.echo(
+                f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc --store {shlex.quote(str(store))}` removes them"
+            )
+        if found.open_to_others:
+            typer.echo(f"other users of this machine may read the store; `chmod -R go= {store}` ends that")
+        for fault in found.faults:
+            typer.echo(f"fault: {fault}")
+        typer.echo("clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore")
+    if found.faults:
+        raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+@expand_options
+def gc(
+    *,
+    store: StoreFolder,
+    keep_versions: Annotated[int, typer.Option(min=0, help="Published versions of a site to keep.")] = 5,
+    keep_drafts: Annotated[int, typer.Option(min=0, help="Drafts of a site to keep.")] = 3,
+    keep_days: Annotated[float, typer.Option(min=0, help="Days to keep retired versions and old drafts.")] = 7.0,
+    robot_days: Annotated[
+        float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
+    ] = 30.0,
+    by: ActorOptions,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
+    json: Json = False,
+) -> None:
+    """Remove drafts and retired versions beyond retention, and unreferenced files.
+
+    Current versions, targets of a rollback and versions that robots run are always kept.
+    """
+    from mapserver.store import Retention
+    from mapserver.store.database import format_of
+    from mapserver.store.files import keep_reserve, release_reserve
+    from mapserver.store.schema import FORMAT, LAST_UNNAMED
+
+    retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
+
+    def collect() -> "Garbage":
+        with open_store(store, read_only=dry_run) as maps:
+            return maps.collect_garbage(retention, dry_run=dry_run, actor=by.named())
+
+    try:
+        garbage = collect()
+    except StoreError:
+        # A store of another format is refused for that, and keeps its reserve.
+        is_ours = LAST_UNNAMED <= format_of(store / "store.sqlite3") <= FORMAT
+        if dry_run or not is_ours or not release_reserve(store):
+            raise
+        try:
+            garbage = collect()  # the disk was full
+        finally:
+            keep_reserve(store)
+    if json:
+        print_json(garbage)
+        return
+    would = "would be " if dry_run else ""
+    for word, versions in (("retired", garbage.retired), ("removed", garbage.removed)):
+        for site, version in versions:
+            typer.echo(f"site {site}: version {version} {would}{word}")
+    typer.echo(f"{garbage.files} files {would}removed, {garbage.freed_bytes} bytes {would}freed")
+
+
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write; replaced if it exists.")],
+    site: SiteName,
+    store: StoreFolder,
+    version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
+    without_archive: Annotated[
+        bool, typer.Option("--without-archive", help="Leave out the data that only later surveys need.")
+    ] = False,
+) -> None:
+    """Write a version into FILE, which `mapserver import` takes into another store."""
+    check_output("FILE", file)
+    with open_store(store, read_only=True) as maps:
+        version = version_named(maps, site, version)
+        size = maps.export_version(site, version, file, archive=not without_archive)
+    typer.echo(f"site {site}: version {version} is in {file} ({size} bytes)")
+
+
+@expand_options
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File that `mapserver export` wrote.")],
+    store: NewStoreFolder,
+    by: ActorOptions,
+) -> None:
+    """Take the version in FILE into a store, as a draft of its site under its own number."""
+    with open_store(store, create=True) as maps:
+        info = maps.import_version(file, actor=by.named())
+    typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")
+
+
+def audit(
+    store: StoreFolder,
+    verify: Annotated[bool, typer.Option("--verify", help="Check the chain of lines; status 3 for a fault.")] = False,
+    last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
+    json: Json = False,
+) -> None:
+    """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
+    from mapserver.store import chain_faults
+
+    with open_store(store, read_only=True) as maps:
+        if not verify:
+            _print(maps.audit_lines(last), json=json)
+            return
+        lines = maps.audit_lines()
+    faults = chain_faults(lines)
+    if json:
+        print_json({"lines": len(lines), "faults": faults})
+    else:
+        for fault in faults:
+            typer.echo(f"fault: {fault}")
+        typer.echo(f"{len(lines)} lines, {f'{len(faults)} faults' if faults else 'clean'}")
+    if faults:
+        raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+def _print(lines: "list[AuditLine]", *, json: bool) -> None:
+    if json:
+        print_json(lines)
+        return
+    for line in lines:
+        typer.echo(_words(line))
+
+
+def _words(line: "AuditLine") -> str:
+    """A line on one line: what came from elsewhere is quoted."""
+    when = datetime.fromtimestamp(line.stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    proved = " (signed in)" if line.operator else ""
+    parts = [f"{line.id} {when} {line.kind}", line.site and f"site {line.site}", repr(line.detail)]
+    parts += [line.actor and f"by {line.actor!r}{proved}", line.address and f"from {line.address!r}"]
+    parts += [line.reason and f"because {line.reason!r}"]
+    return ", ".join(part for part in parts if part)
