@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import Commands, ConfigFile, Group, Options, Version, config_path, make_app
+from fleetmap.cli_options import Commands, Options, Version, make_app
 from fleetmap.errors import UsageError, disk_errors
 from locclient.replay_command import IdentityFolder, Insecure, replay
 
@@ -93,28 +93,12 @@ def status(
     typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
 
 
-def show_config(context: typer.Context, config: ConfigFile = None) -> None:
-    """Print the effective configuration as TOML, with the origin of every value."""
-    import msgspec
-
-    from fleetmap.config_show import Layer, command_options, effective_settings
-    from locclient.config import TIERS, with_common
-
-    path = config_path(context)
-    settings, defaults = context.obj.read_config(path)
-    given = {} if path is None else with_common(msgspec.toml.decode(path.read_bytes()))
-    lines = [*effective_settings(settings, TIERS, (Layer(str(path), given),))]
-    lines += command_options("replay", context.obj.commands["replay"], defaults.get("replay", {}), str(path))
-    typer.echo("\n".join(lines))
-
-
 COMMANDS: Commands = {
     "enrol": enrol,
     "check": check,
     "replay": replay,
     "run": run,
     "status": status,
-    "config": Group("The configuration file.", {"show": show_config}),
 }
 
 

@@ -11,7 +11,6 @@ from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.build import build
 from mapserver.commands.calibrate import calibrate
-from mapserver.commands.config import CONFIG
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
@@ -58,7 +57,6 @@ COMMANDS: Commands = {
     "operators": OPERATORS,
     "audit": audit,
     "trust": TRUST,
-    "config": CONFIG,
 }
 
 

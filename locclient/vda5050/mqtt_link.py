@@ -1,4 +1,4 @@
-"""The adapter's connection to the broker, by paho-mqtt: topics, headers, last will, states at their time."""
+"""The adapter's connection to the broker, MQTT 5 by paho-mqtt: topics, headers, last will, states at their time."""
 
 import logging
 import ssl
@@ -67,9 +67,8 @@ class MqttLink:
             raise UsageError(
                 "[vda5050] needs paho-mqtt, which is not installed: pip install '.[client,vda5050]'"
             ) from error
-        protocol = mqtt.MQTTv5 if self._section.mqtt == "5" else mqtt.MQTTv311
         name = f"{self._section.manufacturer}-{self._section.serial_number}"
-        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, protocol=protocol)
+        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, protocol=mqtt.MQTTv5)
         client.suppress_exceptions = True  # they would end paho's thread; its logger has them
         client.enable_logger(_log)
         client.reconnect_delay_set(1, 30)
@@ -85,17 +84,15 @@ class MqttLink:
         return client
 
     def _connect(self) -> None:
-        where = (self._broker.host, self._broker.port, _KEEPALIVE_S)
-        if self._section.mqtt == "5":
-            from paho.mqtt.packettypes import PacketTypes
-            from paho.mqtt.properties import Properties
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
 
-            limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
-            self._set_will()
-            self._client.connect_async(*where, clean_start=True, properties=limits)
-        else:
-            self._client.connect_async(*where)
+        limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+        limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
+        self._set_will()
+        self._client.connect_async(
+            self._broker.host, self._broker.port, _KEEPALIVE_S, clean_start=True, properties=limits
+        )
 
     def _set_will(self) -> None:
         will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"})

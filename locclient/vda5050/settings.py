@@ -31,7 +31,6 @@ class Vda5050Section(Section, frozen=True):
     download_from: tuple[str, ...] = ()
     download_token_file: str | None = None
     download_ca: str | None = None
-    mqtt: Literal["5", "3.1.1"] = "5"
     robot_actions: tuple[str, ...] = ()
     factsheet: str | None = None
     state_interval_s: float = 1.0

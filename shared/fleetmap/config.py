@@ -36,6 +36,7 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},
     "foxglove": "`locclient replay --mcap FILE` writes a run, which Foxglove opens, and the dashboard shows a site; delete the key",
     "foxglove_site": "the dashboard shows every site, its robots and surveys, live; delete the key",
+    "mqtt": "MQTT 5 is spoken, as by every maintained broker; delete the key",
     "ros2": "`mapserver live --foxglove PORT` shows the survey, or the server's dashboard does",
     "spool": "it is called `outbox` now",
     "spool_bytes": "it is called `outbox_bytes` now",

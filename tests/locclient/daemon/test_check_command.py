@@ -50,20 +50,19 @@ def _read(file: Path) -> tuple[LocclientConfig, dict[str, dict[str, object]]]:
     return typer.main.get_command(cli.app).context_settings["obj"].read_config(file)
 
 
-def test_site_and_server_are_said_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said) -> None:
+def test_site_and_server_are_said_once_and_old_keys_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_text('site = "lab"\nserver = "tcp/10.0.0.2:7447"\n[run]\nrobot = "r1"\n[replay]\nstore = "maps"\n')
     settings, options = _read(file)
     assert (settings.run.site, settings.run.server, settings.run.store) == ("lab", "tcp/10.0.0.2:7447", None)
     assert options["replay"] == {"site": "lab", "store": "maps"}
-    assert status(monkeypatch, "config", "show", "--config", file) == 0
-    shown = tmp_path / "shown.toml"
-    shown.write_text(capsys.readouterr().out)
-    assert _read(shown)[0] == settings
-    assert _read(shown)[1]["replay"].items() >= options["replay"].items()
     file.write_text("[localizer.track]\nmax_misses = 9\n")
     with pytest.raises(UsageError, match=r"localizer\.track\.max_misses is an internal constant now"):
         _read(file)
+    for key, instead in (("map", "`map_topic"), ("driver_odom_topic", "from /tf")):
+        file.write_text(f'[output]\n{key} = ""\n')
+        with pytest.raises(UsageError, match=rf"unknown field `{key}`.*; {instead}"):
+            _read(file)
 
 
 def test_a_good_robot_passes(monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said) -> None:

@@ -17,7 +17,7 @@ from fleetmap.geometry import se3_exp
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import cli
-from mapserver.config import MapserverConfig, read_config, survey_settings
+from mapserver.config import MapserverConfig, read_config
 from mapserver.drafting.draft import BuildRequest, Draft
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
@@ -144,23 +144,6 @@ def test_the_file_gives_defaults_and_the_command_line_wins(
         assert [info["site"] for info in json.loads(capsys.readouterr().out)] == sites
     assert status(monkeypatch, "--config", file, "inspect") == 0
     assert "site hall version 2" in capsys.readouterr().out
-
-
-def test_config_show_prints_a_file_that_means_the_same(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file, shown = tmp_path / "site.toml", tmp_path / "shown.toml"
-    file.write_text('site = "lab"\n[survey.keyframes]\nmin_overlap = 0.5\n[build]\nreplay = ["a", "b"]\nstore = "s"\n')
-    assert status(monkeypatch, "--config", file, "config", "show", "--use", "mono") == 0
-    text = capsys.readouterr().out
-    shown.write_text(text)
-    settings, options = read_config(shown, cli.COMMANDS)
-    assert settings.survey == survey_settings(file, SensorSet.MONO)
-    assert (options["build"]["replay"], options["build"]["store"]) == (["a", "b"], "s")
-    assert options["publish"]["site"] == "lab"
-    assert f"min_overlap = 0.5  # {file}" in text
-    assert "max_parallax = 0.1  # preset mono" in text
-    assert "max_interval_s = 2.0  # default" in text
 
 
 def test_build_takes_its_settings_from_the_file(
