@@ -1,5 +1,6 @@
 """Folders that cannot be right: the message names the value and the next step, or the loss is counted."""
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,6 @@ import pytest
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
 from fleetmap.recordings.images import StoredImage, decode_grey
-from fleetmap.sensors.samples import DataIssue
 from support.recordings.recording_samples import (
     HEIGHT,
     WIDTH,
@@ -23,6 +23,11 @@ from support.recordings.recording_samples import (
 )
 
 SAMPLE = make_sample(4, imu_before_ns=3_000_000_000)
+STAMPS_NS, GYRO, ACCEL = SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2
+LENS = (
+    f"camera_model: pinhole, distortion_model: none, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]"
+)
+Spoil = Callable[[Path], object]
 
 
 @pytest.fixture
@@ -30,35 +35,130 @@ def euroc(tmp_path: Path) -> Path:
     return write_euroc(tmp_path / "recording", SAMPLE)
 
 
-def test_no_such_path(tmp_path: Path) -> None:
+def image(folder: Path, camera: int = 0, number: int = 2) -> Path:
+    return folder / f"mav0/cam{camera}/data/image{number}.png"
+
+
+def edit(name: str, change: Callable[[list[str]], object]) -> Spoil:
+    """Changes the lines of a file of the folder."""
+
+    def spoil(folder: Path) -> None:
+        lines = (folder / name).read_text().splitlines()
+        changed = change(lines)
+        (folder / name).write_text("\n".join(lines if changed is None else changed))
+
+    return spoil
+
+
+def imu(stamps_ns: np.ndarray = STAMPS_NS, gyro: np.ndarray = GYRO, accel: np.ndarray = ACCEL) -> Spoil:
+    return lambda folder: write_euroc_imu(folder / "mav0/imu0/data.csv", stamps_ns, gyro, accel)
+
+
+def dangling(folder: Path) -> None:
+    image(folder).unlink()
+    image(folder).symlink_to("nowhere.png")
+
+
+def bytes_of_image(change: Callable[[bytes], bytes]) -> Spoil:
+    return lambda folder: image(folder).write_bytes(change(image(folder).read_bytes()))
+
+
+flipped = bytes_of_image(lambda data: data[:500] + bytes([data[500] ^ 0x55]) + data[501:])
+
+
+def no_rotation(rows: list[str]) -> None:
+    rows[2] = ",".join([rows[2].split(",")[0], *["0"] * 16])
+
+
+def larger_lens(folder: Path) -> None:
+    edit("mav0/cam0/sensor.yaml", lambda rows: [row.replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]") for row in rows])(
+        folder
+    )
+
+
+def nothing_left(folder: Path) -> None:
+    for number in range(4):
+        image(folder, 1, number).write_bytes(b"")
+
+
+CAMERA, TABLE, TRUTH = "mav0/cam0/data.csv", "mav0/imu0/data.csv", "mav0/state_groundtruth_estimate0/data.csv"
+
+
+def test_paths_that_are_no_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"nowhere does not exist"):
         open_recording(tmp_path / "nowhere")
-
-
-def test_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="empty folder"):
+        open_recording(tmp_path)
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(RecordingError) as caught:
         open_recording(tmp_path)
     assert all(name in str(caught.value) for name in RECORDING_FORMATS)
 
 
-def test_empty_folder(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="empty folder"):
-        open_recording(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["../../../../secret.png", "/etc/passwd"])
-def test_names_outside_of_the_recording(euroc: Path, name: str) -> None:
-    table = euroc / "mav0/cam0/data.csv"
-    table.write_text(table.read_text() + f"1900000000000000000,{name}\n")
-    with pytest.raises(RecordingError, match=r"data\.csv, line \d+: .* is not inside the folder"):
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (edit(CAMERA, lambda rows: rows.append("1900000000000000000,../../../../secret.png")), r"data\.csv, line \d+: .* is not inside"),
+        (edit(CAMERA, lambda rows: rows.append("1900000000000000000,/etc/passwd")), r"data\.csv, line \d+: .* is not inside"),
+        (edit(CAMERA, lambda rows: rows[:1]), "names no image"),
+        (lambda folder: (folder / CAMERA).unlink(), r"data\.csv cannot be read"),
+        (lambda folder: shutil.rmtree(folder / "mav0/cam0"), "cam0 is missing"),
+        (nothing_left, r"cam1: none of the 4 images .*4 without a byte"),
+        (larger_lens, "752x480.*--calibration"),
+        (lambda folder: (folder / "mav0/cam1/sensor.yaml").unlink(), r"cam1/sensor\.yaml is missing.*--calibration FILE"),
+        (imu(accel=ACCEL / 9.80665), r"in g \(median 1\.00"),
+        (imu(gyro=np.degrees(GYRO)), "degrees per second"),
+        (imu(STAMPS_NS[::-1]), "stamps go backwards"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_named(euroc: Path, spoil: Spoil, says: str) -> None:
+    spoil(euroc)
+    with pytest.raises(RecordingError, match=says):
         open_recording(euroc)
 
 
-def test_missing_camera_folder(euroc: Path) -> None:
-    shutil.rmtree(euroc / "mav0/cam0")
-    with pytest.raises(RecordingError, match="cam0 is missing"):
-        open_recording(euroc)
+@pytest.mark.parametrize(
+    ("spoil", "frames", "says"),
+    [
+        (dangling, 3, "cam0: images missing: 1 of 4, the first is image2.png"),
+        (bytes_of_image(lambda data: b""), 3, "cam0: images without a byte: 1 of 4, the first is image2.png"),
+        (bytes_of_image(lambda data: b"none"), 3, "cam0: images of no format that is read: 1 of 4, the first is image2.png"),
+        (bytes_of_image(lambda data: data[:-900]), 3, "cam0: images cut off: 1 of 4, the first is image2.png"),
+        (flipped, 3, "cam0: images damaged inside: 1 of 4, the first is image2.png"),
+        (
+            lambda folder: cv2.imwrite(str(image(folder, 1)), np.zeros((HEIGHT, WIDTH - 8), np.uint8)), 3,
+            f"cam1: images of another size: 1 of {WIDTH - 8}x{HEIGHT} left out, 3 have {WIDTH}x{HEIGHT} px",
+        ),
+        (edit(CAMERA, lambda rows: [rows[at] for at in (0, 1, 3, 2, 4)]), 3, "cam0: stamps not increasing"),
+        (edit(TABLE, lambda rows: [*rows[:-1], rows[-1][:-60]]), 4, "data.csv: unreadable lines: 1 of"),
+        (imu(gyro=np.where(np.arange(len(GYRO))[:, None] == 7, np.nan, GYRO)), 4, "imu: impossible values: 1 of"),
+        (edit(TRUTH, no_rotation), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion"),
+    ],
+)  # fmt: skip
+def test_what_is_lost_is_counted(euroc: Path, spoil: Spoil, frames: int, says: str) -> None:
+    spoil(euroc)
+    recording = open_recording(euroc)
+    assert len([recording.read_frame(index) for index in range(len(recording))]) == frames
+    assert (np.diff(recording.frame_stamps_ns) > 0).all()
+    assert np.isfinite(recording.imu.gyro_radps).all()
+    assert any(f"{issue.what}: {issue.detail}".startswith(says) for issue in recording.issues), recording.issues
+
+
+def test_a_picture_that_is_damaged_inside_is_told_in_our_words(euroc: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    flipped(euroc)
+    assert open_recording(euroc).damaged_ns.tolist() == [SAMPLE.stamps_ns[2]], (
+        "rows of a trajectory are counted with it"
+    )
+    with pytest.raises(RecordingError, match="the png image is damaged"):
+        decode_grey(StoredImage("file", image(euroc).read_bytes(), "a robot's own"))
+    assert capfd.readouterr().err == "", "libpng has nothing to say"
+
+
+def test_a_cut_jpeg_is_left_out_instead_of_filled_with_grey(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "r", SAMPLE, image_type="jpg")
+    file = folder / "mav0/cam0/data/image2.jpg"
+    file.write_bytes(file.read_bytes()[:-900])
+    assert SAMPLE.stamps_ns[2] not in open_recording(folder).frame_stamps_ns
 
 
 @pytest.mark.parametrize(("write", "gone"), [(write_kitti, "image_0"), (write_kitti, "image_1"), (write_tumvi, "cam0")])
@@ -67,15 +167,6 @@ def test_missing_camera_folder_elsewhere(tmp_path: Path, write: Callable[..., Pa
     shutil.rmtree(folder / gone)
     with pytest.raises(RecordingError, match=rf"{gone}.* is missing"):
         open_recording(folder)
-
-
-def test_camera_folder_without_table_or_images(euroc: Path) -> None:
-    (euroc / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n")
-    with pytest.raises(RecordingError, match="names no image"):
-        open_recording(euroc)
-    (euroc / "mav0/cam0/data.csv").unlink()
-    with pytest.raises(RecordingError, match=r"data\.csv cannot be read"):
-        open_recording(euroc)
 
 
 @pytest.mark.parametrize("name", ["1403636579763555584.png", f"{10**25}.png"])
@@ -91,157 +182,20 @@ def test_names_of_kitti_images_that_are_no_number_of_a_frame(tmp_path: Path, nam
         open_recording(folder)
 
 
-def test_links_to_images_that_are_not_there_are_left_out_and_counted(euroc: Path) -> None:
-    image = euroc / "mav0/cam0/data/image2.png"
-    image.unlink()
-    image.symlink_to("nowhere.png")
-    recording = open_recording(euroc)
-    assert recording.issues[0] == DataIssue("cam0: images missing", "1 of 4, the first is image2.png")
-
-
-def test_zero_byte_image_is_left_out_and_counted(euroc: Path) -> None:
-    (euroc / "mav0/cam0/data/image3.png").write_bytes(b"")
-    recording = open_recording(euroc)
-    assert len(recording) == 3
-    assert any("without a byte" in issue.what and "image3.png" in issue.detail for issue in recording.issues)
-
-
-def test_nothing_but_zero_byte_images(euroc: Path) -> None:
-    for file in (euroc / "mav0/cam1/data").iterdir():
-        file.write_bytes(b"")
-    with pytest.raises(RecordingError, match=r"cam1: none of the 4 images .*4 without a byte"):
-        open_recording(euroc)
-
-
-@pytest.mark.parametrize("image_type", ["png", "jpg"])
-def test_cut_image_is_left_out_instead_of_filled_with_grey(tmp_path: Path, image_type: str) -> None:
-    folder = write_euroc(tmp_path / "r", SAMPLE, image_type=image_type)
-    file = folder / f"mav0/cam0/data/image2.{image_type}"
-    file.write_bytes(file.read_bytes()[:-900])
-    recording = open_recording(folder)
-    assert SAMPLE.stamps_ns[2] not in recording.frame_stamps_ns
-    assert len(recording) == 3
-    (issue, _) = recording.issues
-    assert issue == DataIssue("cam0: images cut off", f"1 of 4, the first is image2.{image_type}")
-
-
-def test_png_that_is_damaged_inside_costs_one_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    folder = write_euroc(tmp_path / "r", SAMPLE)
-    file = folder / "mav0/cam0/data/image2.png"
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 0x55
-    file.write_bytes(data)
-    recording = open_recording(folder)
-    assert SAMPLE.stamps_ns[2] not in recording.frame_stamps_ns
-    assert len([recording.read_frame(index) for index in range(len(recording))]) == 3
-    assert recording.issues[0] == DataIssue("cam0: images damaged inside", "1 of 4, the first is image2.png")
-    assert recording.damaged_ns.tolist() == [SAMPLE.stamps_ns[2]], "rows of a trajectory are counted with it"
-    with pytest.raises(RecordingError, match="the png image is damaged"):
-        decode_grey(StoredImage("file", bytes(data), "a robot's own"))
-    assert capfd.readouterr().err == "", "libpng has nothing to say"
-
-
-def test_image_that_is_none(euroc: Path) -> None:
-    (euroc / "mav0/cam0/data/image2.png").write_bytes(b"this is no image at all")
-    recording = open_recording(euroc)
-    assert len(recording) == 3
-    assert recording.issues[0] == DataIssue("cam0: images of no format that is read", "1 of 4, the first is image2.png")
-
-
-def test_image_of_another_size_is_left_out_and_a_calibration_of_another_size_refused(euroc: Path) -> None:
-    file = euroc / "mav0/cam1/data/image2.png"
-    whole = file.read_bytes()
-    cv2.imwrite(str(file), np.zeros((HEIGHT, WIDTH - 8), np.uint8))
-    recording = open_recording(euroc)
-    assert len(recording) == 3
-    assert recording.issues[0].detail == f"1 of {WIDTH - 8}x{HEIGHT} left out, 3 have {WIDTH}x{HEIGHT} px"
-    file.write_bytes(whole)
-    sensor = euroc / "mav0/cam0/sensor.yaml"
-    sensor.write_text(sensor.read_text().replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]"))
-    with pytest.raises(RecordingError, match=r"752x480.*--calibration"):
-        open_recording(euroc)
-
-
-def test_accelerometer_in_g(euroc: Path) -> None:
-    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2 / 9.80665)
-    with pytest.raises(RecordingError, match=r"in g \(median 1\.00"):
-        open_recording(euroc)
-
-
-def test_gyro_in_degrees(euroc: Path) -> None:
-    write_euroc_imu(
-        euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, np.degrees(SAMPLE.gyro_radps), SAMPLE.accel_mps2
-    )
-    with pytest.raises(RecordingError, match="degrees per second"):
-        open_recording(euroc)
-
-
 def test_backward_stamps_are_dropped_and_counted_never_sorted(euroc: Path) -> None:
-    stamps = SAMPLE.imu_stamps_ns.copy()
+    stamps = STAMPS_NS.copy()
     stamps[[50, 51]] = stamps[[51, 50]]
     stamps[80] = stamps[79]
     stamps[100] += 10**12  # one wild stamp costs itself alone
-    write_euroc_imu(euroc / "mav0/imu0/data.csv", stamps, SAMPLE.gyro_radps, SAMPLE.accel_mps2)
+    imu(stamps)(euroc)
     recording = open_recording(euroc)
     assert (np.diff(recording.imu.stamps_ns) > 0).all()
     assert len(recording.imu) == len(stamps) - 3
     (issue,) = recording.issues
     assert issue.what == "imu: stamps not increasing"
     assert f"3 of {len(stamps)}" in issue.detail
-    kept = np.isin(SAMPLE.imu_stamps_ns, recording.imu.stamps_ns)
-    np.testing.assert_array_equal(recording.imu.gyro_radps[:50], SAMPLE.gyro_radps[kept][:50])
-
-
-def test_a_clock_that_runs_backwards_is_refused(euroc: Path) -> None:
-    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns[::-1], SAMPLE.gyro_radps, SAMPLE.accel_mps2)
-    with pytest.raises(RecordingError, match="stamps go backwards"):
-        open_recording(euroc)
-
-
-def test_camera_stamps_backwards(euroc: Path) -> None:
-    file = euroc / "mav0/cam0/data.csv"
-    lines = file.read_text().splitlines()
-    file.write_text("\n".join([lines[0], lines[1], lines[3], lines[2], lines[4]]))
-    recording = open_recording(euroc)
-    assert len(recording) == 3
-    assert (np.diff(recording.frame_stamps_ns) > 0).all()
-    assert any("cam0: stamps not increasing" in issue.what for issue in recording.issues)
-
-
-def test_table_cut_off_in_the_middle_of_a_line(euroc: Path) -> None:
-    file = euroc / "mav0/imu0/data.csv"
-    text = file.read_text()
-    file.write_text(text[: len(text) - 60])
-    recording = open_recording(euroc)
-    assert len(recording.imu) == len(SAMPLE.imu_stamps_ns) - 1
-    assert any("unreadable lines" in issue.what and issue.detail.startswith("1 of") for issue in recording.issues)
-
-
-def test_values_that_are_not_finite(euroc: Path) -> None:
-    gyro = SAMPLE.gyro_radps.copy()
-    gyro[7, 1] = np.nan
-    write_euroc_imu(euroc / "mav0/imu0/data.csv", SAMPLE.imu_stamps_ns, gyro, SAMPLE.accel_mps2)
-    recording = open_recording(euroc)
-    assert np.isfinite(recording.imu.gyro_radps).all()
-    assert any("impossible values" in issue.what for issue in recording.issues)
-
-
-def test_truth_without_rotation_is_left_out(euroc: Path) -> None:
-    file = euroc / "mav0/state_groundtruth_estimate0/data.csv"
-    lines = file.read_text().splitlines()
-    stamp = lines[2].split(",")[0]
-    lines[2] = ",".join([stamp, *["0"] * 16])
-    file.write_text("\n".join(lines))
-    recording = open_recording(euroc)
-    assert recording.ground_truth is not None
-    assert len(recording.ground_truth) == 3
-    assert any("unit quaternion" in issue.detail for issue in recording.issues)
-
-
-def test_missing_sensor_yaml(euroc: Path) -> None:
-    (euroc / "mav0/cam1/sensor.yaml").unlink()
-    with pytest.raises(CalibrationError, match=r"cam1/sensor\.yaml is missing.*--calibration FILE"):
-        open_recording(euroc)
+    kept = np.isin(STAMPS_NS, recording.imu.stamps_ns)
+    np.testing.assert_array_equal(recording.imu.gyro_radps[:50], GYRO[kept][:50])
 
 
 @pytest.mark.parametrize(
@@ -253,10 +207,8 @@ def test_missing_sensor_yaml(euroc: Path) -> None:
         ("left: {}", "no cam0"),
         ("cam0: 3", "cam0 is 3"),
         ("cam0: {camera_model: omni, distortion_model: radtan}", "omni with distortion radtan is not known"),
-        (
-            "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [-9, 9, 9, 9], resolution: [20, 20]}",
-            "focal lengths",
-        ),
+        (f"cam0: {{{LENS.replace('200, 200', '-9, 9')}}}", "focal lengths"),
+        (f"cam0: {{{LENS}}}", "2 cameras are recorded, the calibration describes 1"),
     ],
 )
 def test_calibration_file_missing_or_nonsense(euroc: Path, tmp_path: Path, content: str | None, says: str) -> None:
@@ -265,24 +217,13 @@ def test_calibration_file_missing_or_nonsense(euroc: Path, tmp_path: Path, conte
         file.write_text(content)
     with pytest.raises(CalibrationError, match=says) as caught:
         open_recording(euroc, OpenOptions(calibration_file=file))
-    assert "rig.yaml" in str(caught.value)
-
-
-def test_calibration_file_with_too_few_cameras(euroc: Path, tmp_path: Path) -> None:
-    file = tmp_path / "rig.yaml"
-    file.write_text(
-        "cam0: {camera_model: pinhole, distortion_model: none, intrinsics: [200, 200, 160, 120], "
-        f"resolution: [{WIDTH}, {HEIGHT}]}}"
-    )
-    with pytest.raises(CalibrationError, match="2 cameras are recorded, the calibration describes 1"):
-        open_recording(euroc, OpenOptions(calibration_file=file))
+    assert re.search(r"rig\.yaml|--calibration FILE", str(caught.value))
 
 
 def test_imu_without_mounting_is_not_used_and_said_so(euroc: Path, tmp_path: Path) -> None:
     file = tmp_path / "rig.yaml"
-    lens = f"camera_model: pinhole, distortion_model: none, intrinsics: [200, 200, 160, 120], resolution: [{WIDTH}, {HEIGHT}]"
     rows = "[[1, 0, 0, -0.2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
-    file.write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
+    file.write_text(f"cam0: {{{LENS}}}\ncam1: {{{LENS}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(euroc, OpenOptions(calibration_file=file))
     assert recording.sensor_set.value == "stereo"
     assert len(recording.imu) == 0
