@@ -32,7 +32,7 @@ TIERS = {
         "run.trial": "*",
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
-        "map_frame building_frame odom_frame base_frame sensor_frames publish_odom driver_odom_topic transform_tolerance_s",
+        "map_frame building_frame odom_frame base_frame sensor_frames publish_odom transform_tolerance_s",
         "vda5050": "state_interval_s robot_silent_s initialize_s initial_sigma_m initial_sigma_rad",
         "localizer": "seed",
         "localizer.orb": "extractor count",

@@ -18,8 +18,8 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection
-from locclient.daemon.output_section import completed_for_ros2
-from locclient.daemon.publishers import PublisherInputs, open_publisher
+from locclient.daemon.output_section import check_for_ros2
+from locclient.daemon.publishers import open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
@@ -68,7 +68,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
             raise UsageError(f"[{section}] endpoint = {error}") from error
     output = config.output
     if output.format == "ros2":
-        completed_for_ros2(output, config.topics.wheel)
+        check_for_ros2(output)
     if output.format == "ros2" and output.odom_topic.lstrip("/") == config.topics.wheel.lstrip("/"):
         raise UsageError(
             f"[output] odom_topic = {output.odom_topic!r} is also where [topics] wheel listens: the robot would take its own "
@@ -145,9 +145,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         told_bus = _output_bus(config, bus, stack)
         publisher = None
         if told_bus is not None:
-            publisher = open_publisher(
-                PublisherInputs(told_bus, site, name, calibration, intake, config.topics.wheel), config.output
-            )
+            publisher = open_publisher(config.output, told_bus, site, name, calibration, intake)
             stack.callback(publisher.close)
             if server is not None:
                 server.client.takes_grids = publisher.grid_height_m is not None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.recordings.ros2.messages import FrameLink, decode_frame_links, decode_odometry_pose
+from fleetmap.recordings.ros2.messages import FrameLink, decode_frame_links
 
 _KEPT_NS = 10_000_000_000  # as tf2 keeps them
 _KEPT_POSES = 20_000
@@ -94,8 +94,8 @@ class PoseHistory:
 class DriverOdometry:
     """Sends map_from_odom for every localized frame, once the driver's pose at its stamp is known. From any thread.
 
-    The pose is that of /tf where odom -> base is there, because it is what others compose with; else that of the driver's Odometry.
-    Where the driver moves another frame, such as base_footprint, /tf_static leads from it to the base.
+    The pose is that of /tf, because it is what others compose with. Where the driver moves another frame, such as base_footprint,
+    /tf_static leads from it to the base.
     """
 
     def __init__(
@@ -105,27 +105,27 @@ class DriverOdometry:
         self._odom, self._base, self._send = odom_frame, base_frame, send
         self._offset_ns = round(sensor_minus_frame_s * 1e9)
         self._lock = threading.Lock()
-        self._tf, self._odometry = PoseHistory(), PoseHistory()
+        self._odom_from_base = PoseHistory()
         self._parents: dict[str, FrameLink] = {}  # by child, of /tf_static
         self._waiting: deque[tuple[int, Array]] = deque(maxlen=_WAITING)
         self._since_ns: int | None = None  # of the first frame that has no transform yet
         self._refused = self._missing = ""
 
-    def handle_odometry(self, message: bytes) -> None:
-        """nav_msgs/Odometry of the driver."""
-        with self._lock:
-            try:
-                link = decode_odometry_pose(message)
-            except ValueError as error:
-                self._refused = f"an Odometry message is refused: {error}"
-                return
-            self._take(link, self._odometry)
-
     def handle_tf(self, links: list[FrameLink]) -> None:
         with self._lock:
             for link in links:
-                if link.parent == self._odom:
-                    self._take(link, self._tf)
+                child_from_base = self._child_from_base(link.child) if link.parent == self._odom else None
+                if child_from_base is not None:
+                    self._refused = ""
+                    self._odom_from_base.add(link.stamp_ns, link.parent_from_child @ child_from_base)
+                    self._send_known()
+                elif self._odom_from_base.newest_ns is None and link.parent == self._odom:
+                    way = "and /tf_static no way from there to the base"
+                    self._refused = (
+                        f"/tf has {link.child!r} in {link.parent!r}, {way}; set [output] base_frame, or publish the way"
+                    )
+                elif self._odom_from_base.newest_ns is None and link.child == self._base:
+                    self._refused = f"/tf has {link.child!r} in {link.parent!r}: set [output] odom_frame"
 
     def handle_tf_static(self, message: bytes) -> None:
         """tf2_msgs/TFMessage of /tf_static."""
@@ -143,26 +143,10 @@ class DriverOdometry:
         with self._lock:
             if self._since_ns is None or stamp_ns - self._since_ns < _GAP_NS:
                 return ""
-            now = self._at(stamp_ns + self._offset_ns)
+            now = self._odom_from_base.at(stamp_ns + self._offset_ns)
             reason = now.reason if isinstance(now, Missing) else self._missing
             what = f"the driver's pose of {self._base} in {self._odom} is not known: {reason}"
             return f"{what}; {self._refused}" if self._refused else what
-
-    def _take(self, link: FrameLink, history: PoseHistory) -> None:
-        child = link.child or self._base
-        child_from_base = self._child_from_base(child)
-        if link.parent != self._odom or child_from_base is None:
-            where = f"{child!r} in {link.parent!r}"
-            if history is self._odometry:
-                self._refused = (
-                    f"its Odometry is of {where}: set [output] odom_frame and base_frame, or driver_odom_topic"
-                )
-            elif history.newest_ns is None:
-                self._refused = f"/tf has {where}, and /tf_static no way from there to the base"
-            return
-        self._refused = ""
-        history.add(link.stamp_ns, link.parent_from_child @ child_from_base)
-        self._send_known()
 
     def _child_from_base(self, child: str) -> Array | None:
         frame, frame_from_base = self._base, np.eye(4)
@@ -179,7 +163,7 @@ class DriverOdometry:
         """Sends what waits, in order. What can no longer get a pose is left out."""
         while self._waiting:
             stamp_ns, map_from_base = self._waiting[0]
-            odom_from_base = self._at(stamp_ns + self._offset_ns)
+            odom_from_base = self._odom_from_base.at(stamp_ns + self._offset_ns)
             if isinstance(odom_from_base, Missing):
                 self._missing = odom_from_base.reason
                 if odom_from_base.may_come:
@@ -188,8 +172,3 @@ class DriverOdometry:
                 self._send(stamp_ns, map_from_base @ se3_inverse(odom_from_base))
                 self._since_ns = None
             self._waiting.popleft()
-
-    def _at(self, stamp_ns: int) -> Array | Missing:
-        tf_ns, odometry_ns = self._tf.newest_ns, self._odometry.newest_ns
-        has_tf = tf_ns is not None and (odometry_ns is None or tf_ns > odometry_ns - _GAP_NS)
-        return (self._tf if has_tf else self._odometry).at(stamp_ns)

@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import msgspec
-from msgspec.structs import replace
 
 from fleetmap.config import Section
 from fleetmap.errors import UsageError
@@ -33,38 +32,14 @@ class OutputSection(Section, frozen=True):
     base_frame: str = "base_link"
     sensor_frames: str = "fleetmap_"
     publish_odom: bool = True
-    driver_odom_topic: str = ""
     transform_tolerance_s: float = 0.0
 
 
-def completed_for_ros2(section: OutputSection, wheel_topic: str) -> OutputSection:
-    """`section` with the topic of the pose that map -> odom is computed against: by default the Odometry of [topics] wheel.
-
-    driver_odom_topic is empty where odom -> base is published here. UsageError for frames that tf2 does not take, and for a driver
-    that publishes odom -> base but no pose that is known here.
-    """
+def check_for_ros2(section: OutputSection) -> None:
+    """Raises UsageError for frames that tf2 does not take."""
     frames = (section.map_frame, section.odom_frame, section.base_frame)
     if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
         raise UsageError(
             f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 takes three different names "
             "that do not begin with a slash"
         )
-    link = f"{section.odom_frame} -> {section.base_frame}"
-    if section.publish_odom:
-        if section.driver_odom_topic:
-            raise UsageError(
-                f"[output] driver_odom_topic = {section.driver_odom_topic!r} names a driver that publishes {link}, and so does this "
-                "program: set publish_odom = false"
-            )
-        return section
-    topic = section.driver_odom_topic or (wheel_topic and f"/{wheel_topic.lstrip('/')}")
-    if not topic:
-        raise UsageError(
-            f"[output] publish_odom = false: {section.map_frame} -> {section.odom_frame} needs the pose of the driver that publishes "
-            f"{link}; set driver_odom_topic to its nav_msgs/Odometry, such as /odom, or to /tf"
-        )
-    if topic.lstrip("/") == section.odom_topic.lstrip("/"):
-        raise UsageError(
-            f"[output] driver_odom_topic = {topic!r} is where this program publishes its own odometry (odom_topic); name the driver's"
-        )
-    return replace(section, driver_odom_topic=topic)

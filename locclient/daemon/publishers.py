@@ -1,8 +1,6 @@
-"""Publishers of estimates to the robot's own programs. To add one: a class and a line in PUBLISHERS."""
+"""Publishers of estimates to the robot's own programs. To add one: a class, and its format in `open_publisher`."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
@@ -10,25 +8,12 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import EstimateMessage, Placement, encode_message, robot_key
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from locclient.daemon.output_section import OutputSection, completed_for_ros2
+from locclient.daemon.output_section import OutputSection, check_for_ros2
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import PublishedPose
 
 _MAX_HYPOTHESES = 16
-
-
-@dataclass(frozen=True, slots=True)
-class PublisherInputs:
-    """What publishers are made of. intake: where commands of the robot's own programs go. wheel_topic: of the robot's driver."""
-
-    bus: Bus
-    site: str
-    robot: str
-    calibration: RigCalibration
-    intake: Intake
-    wheel_topic: str = Topics().wheel
 
 
 class Publisher(ABC):
@@ -52,10 +37,10 @@ class Publisher(ABC):
 
 
 class MessagePackPublisher(Publisher):
-    """EstimateMessage under the robot's key `estimate`."""
+    """EstimateMessage under the robot's key."""
 
-    def __init__(self, inputs: PublisherInputs, _: OutputSection) -> None:
-        self._bus, self._key = inputs.bus, robot_key(inputs.site, inputs.robot, "estimate")
+    def __init__(self, bus: Bus, key: str) -> None:
+        self._bus, self._key = bus, key
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         body_from_base = se3_inverse(base_from_body)
@@ -76,21 +61,18 @@ class MessagePackPublisher(Publisher):
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
 
-def _ros2(inputs: PublisherInputs, section: OutputSection) -> Publisher:
-    from locclient.daemon.ros2_localizer import Ros2Localizer
+def open_publisher(
+    section: OutputSection, bus: Bus, site: str, robot: str, calibration: RigCalibration, intake: Intake
+) -> Publisher:
+    """The publisher that the section asks for. intake: where commands of the robot's own programs go.
 
-    completed = completed_for_ros2(section, inputs.wheel_topic)
-    return Ros2Localizer(inputs.bus, inputs.robot, completed, inputs.calibration, inputs.intake)
+    UsageError for an unknown format or a topic that is none.
+    """
+    if section.format == "messagepack":
+        return MessagePackPublisher(bus, robot_key(site, robot, "estimate"))
+    if section.format == "ros2":
+        from locclient.daemon.ros2_localizer import Ros2Localizer
 
-
-PUBLISHERS: dict[str, Callable[[PublisherInputs, OutputSection], Publisher]] = {
-    "messagepack": MessagePackPublisher,
-    "ros2": _ros2,
-}
-
-
-def open_publisher(inputs: PublisherInputs, section: OutputSection) -> Publisher:
-    """The publisher that the section asks for; UsageError for an unknown format or a topic that is none."""
-    if section.format not in PUBLISHERS:
-        raise UsageError(f"[output] format = {section.format!r}; known are {', '.join(PUBLISHERS)}")
-    return PUBLISHERS[section.format](inputs, section)
+        check_for_ros2(section)
+        return Ros2Localizer(bus, robot, section, calibration, intake)
+    raise UsageError(f"[output] format = {section.format!r}; known are messagepack and ros2")

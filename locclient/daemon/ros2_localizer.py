@@ -166,7 +166,7 @@ class Ros2Localizer(Publisher):
     def __init__(
         self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
     ) -> None:
-        """section: from `completed_for_ros2`. Raises UsageError for names that are none."""
+        """Raises UsageError for names that are none."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
         self.grid_height_m = section.robot_height_m if section.map_topic else None
         self._grid: OccupancyGrid | None = None
@@ -213,8 +213,6 @@ class Ros2Localizer(Publisher):
         node.subscribe(section.tf_topic, "tf2_msgs/TFMessage", self._hear_tf, Qos(100))
         if not section.publish_odom:
             node.subscribe(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", self._driver.handle_tf_static, LATCHED)
-            if node.resolved(section.driver_odom_topic) != node.resolved(section.tf_topic):
-                node.subscribe(section.driver_odom_topic, "nav_msgs/Odometry", self._driver.handle_odometry)
         node.serve("~/get_state", "lifecycle_msgs/srv/GetState", lambda _: encode_state(self._state))
         node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
         node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())

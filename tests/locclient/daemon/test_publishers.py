@@ -11,9 +11,10 @@ from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.cdr import CdrReader
 from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection
-from locclient.daemon.publishers import PublisherInputs, open_publisher
+from locclient.daemon.publishers import open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub
@@ -22,9 +23,9 @@ from support.recordings.recording_samples import calibration
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
 
 
-def inputs(bus: MemoryBus) -> PublisherInputs:
+def inputs(bus: MemoryBus) -> tuple[MemoryBus, str, str, RigCalibration, Intake]:
     intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
-    return PublisherInputs(bus, "hall", "r1", calibration(), intake)
+    return (bus, "hall", "r1", calibration(), intake)
 
 
 def published(section: OutputSection, *estimates: object) -> dict[str, list[bytes]]:
@@ -32,7 +33,7 @@ def published(section: OutputSection, *estimates: object) -> dict[str, list[byte
     hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
-        publisher, odom = open_publisher(inputs(bus), section), ContinuousOdom(BASE_FROM_BODY)
+        publisher, odom = open_publisher(section, *inputs(bus)), ContinuousOdom(BASE_FROM_BODY)
         for one in estimates:
             publisher.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
         publisher.close()
@@ -79,7 +80,7 @@ def test_the_building_is_told_once_the_map_says_it() -> None:
     key = ros_key(0, "/tf_static", "tf2_msgs/TFMessage")
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe(key, lambda _, payload: heard.append(decode_frame_links(payload)))
-        publisher = open_publisher(inputs(bus), OutputSection(format="ros2", building_frame="building"))
+        publisher = open_publisher(OutputSection(format="ros2", building_frame="building"), *inputs(bus))
         odom = ContinuousOdom(BASE_FROM_BODY)
         for known in (None, building_from_map, building_from_map.copy(), None):
             one = estimate(5.0)
@@ -98,7 +99,7 @@ def test_the_building_is_told_once_the_map_says_it() -> None:
 )
 def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: str) -> None:
     with MemoryBus(MemoryHub()) as bus, pytest.raises(UsageError, match=said):
-        open_publisher(inputs(bus), OutputSection(**section))
+        open_publisher(OutputSection(**section), *inputs(bus))
 
 
 def test_odom_is_continuous_once_a_place_was_named() -> None:

@@ -16,7 +16,7 @@ from fleetmap.recordings.ros2.messages import encode_compressed_image, encode_im
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
 from locclient.daemon.output_section import OutputSection
-from locclient.daemon.publishers import PublisherInputs, open_publisher
+from locclient.daemon.publishers import open_publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.nav2_client import eventually, message_name, typestore
@@ -42,7 +42,7 @@ def test_nav2_on_dds_reaches_the_localizer() -> None:
     with bridge() as dds, Bus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
         commands = intake()
         section = OutputSection(format="ros2", keys="ros2dds", autostart=False)
-        localizer = open_publisher(PublisherInputs(bus, "hall", "r1", calibration(), commands), section)
+        localizer = open_publisher(section, bus, "hall", "r1", calibration(), commands)
 
         def tokens() -> list[str]:
             replies = dds.liveliness().get("@/*/@ros2_lv/**", timeout=1.0)
@@ -52,7 +52,7 @@ def test_nav2_on_dds_reaches_the_localizer() -> None:
                 if reply.ok and "@ros2_lv/" in str(reply.ok.key_expr)
             ]
 
-        assert eventually(lambda: len(tokens()) == 21)
+        assert eventually(lambda: len(tokens()) == 20), tokens()
         announced = tokens()
         assert "SS/fleetmap_localizer§change_state/lifecycle_msgs§srv§ChangeState" in announced
         assert [

@@ -16,7 +16,7 @@ from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection
-from locclient.daemon.publishers import PublisherInputs, open_publisher
+from locclient.daemon.publishers import open_publisher
 from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
@@ -66,8 +66,8 @@ def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
     programs: list[LifecycleManager] = []
     with rmw_router(free_port()) as endpoint, Bus.connect(endpoint, is_ros=True) as bus:
         intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
-        inputs = PublisherInputs(bus, "hall", "r1", calibration(), intake)
-        localizer = open_publisher(inputs, OutputSection(**settings))
+        inputs = (bus, "hall", "r1", calibration(), intake)
+        localizer = open_publisher(OutputSection(**settings), *inputs)
         assert isinstance(localizer, Ros2Localizer)
 
         def opened() -> LifecycleManager:
@@ -304,13 +304,11 @@ def test_bytes_that_are_no_message_change_nothing(robot: Robot, caplog: pytest.L
 def test_diagnostics_say_status_and_cause(statuses: list[Status], silent: bool, level: int, words: str) -> None:
     hub, heard = MemoryHub(), []  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
-        inputs = PublisherInputs(
-            bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0)
-        )
+        inputs = (bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0))
         other.subscribe(
             ros_key(0, "/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: heard.append(data)
         )
-        localizer = open_publisher(inputs, OutputSection(format="ros2"))
+        localizer = open_publisher(OutputSection(format="ros2"), *inputs)
         odom = ContinuousOdom(np.eye(4))
         for one in (estimate(1.0, status) for status in statuses):
             localizer.publish(one, odom.handle(one), np.eye(4))
@@ -342,13 +340,11 @@ def test_planners_get_the_grid_of_the_version(robot: Robot) -> None:
 
 def test_names_that_are_none_are_refused_at_once() -> None:
     with MemoryBus(MemoryHub()) as bus:
-        inputs = PublisherInputs(
-            bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0)
-        )
+        inputs = (bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0))
         with pytest.raises(UsageError, match="a b"):
-            open_publisher(inputs, OutputSection(format="ros2", pose_topic="a b"))
+            open_publisher(OutputSection(format="ros2", pose_topic="a b"), *inputs)
         with pytest.raises(UsageError, match="cyclone"):
-            open_publisher(inputs, OutputSection(format="ros2", keys="cyclone"))
-        plain = open_publisher(inputs, OutputSection(format="ros2", map_topic=""))
+            open_publisher(OutputSection(format="ros2", keys="cyclone"), *inputs)
+        plain = open_publisher(OutputSection(format="ros2", map_topic=""), *inputs)
         assert plain.grid_height_m is None, "another program publishes the map"
         plain.close()

@@ -24,8 +24,8 @@ from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.sources.intake import Intake
 from locclient.config import read_config
 from locclient.daemon.driver_odometry import Missing, PoseHistory
-from locclient.daemon.output_section import OutputSection, completed_for_ros2
-from locclient.daemon.publishers import Publisher, PublisherInputs, open_publisher
+from locclient.daemon.output_section import OutputSection, check_for_ros2
+from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY
@@ -55,7 +55,7 @@ def truth(at_ms: float) -> Array:
 
 @dataclass(frozen=True)
 class Case:
-    """A drive. changes_ms: when the driver's odometry starts anew at zero. lost_ms: no driver from, to. sends: what of it is heard."""
+    """A drive. changes_ms: when the driver's odometry starts anew at zero. lost_ms: no driver from, to."""
 
     publish_odom: bool = False
     begun_at: Array | None = None
@@ -65,7 +65,6 @@ class Case:
     delay_ms: int = 0
     is_shuffled: bool = False
     child: str = "base_link"
-    sends: tuple[str, ...] = ("/odom", "/tf")
     section: tuple[tuple[str, Any], ...] = ()
 
     def odom_from_base(self, at_ms: float) -> Array:
@@ -84,8 +83,7 @@ class Case:
 
 CASES = {
     "we publish odom -> base_link": Case(publish_odom=True),
-    "the driver's Odometry": Case(sends=("/odom",)),
-    "the driver's /tf": Case(sends=("/tf",), section=(("driver_odom_topic", "/tf"),)),
+    "the driver": Case(),
     "a driver that ran long before": Case(begun_at=planar(-140.0, 320.0, 2.5)),
     "the driver starts anew after 1.5 s": Case(begun_at=planar(40, 2, 1), changes_ms=(2500,), lost_ms=(1000, 2500)),
     "the driver's odometry is reset": Case(begun_at=planar(40, 2, 1), changes_ms=(1510, 2310)),
@@ -112,20 +110,6 @@ def tf_message(frames: tuple[str, str], parent_from_child: Array, at_ms: float) 
     placed = TYPES["geometry_msgs/msg/Transform"](moved, TYPES["geometry_msgs/msg/Quaternion"](*xyzw))
     link = TYPES["geometry_msgs/msg/TransformStamped"](stamped(frames[0], at_ms), frames[1], placed)
     return TYPES["tf2_msgs/msg/TFMessage"]([link])
-
-
-def odometry_message(frames: tuple[str, str], parent_from_child: Array, at_ms: float, variance: float = 0.01) -> Any:
-    xyzw = quat_wxyz_from_rotation(parent_from_child[:3, :3])[[1, 2, 3, 0]]
-    placed = TYPES["geometry_msgs/msg/Pose"](
-        TYPES["geometry_msgs/msg/Point"](*parent_from_child[:3, 3]), TYPES["geometry_msgs/msg/Quaternion"](*xyzw)
-    )
-    vector = TYPES["geometry_msgs/msg/Vector3"]
-    twist = TYPES["geometry_msgs/msg/Twist"](vector(1.5, 0, 0), vector(0, 0, 0.5))
-    return TYPES["nav_msgs/msg/Odometry"](
-        stamped(frames[0], at_ms), frames[1],
-        TYPES["geometry_msgs/msg/PoseWithCovariance"](placed, np.full(36, variance)),
-        TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)),
-    )  # fmt: skip
 
 
 class World:
@@ -161,8 +145,8 @@ class World:
         """Another run of the localizer; its odometry begins where the robot is."""
         self.close()
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
-        inputs = PublisherInputs(MemoryBus(self.hub), "hall", "r1", calibration(), intake)
-        self.localizer = open_publisher(inputs, self.section)
+        inputs = (MemoryBus(self.hub), "hall", "r1", calibration(), intake)
+        self.localizer = open_publisher(self.section, *inputs)
         self.odom, self.begun_ms = ContinuousOdom(BASE_FROM_BODY), at_ms
         if self.case.child != "base_link":
             self.put(
@@ -175,20 +159,11 @@ class World:
         self.bus.publish(key, bytes(STORE.serialize_cdr(message, type_name)))
 
     def drive(self, at_ms: int) -> None:
-        """The driver's messages of a moment. What the localizer is not to hear goes to tf2 alone."""
+        """The driver's message of a moment."""
         base = self.case.odom_from_base(at_ms)
         odom_from_child = base if self.case.child == "base_link" else base @ se3_inverse(FOOTPRINT_FROM_BASE)
-        frames, link_type = (self.section.odom_frame, self.case.child), "tf2_msgs/msg/TFMessage"
-        if "/odom" in self.case.sends:
-            self.put(
-                ros_key(0, "/odom", "nav_msgs/Odometry"),
-                odometry_message(frames, odom_from_child, at_ms),
-                "nav_msgs/msg/Odometry",
-            )
-        if "/tf" in self.case.sends:
-            self.put(self.key(""), tf_message(frames, odom_from_child, at_ms), link_type)
-        else:
-            self.heard_by_tf2.append((tf_message(frames, odom_from_child, at_ms), False))
+        message = tf_message((self.section.odom_frame, self.case.child), odom_from_child, at_ms)
+        self.put(self.key(""), message, "tf2_msgs/msg/TFMessage")
 
     def frame(self, at_ms: int, **changes: Any) -> None:
         """A localized frame, taken at this moment."""
@@ -275,7 +250,7 @@ def heard(world: World) -> tuple[int, str]:
 
 def driven(sends: Callable[[World, int], None]) -> World:
     """Two seconds of frames with what is sent for every message of the driver."""
-    world = World(Case(sends=()))
+    world = World(Case())
     for at_ms in range(0, 2000, DRIVER_MS):
         sends(world, at_ms)
         if at_ms % FRAME_MS == 0 and at_ms > 0:
@@ -283,10 +258,10 @@ def driven(sends: Callable[[World, int], None]) -> World:
     return world
 
 
-def odometry(frames: tuple[str, str], shift_ms: int = 0, **changes: Any) -> Callable[[World, int], None]:
+def link(frames: tuple[str, str], shift_ms: int = 0) -> Callable[[World, int], None]:
     def send(world: World, at_ms: int) -> None:
-        message = odometry_message(frames, world.case.odom_from_base(at_ms), at_ms + shift_ms, **changes)
-        world.put(ros_key(0, "/odom", "nav_msgs/Odometry"), message, "nav_msgs/msg/Odometry")
+        message = tf_message(frames, world.case.odom_from_base(at_ms), at_ms + shift_ms)
+        world.put(world.key(""), message, "tf2_msgs/msg/TFMessage")
 
     return send
 
@@ -304,22 +279,13 @@ def two_drivers(world: World, at_ms: int) -> None:
     ("sends", "words"),
     [
         (lambda *_: None, "none has come"),
-        (odometry(("odom_combined", "base_link")), "'base_link' in 'odom_combined': set [output] odom_frame"),
-        (odometry(("odom", "base_footprint")), "'base_footprint' in 'odom': set [output] odom_frame and base_frame"),
-        (odometry(("odom", "base_link"), variance=np.inf), "it holds no pose"),
-        (odometry(("odom", "base_link"), shift_ms=-9000), "the newest one is stamped 8.9"),
-        (odometry(("odom", "base_link"), shift_ms=9000), "the oldest one is stamped"),
+        (link(("odom_combined", "base_link")), "'base_link' in 'odom_combined': set [output] odom_frame"),
+        (link(("odom", "base_footprint")), "'base_footprint' in 'odom', and /tf_static no way"),
+        (link(("odom", "base_link"), shift_ms=-9000), "the newest one is stamped 8.9"),
+        (link(("odom", "base_link"), shift_ms=9000), "the oldest one is stamped"),
         (two_drivers, "do two programs publish it?"),
     ],
-    ids=[
-        "silent",
-        "another odom",
-        "base_footprint without /tf_static",
-        "no pose",
-        "old",
-        "of another clock",
-        "two drivers",
-    ],
+    ids=["silent", "another odom", "base_footprint without /tf_static", "old", "of another clock", "two drivers"],
 )
 def test_map_to_odom_is_not_sent_without_the_drivers_pose_and_diagnostics_say_why(sends: Any, words: str) -> None:
     world = driven(sends)
@@ -330,26 +296,6 @@ def test_map_to_odom_is_not_sent_without_the_drivers_pose_and_diagnostics_say_wh
         "TRACKING; map -> odom is not sent: the driver's pose of base_link in odom is not known: "
     )
     assert words in message
-    world.close()
-
-
-def test_a_filter_on_tf_counts_more_than_the_wheels_odometry() -> None:
-    """robot_localization publishes odom -> base_link; /odom of the wheels is then in a frame that nobody composes with."""
-
-    def send(world: World, at_ms: int) -> None:
-        message = odometry_message(("odom", "base_link"), planar(70, 0, 2) @ world.case.odom_from_base(at_ms), at_ms)
-        world.put(ros_key(0, "/odom", "nav_msgs/Odometry"), message, "nav_msgs/msg/Odometry")
-        world.put(
-            world.key(""),
-            tf_message(("odom", "base_link"), world.case.odom_from_base(at_ms), at_ms),
-            "tf2_msgs/msg/TFMessage",
-        )
-
-    world = driven(send)
-    for stamp_ns, map_from_odom in world.sent["map", "odom"]:
-        at_ms = (stamp_ns - BEGUN_NS) // MS
-        np.testing.assert_allclose(map_from_odom @ world.case.odom_from_base(at_ms), truth(at_ms), atol=1e-3)
-    assert heard(world) == (0, "TRACKING")
     world.close()
 
 
@@ -365,7 +311,7 @@ def test_stray_stamps_cost_moments_and_a_clock_that_is_set_back_half_a_second() 
 
 def test_other_programs_with_the_same_transforms_are_named() -> None:
     for publish_odom, frames in ((True, ("odom", "base_link")), (True, ("map", "odom")), (False, ("map", "odom"))):
-        world = World(Case(publish_odom=publish_odom, sends=()))
+        world = World(Case(publish_odom=publish_odom))
         world.frame(0)
         assert heard(world) == (0, "TRACKING"), "what it sent itself comes back to it"
         world.put(world.key(""), tf_message(frames, np.eye(4), 0), "tf2_msgs/msg/TFMessage")
@@ -375,18 +321,12 @@ def test_other_programs_with_the_same_transforms_are_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "wheel", "words"),
-    [
-        ({"publish_odom": False}, "", "needs the pose of the driver"),
-        ({"publish_odom": False, "driver_odom_topic": "visual_odom"}, "/odom", "its own odometry"),
-        ({"driver_odom_topic": "/odom"}, "/odom", "set publish_odom = false"),
-        ({"odom_frame": "map"}, "/odom", "three different names"),
-        ({"base_frame": "/base_link"}, "/odom", "begin with a slash"),
-    ],
+    ("settings", "words"),
+    [({"odom_frame": "map"}, "three different names"), ({"base_frame": "/base_link"}, "begin with a slash")],
 )
-def test_a_tree_that_cannot_be_right_is_refused_at_start(settings: dict[str, Any], wheel: str, words: str) -> None:
+def test_a_tree_that_cannot_be_right_is_refused_at_start(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        completed_for_ros2(OutputSection(format="ros2", **settings), wheel)
+        check_for_ros2(OutputSection(format="ros2", **settings))
 
 
 def test_the_covariance_is_that_of_the_base() -> None:
@@ -410,10 +350,9 @@ def test_the_covariance_is_that_of_the_base() -> None:
     )
 
 
-def test_the_shipped_example_has_one_publisher_of_map_and_a_pose_of_the_driver() -> None:
+def test_the_shipped_example_has_one_publisher_of_map() -> None:
     folder = REPOSITORY / "deploy/ros2"
     config, _ = read_config(folder / "locclient.toml", {})
-    assert completed_for_ros2(config.output, config.topics.wheel).driver_odom_topic == "/odom"
     params = yaml.safe_load((folder / "nav2_params.yaml").read_text())
     assert params["lifecycle_manager_localization"]["ros__parameters"]["node_names"] == [config.output.node]
     assert (config.output.map_topic, config.output.autostart) == ("map", False)

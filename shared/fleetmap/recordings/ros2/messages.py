@@ -198,16 +198,6 @@ def encode_odometry(sample: WheelSample, frame_id: str, child_frame_id: str) -> 
     return writer.doubles(variances).message()
 
 
-def decode_odometry_pose(data: bytes) -> FrameLink:
-    """The pose of nav_msgs/Odometry: from its frame to its child frame. ValueError for one that its covariance calls unknown."""
-    reader = CdrReader(data)
-    stamp_ns, parent, child = reader.stamp_ns(), reader.text().lstrip("/"), reader.text().lstrip("/")
-    parent_from_child, variances = _target_from_source(reader.doubles(7)), np.diag(reader.doubles(36).reshape(6, 6))
-    if not np.isfinite(variances).all():
-        raise ValueError(f"the variances of its pose are {variances.tolist()}; it holds no pose")
-    return FrameLink(parent, child, parent_from_child, stamp_ns)
-
-
 def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
     reader = CdrReader(data)
