@@ -95,17 +95,19 @@ class Keyframe:
     def pyramid(self) -> patch_align.Pyramid:
         return self.pictures.pyramid
 
-    def with_pictures(self, *, whole: bool) -> "Keyframe":
-        """The same keyframe with its pictures in memory; unless `whole`, only the left one's pyramid."""
-        pictures, images = self.pictures, MemoryImageStore()
-        if not whole:
-            frame = RectifiedFrame(self.stamp_ns, pictures.pyramid[0], None, None)
-            pictures = Pictures(frame, pictures.pyramid)
-        return replace(self, images=images, image_number=images.put(pictures))
+    def with_pyramid(self) -> "Keyframe":
+        """The same keyframe with the left picture's pyramid in memory, and no other picture."""
+        images, pyramid = MemoryImageStore(), self.pyramid
+        frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, None)
+        return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)))
 
     def without_pictures(self) -> "Keyframe":
         """The same keyframe with an empty image store, cheap to send where only features are compared."""
         return replace(self, images=MemoryImageStore(), image_number=0)
+
+    def measured(self, features: NDArray[np.integer]) -> Array:
+        """(n, 2) disparities of features (n,) and their sigmas as its own pictures have them; NaN where other keyframes say them."""
+        return np.full((len(features), 2), np.nan) if self.from_views else self.disparities[features]
 
     @property
     def median_depth_m(self) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
-from fleetmap.features import patch_align, stereo
+from fleetmap.features import patch_align
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -98,9 +98,9 @@ def _refined(
     sure = np.isfinite(aligned[:, 0])
     left[sure] = aligned[sure, :2]
     sigma[sure] = np.hypot(noise.aligned_sigma_px, aligned[sure, 2])
-    depth = stereo.disparities(keyframe.frame, base.camera, left, settings.stereo, keyframe.disparities[features, 0])
-    sigma_depth = np.hypot(noise.disparity_sigma_px, np.nan_to_num(depth[:, 1], nan=1.0))
-    pixels = np.column_stack([left, left[:, 0] - depth[:, 0]])
+    disparities, sigmas = keyframe.measured(features).T
+    sigma_depth = np.hypot(noise.disparity_sigma_px, np.nan_to_num(sigmas, nan=1.0))
+    pixels = np.column_stack([left, left[:, 0] - disparities])
     return Sighting(rows, features, pixels, np.column_stack([sigma, sigma_depth]))
 
 

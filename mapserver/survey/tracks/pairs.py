@@ -116,8 +116,7 @@ def _from_descriptors(
     pairs = match_mutual(*descriptors, settings.max_distance, settings.ratio, nodes)
     index_a, index_b = known[pairs[:, 0]], pairs[:, 1]
     pixels, scale = b.features.pixels[index_b], _SCALES[b.features.octaves[index_b]]
-    disparities = np.full(len(pixels), np.nan) if b.from_views else b.disparities[index_b, 0]
-    measured = np.column_stack([pixels, pixels[:, 0] - disparities])
+    measured = np.column_stack([pixels, pixels[:, 0] - b.measured(index_b)[:, 0]])
     sigmas = np.column_stack([settings.match_sigma_px * scale, np.maximum(settings.match_sigma_px, scale)])
     matches = Correspondences(camera, a.points_cam[index_a], measured, sigmas)
     least = settings.min_inliers

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features import patch_align, stereo
+from fleetmap.features import patch_align
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, Pictures, PosedKeyframes, of_features
+from mapserver.survey.state import Keyframe, Landmarks, PosedKeyframes, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 
 # Of an image: its pyramid, pixels (M, 2), octaves (M,) and angles (M,) of features, and which of them are chosen (N,).
@@ -172,12 +171,12 @@ def _observe(
         for group, rows in zip(groups, rows_of, strict=True):
             references = table[reference_row[rows]]
             sources = np.unique(references[:, 0]).tolist()
-            known = {k: keyframes[k].with_pictures(whole=k in group) for k in sorted({*group, *sources})}
+            known = {k: keyframes[k].with_pyramid() for k in sorted({*group, *sources})}
             at = {k: map_from_cam[k] for k in known}
             yield _ObservationBatch(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, at)
 
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
-    found = executor.map(_observe_batch, (posed.camera, settings), batches())
+    found = executor.map(_observe_batch, settings, batches())
     for rows, (batch_pixels, batch_sigmas) in zip(rows_of, found, strict=True):
         pixels[rows], sigmas[rows] = batch_pixels, batch_sigmas
     return pixels, sigmas
@@ -196,15 +195,14 @@ class _ObservationBatch:
     map_from_cam: dict[int, Array]
 
 
-def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _ObservationBatch) -> tuple[Array, Array]:
+def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[Array, Array]:
     """Pixels (M, 3) and sigmas (M, 2) of one batch."""
-    camera, settings = shared
     noise, align, keyframes = settings.noise, settings.align, batch.keyframes
     limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
     for k in np.unique(batch.table[:, 0]).tolist():
         rows = np.flatnonzero(batch.table[:, 0] == k)
-        own, pictures = keyframes[k], keyframes[k].pictures
+        own = keyframes[k]
         features, references, is_reference = batch.table[rows, 2], batch.references[rows], batch.is_reference[rows]
         points_map = batch.points_map[rows]
         left, sigma = (
@@ -219,19 +217,19 @@ def _observe_batch(shared: tuple[StereoCamera, SurveySettings], batch: _Observat
         for source, inner in zip(sources.tolist(), np.split(others, starts)[1:], strict=True):
             cam_from_source = cam_from_map @ batch.map_from_cam[source]
             points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
-            theirs = _patch_features(keyframes[source], keyframes[source].pictures, references[inner, 2])
-            ours = _patch_features(own, pictures, features[inner])
+            theirs = _patch_features(keyframes[source], references[inner, 2])
+            ours = _patch_features(own, features[inner])
             refined = core.align_observations(theirs, ours, points_source, cam_from_source, *limits)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
-        found = stereo.disparities(pictures.frame, camera, left, settings.stereo, own.disparities[features, 0])
-        pixels[rows] = np.column_stack([left, left[:, 0] - found[:, 0]])
-        sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(found[:, 1], nan=1.0))])
+        disparities, its_sigmas = own.measured(features).T
+        pixels[rows] = np.column_stack([left, left[:, 0] - disparities])
+        sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(its_sigmas, nan=1.0))])
     return pixels, sigmas
 
 
-def _patch_features(keyframe: Keyframe, pictures: Pictures, chosen: NDArray[np.int64]) -> _PatchFeatures:
+def _patch_features(keyframe: Keyframe, chosen: NDArray[np.int64]) -> _PatchFeatures:
     own = keyframe.features
     pixels, octaves = np.ascontiguousarray(own.pixels, np.float64), np.ascontiguousarray(own.octaves, np.int8)
-    return pictures.pyramid, pixels, octaves, np.ascontiguousarray(own.angles_deg, np.float32), chosen
+    return keyframe.pyramid, pixels, octaves, np.ascontiguousarray(own.angles_deg, np.float32), chosen
