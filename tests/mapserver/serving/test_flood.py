@@ -38,7 +38,7 @@ from mapserver.store import Actor, FailureFilter, MapStore, TokenRow
 from support.fleet.dashboard_scene import Served, serving
 from support.storage.map_samples import save_sample_draft
 
-SECONDS = float(os.environ.get("FLOOD_SECONDS", "3"))
+SECONDS = float(os.environ.get("FLOOD_SECONDS", "1.5"))
 PICTURE = Thumbnail(stamp_ns=1, kind="frame", jpeg=b"\xff\xd8" + bytes(60_000) + b"\xff\xd9")
 FAILURE = FailureReport(
     site="lab",
@@ -124,7 +124,7 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
         thread.start()
         try:
             until_s = time.monotonic() + SECONDS
-            while time.monotonic() < until_s:
+            while time.monotonic() < until_s or len(waits) < 4:
                 begun_s = time.monotonic()
                 decode_message(bus.get(robot_key("lab", calm, "wanted"), timeout_s=5.0), WantedVersion)
                 report = msgspec.structs.replace(FAILURE, robot=calm, id=f"{kind.replace(' ', '-')}-{len(waits)}")
@@ -142,7 +142,6 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
     more_mb, more_disk_mb = memory_mb(served) - before_mb, disk_mb(served.folder) - before_disk_mb
     print(f"{kind}: {sent[0]} sent, waits {max(waits):.3f} s, memory {more_mb:+.0f} MB, disk {more_disk_mb:+.1f} MB")
     assert sent[0] > 100
-    assert len(waits) >= 3
     assert sorted(waits)[-2] < 1.0, "one may meet another test; a flood that delays anybody delays more than one"
     assert more_mb < 50
     assert more_disk_mb < (50 if kind == "failures" else 10), (

@@ -1,6 +1,7 @@
 """The chained log: a line that was changed afterwards is found (row 38 of docs/security.md)."""
 
 import json
+import shutil
 import sqlite3
 from dataclasses import astuple
 from pathlib import Path
@@ -33,16 +34,23 @@ def rewrite(folder: Path, *statements: str) -> None:
             connection.execute(statement)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A signed store of some releases."""
-    with MapStore.open(tmp_path / "store", create=True) as store:
+    folder = tmp_path_factory.mktemp("audit") / "store"
+    with MapStore.open(folder, create=True) as store:
         for seed in range(2):
             save_sample_draft(store, seed=seed)
             releases.publish(store, "lab", actor=Actor("ada", "monday"))
         init_here(store)
         store.audit("enrolled", "tug-7", actor=Actor("ada", "", "ada", "10.0.0.1"))
-    return tmp_path / "store"
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """A copy to be changed."""
+    return shutil.copytree(made, tmp_path / "store")
 
 
 def test_an_honest_log_is_clean(folder: Path) -> None:
