@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleetmap.bus import Bus, RobotQuestions, is_loopback
+from fleetmap.bus import Bus, is_loopback
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.identity import MapAddress
@@ -49,7 +49,7 @@ def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
         raise UsageError(
             f"whose maps may be trusted at {server}? Copy trust/1.root.json of the server's store to the robot and name it: root"
         )
-    return TrustedMap(folder, site, data, ask_over(RobotQuestions(bus, address.robot), site))
+    return TrustedMap(folder, site, data, ask_over(bus, site, address.robot))
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from fleetmap.bus import Bus, Handle, RobotQuestions
+from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import (
@@ -28,10 +28,8 @@ from fleetmap.messages import (
     RobotAck,
     RobotHealth,
     WantedVersion,
-    blob_key,
     decode_message,
     encode_message,
-    manifest_key,
     robot_key,
 )
 from fleetmap.trust import TrustedMap
@@ -55,7 +53,7 @@ class ChunkReader:
 
     def __init__(
         self,
-        bus: Bus | RobotQuestions,
+        bus: Bus,
         *,
         timeout_s: float,
         patience_s: float,
@@ -132,7 +130,7 @@ class MapClient(MapSource):
         self._bus, self._cache = bus, cache
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
-        self._chunks = ChunkReader(RobotQuestions(bus, robot), timeout_s=timeout_s, patience_s=patience_s)
+        self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
         self.takes_grids = False  # of planners, where versions have them; a robot localizes without
         self._away: UnreachableError | None = None  # while tiles are read
@@ -253,11 +251,11 @@ class MapClient(MapSource):
         active = self._cache.active(self._site)
         is_active = active is not None and sha256 == active.blobs[0]
         max_bytes = MAX_MANIFEST_BYTES if is_active else self._admitted_bytes(wanted, sha256)
-        return checked_manifest(self._blob(manifest_key(self._site, version), sha256, max_bytes), wanted)
+        return checked_manifest(self._blob(self._key(f"manifests/{version}"), sha256, max_bytes), wanted)
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """The verified bytes of an address, from the cache or the server; errors as of `manifest`."""
-        return self._blob(blob_key(self._site, sha256), sha256, max_bytes)
+        return self._blob(self._key(f"blobs/{sha256}"), sha256, max_bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
         """As of MapSource, from the cache or the server. Once nobody answers, only the cache is asked, so that a robot without a
@@ -331,7 +329,7 @@ class MapClient(MapSource):
             return kept
         data = None
         if (sha256 := named.get(kind)) is not None:
-            data = verified(self._chunks.read(blob_key(self._site, sha256), max_bytes=max_bytes), sha256)
+            data = verified(self._chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
         self._cache.keep_file(self._site, kind, data)
         return data
 

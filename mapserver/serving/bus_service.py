@@ -13,17 +13,11 @@ from fleetmap.messages import (
     PoseMessage,
     RobotAck,
     RobotHealth,
-    blob_key,
     decode_message,
     encode_message,
-    manifest_key,
-    own_map_key,
     part_of,
-    patch_key,
     robot_key,
-    shared_map_key,
     split_key,
-    trust_key,
 )
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
@@ -68,16 +62,13 @@ class BusService:
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
             bus.queryable(robot_key("*", "*", "replays"), self._counted("replay", self._replay)),
-            # Under a robot's own keys, where the queue serves robots in turn, and for robots of before under those that all share.
             *(
-                bus.queryable(key, self._counted(what, self._parts(answer)))
-                for shared, what, answer in (
-                    (manifest_key("*", "*"), "manifest", self._manifest),
-                    (blob_key("*", "*"), "blob", self._blob),
-                    (patch_key("*", "*"), "patch", self._patch),
-                    (trust_key("*", "*"), "trust", self._list_file),
+                bus.queryable(robot_key("*", "*", f"{part}/*"), self._counted(what, self._parts(answer)))
+                for part, what, answer in (
+                    ("manifests", "manifest", self._manifest),
+                    ("blobs", "blob", self._blob),
+                    ("trust", "trust", self._list_file),
                 )
-                for key in (own_map_key(shared, "*"), shared)
             ),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
             bus.subscribe(live_key("*"), self._hear_survey),
@@ -125,7 +116,7 @@ class BusService:
         return counted
 
     def _parts(self, whole: Callable[[str], bytes]) -> Callable[[str, bytes], bytes]:
-        return lambda key, question: part_of(whole(shared_map_key(key)), question)
+        return lambda key, question: part_of(whole(key), question)
 
     def _sender(self, key: str) -> tuple[str, str]:
         """Site and robot of a robot's key; LinkError for one that may not speak, also where the bus let it through."""
@@ -161,7 +152,7 @@ class BusService:
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)
         if not number.isdecimal() or len(number) > 10:
-            raise LinkError(f"{number[:80]!r} is no version number; ask {manifest_key(site, 'NUMBER')}")
+            raise LinkError(f"{number[:80]!r} is no version number")
         info = self._store.version(site, int(number))
         if info.state == "draft":
             raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
@@ -176,10 +167,6 @@ class BusService:
         if self._store.served_kind(sha256, site) is None:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
         return self._recent.get(sha256)
-
-    def _patch(self, key: str) -> bytes:
-        """Robots of before ask for patches first, and for the whole where that is refused."""
-        raise LinkError(f"there are no patches any more ({key[:200]}); fetch the whole")
 
     def _hear(self, key: str, payload: bytes) -> None:
         what = key.rpartition("/")[2]

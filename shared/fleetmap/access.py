@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from fleetmap.messages import robot_key
+from fleetmap.messages import MAP_PARTS, robot_key
 
-SITE_ANSWERS = ("manifests", "blobs", "patches", "trust")
 REPORTS = ("ack", "health", "pose", "estimate")
 QUESTIONS = ("wanted", "failures", "replays", "renew")
 ORDERS = ("wanted", "initial_pose")
@@ -142,11 +141,8 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
             Rule(f"{name}-enrols", Direction.IN, (Act.QUERY,), renew),
             Rule(f"{name}-enrolled", Direction.OUT, (Act.REPLY,), renew),
         )
-    maps = tuple(f"fleetmap/{holder.site}/{what}/*" for what in SITE_ANSWERS)  # as robots of before ask
-    questions = own((*QUESTIONS, *(f"{what}/*" for what in SITE_ANSWERS)))
+    questions = own((*QUESTIONS, *(f"{what}/*" for what in MAP_PARTS)))
     return (
-        Rule(f"{holder.site}-asks", Direction.IN, (Act.QUERY,), maps),
-        Rule(f"{holder.site}-told", Direction.OUT, (Act.REPLY,), maps),
         Rule(f"{name}-asks", Direction.IN, (Act.QUERY,), questions),
         Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), questions),
         Rule(f"{name}-reports", Direction.IN, (Act.PUT,), own(REPORTS)),

@@ -10,10 +10,10 @@ fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: Fail
 fleetmap/{site}/robots/{robot}/replays   asked by the robot, ReplayPart: FailureAck, with how much of a failure's recording has come
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
 fleetmap/{site}/robots/{robot}/renew     asked by the robot with its next key: fleetmap.trust.enrolment
+fleetmap/{site}/robots/{robot}/manifests/{version} asked by the robot, ChunkRequest: Part of a manifest
+fleetmap/{site}/robots/{robot}/blobs/{sha256} asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
+fleetmap/{site}/robots/{robot}/trust/{file} asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
 fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
-fleetmap/{site}/manifests/{version}      asked by the robot, ChunkRequest: Part of a manifest
-fleetmap/{site}/blobs/{sha256}           asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
-fleetmap/{site}/trust/{file}             asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
 """
 
 import math
@@ -31,6 +31,7 @@ MAX_MESSAGE_BYTES = 1 << 20
 PART_BYTES = 256 << 10  # small enough to come within seconds over a poor radio, and to be asked for again
 MAX_THUMBNAIL_BYTES = 64 << 10  # four of them and the rest of a failure's report stay far below a message's limit
 _ROOT = "fleetmap"
+MAP_PARTS = ("manifests", "blobs", "trust")  # of what a robot asks for a map, behind its own name
 _MAX_KEY = 256  # two names and two addresses of bytes
 
 Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -374,47 +375,16 @@ def finite(value: Any) -> Any:
 
 
 def robot_key(site: str, robot: str, what: str) -> str:
-    """Key of a robot's wanted, initial_pose, ack, health, pose, estimate, failures, alive or renew; '*' for any site or robot."""
+    """Key of what a robot asks or tells, such as `wanted` or `blobs/{sha256}`; '*' for any site or robot."""
     return f"{_ROOT}/{site}/robots/{robot}/{what}"
 
 
-def manifest_key(site: str, version: int | str) -> str:
-    """Key of a version's manifest; '*' for any."""
-    return f"{_ROOT}/{site}/manifests/{version}"
-
-
-def blob_key(site: str, sha256: str) -> str:
-    """Key of the bytes of an address; '*' for any."""
-    return f"{_ROOT}/{site}/blobs/{sha256}"
-
-
-def patch_key(site: str, pair: str) -> str:
-    """Key under which robots of before ask for a patch between two addresses; '*' for any."""
-    return f"{_ROOT}/{site}/patches/{pair}"
-
-
-def trust_key(site: str, file: str) -> str:
-    """Key of a file of the signed lists, such as `timestamp.json`; '*' for any."""
-    return f"{_ROOT}/{site}/trust/{file}"
-
-
-def own_map_key(key: str, robot: str) -> str:
-    """The key under which a robot asks for what lies under the key of a map: the server's rules let it ask in no other name."""
-    root, site, rest = key.split("/", 2)
-    return f"{root}/{site}/robots/{robot}/{rest}"
-
-
-def shared_map_key(key: str) -> str:
-    """The key of a map that a robot asks for; inverse of `own_map_key`, and other keys as they are."""
-    chunks = key.split("/")
-    return "/".join((*chunks[:2], *chunks[4:])) if len(chunks) == 6 and chunks[2] == "robots" else key
-
-
 def split_key(key: str) -> tuple[str, str, str]:
-    """Site, robot (or 'live', 'manifests', 'blobs', 'patches', 'trust') and last chunk of a key; raises LinkError for any other."""
+    """Site, robot (or 'live') and last chunk of a key; raises LinkError for any other."""
     chunks = key.split("/") if len(key) <= _MAX_KEY else []
-    if len(chunks) == 5 and chunks[0] == _ROOT and chunks[2] == "robots":
-        return chunks[1], chunks[3], chunks[4]
-    if len(chunks) == 4 and chunks[0] == _ROOT and chunks[2] in {"live", "manifests", "blobs", "patches", "trust"}:
-        return chunks[1], chunks[2], chunks[3]
+    if chunks[:1] == [_ROOT]:
+        if chunks[2:3] == ["robots"] and (len(chunks) == 5 or (len(chunks) == 6 and chunks[4] in MAP_PARTS)):
+            return chunks[1], chunks[3], chunks[-1]
+        if len(chunks) == 4 and chunks[2] == "live":
+            return chunks[1], chunks[2], chunks[3]
     raise LinkError(f"key {key[:200]!r} is none of fleetmap's; its keys are listed in fleetmap.messages")

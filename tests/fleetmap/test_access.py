@@ -118,13 +118,13 @@ ALLOWED, DENIED = "honest", "silenced"
     ("key", "guarded"),
     [
         (OWN + "wanted", ALLOWED),
-        ("fleetmap/hall/blobs/00ff", ALLOWED),
         (OWN + "blobs/00ff", ALLOWED),
+        ("fleetmap/hall/blobs/00ff", DENIED),
         (OTHERS + "blobs/00ff", DENIED),
         (OWN + "renew", ALLOWED),
         (OTHERS + "wanted", DENIED),
         (OTHERS + "renew", DENIED),
-        ("fleetmap/yard/blobs/00ff", DENIED),
+        ("fleetmap/yard/robots/a/blobs/00ff", DENIED),
         ("fleetmap/yard/robots/a/wanted", DENIED),
     ],
 )
@@ -180,10 +180,10 @@ def test_nobody_answers_in_the_servers_place(make: Callable[[bool], World], is_g
         asked.append(key)
         return b"EVIL"
 
-    for key in ("fleetmap/hall/manifests/*", "fleetmap/**"):
+    for key in ("fleetmap/hall/robots/*/manifests/*", "fleetmap/**"):
         eve.queryable(key, lie)
     world.settle()
-    said = answer(bob, "fleetmap/hall/manifests/7")
+    said = answer(bob, OTHERS + "manifests/7")
     if is_guarded:
         assert (said, asked) == (DENIED, [])
     elif world.kind != "peer":  # a router passes nothing on between peers, so that there is no attack
@@ -297,18 +297,18 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
         for wrong in (fake.endpoint, elsewhere):
             victim = stack.enter_context(Bus.connect(wrong, tls=keys.robot("b.1")))
             with pytest.raises(UnreachableError):
-                victim.get("fleetmap/hall/blobs/00ff", timeout_s=1.0)
+                victim.get(OTHERS + "blobs/00ff", timeout_s=1.0)
             assert not victim.connected()
             assert "server's certificate is refused" in handshake_fault(wrong, keys.robot("b.1"))
         good = stack.enter_context(Bus.connect(endpoint, tls=keys.robot("b.1")))
-        assert good.get("fleetmap/hall/blobs/00ff") == b"honest"
+        assert good.get(OTHERS + "blobs/00ff") == b"honest"
         # The control: without TLS, or where it is not looked at who signed the server's certificate, the robot believes both.
         for how, robot in ((None, None), (keys.strangers.tls, TlsFiles(wrong_server.authority, stranger.own))):
             there = Bus.listen("tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0", tls=how)
             fake = stack.enter_context(there)
             fake.queryable("fleetmap/**", lambda *_: b"EVIL")
             victim = stack.enter_context(Bus.connect(fake.endpoint, tls=robot))
-            assert victim.get("fleetmap/hall/blobs/00ff") == b"EVIL"
+            assert victim.get(OTHERS + "blobs/00ff") == b"EVIL"
     assert "cannot be reached" in handshake_fault(endpoint, keys.robot("a.1"))
 
 
@@ -319,7 +319,7 @@ def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str)
     with Bus.listen(f"{protocol}/127.0.0.1:0", tls=keys.ours.tls, access=ACCESS) as server:
         server.queryable("fleetmap/*/robots/*/wanted", lambda key, _: key.encode())
         server.subscribe("fleetmap/*/robots/*/health", lambda key, _: heard.append(key))
-        closed = server.queryable("fleetmap/*/blobs/*", lambda *_: b"")
+        closed = server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"")
         closed.close()
         with (
             Bus.connect(server.endpoint, tls=keys.robot("a.1")) as a,
@@ -344,7 +344,7 @@ def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str)
                 bus.publish(own + "health", b"x")
             assert eventually(lambda: heard == [OTHERS + "health"], 3)
             with pytest.raises(UnreachableError):
-                b.get("fleetmap/hall/blobs/00", timeout_s=0.3)  # a closed handle stays closed
+                b.get(OTHERS + "blobs/00", timeout_s=0.3)  # a closed handle stays closed
             server.reopen(ACCESS)
             assert a.get(OWN + "wanted", timeout_s=5), "the control"
 
@@ -353,22 +353,22 @@ def test_a_damaged_certificate_does_not_close_the_bus(keys: Keys, tmp_path: Path
     own = tmp_path / "server.pem"
     own.write_bytes(keys.ours.tls.own.read_bytes())
     with Bus.listen("tls/127.0.0.1:0", tls=TlsFiles(keys.ours.tls.authority, own), access=ACCESS) as server:
-        server.queryable("fleetmap/*/blobs/*", lambda *_: b"honest")
+        server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"honest")
         with Bus.connect(server.endpoint, tls=keys.robot("a.1")) as robot:
             own.write_text("damaged")
             with pytest.raises(LinkError, match="the bus stays as it is"):
                 server.reopen(ACCESS)
-            assert robot.get("fleetmap/hall/blobs/00", timeout_s=10) == b"honest"
+            assert robot.get(OWN + "blobs/00", timeout_s=10) == b"honest"
 
 
 def test_rules_of_nobody_and_of_many() -> None:
-    """zenoh refuses empty lists; a site's rules are shared."""
+    """zenoh refuses empty lists."""
     config = Access([]).zenoh_config()["access_control"]
     assert config["default_permission"] == "deny"
     assert all(config[name] for name in ("rules", "subjects", "policies"))
     many = Access(Holder(f"r{n}.1", f"s{n % 3}", f"r{n}") for n in range(300)).zenoh_config()["access_control"]
-    assert len(many["rules"]) == 3 * 2 + 300 * 6
+    assert len(many["rules"]) == 300 * 6
     assert len({rule["id"] for rule in many["rules"]}) == len(many["rules"])
-    assert not permits(ACCESS, "a.1", Direction.IN, Act.ANSWER, "fleetmap/hall/blobs/*")
+    assert not permits(ACCESS, "a.1", Direction.IN, Act.ANSWER, OWN + "blobs/*")
     assert not permits(ACCESS, "a.1", Direction.IN, Act.SUBSCRIBE, "fleetmap/hall/robots/*/wanted")
     assert not any("@" in key for rule in many["rules"] for key in rule["key_exprs"])

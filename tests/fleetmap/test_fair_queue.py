@@ -9,7 +9,7 @@ from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
 
 def test_the_sender_stands_in_the_key() -> None:
     assert sender_of("fleetmap/hall/robots/tug-7/health") == "hall/tug-7"
-    assert sender_of("fleetmap/hall/blobs/abc") == SHARED
+    assert sender_of("fleetmap/hall/live/survey") == SHARED
     assert sender_of("") == SHARED
 
 

@@ -23,10 +23,8 @@ from fleetmap.messages import (
     Status,
     Thumbnail,
     WantedVersion,
-    blob_key,
     decode_message,
     encode_message,
-    manifest_key,
     report_dict,
     robot_key,
     split_key,
@@ -116,9 +114,8 @@ def test_oversized_and_foreign_messages_are_refused() -> None:
 
 def test_keys_can_be_taken_apart() -> None:
     assert split_key(robot_key("lab", "r1", "ack")) == ("lab", "r1", "ack")
-    assert split_key(manifest_key("lab", 3)) == ("lab", "manifests", "3")
-    assert split_key(blob_key("lab", "ab")) == ("lab", "blobs", "ab")
-    for key in ("", "fleetmap/lab", "other/lab/blobs/ab", "fleetmap/lab/robots/r1/ack/x"):
+    assert split_key(robot_key("lab", "r1", "manifests/3")) == ("lab", "r1", "3")
+    for key in ("", "fleetmap/lab", "other/lab/robots/r1/ack", "fleetmap/lab/blobs/ab", "fleetmap/lab/robots/r1/ack/x"):
         with pytest.raises(LinkError):
             split_key(key)
 

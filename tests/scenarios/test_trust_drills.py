@@ -95,7 +95,7 @@ class Robot:
     def __init__(self, drill: Drill, bus: Bus, name: str) -> None:
         folder, root = drill.folder / name, (drill.lists.folder / "1.root.json").read_bytes()
         self.client = MapClient(bus, TileCache(folder), SITE, name)
-        self.trust = TrustedMap(folder / "trust", SITE, root, ask_over(bus, SITE))
+        self.trust = TrustedMap(folder / "trust", SITE, root, ask_over(bus, SITE, name))
         self.client.require(self.trust)
 
     def ready(self) -> tuple[int | None, str]:

@@ -1,7 +1,7 @@
 """The bus between server and robots."""
 
 from fleetmap.bus.endpoints import TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
-from fleetmap.bus.zenoh_bus import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen, RobotQuestions
+from fleetmap.bus.zenoh_bus import MAX_MESSAGE_BYTES, Answer, Bus, Handle, LatchedPublisher, Listen
 
 __all__ = [
     "MAX_MESSAGE_BYTES",
@@ -10,7 +10,6 @@ __all__ = [
     "Handle",
     "LatchedPublisher",
     "Listen",
-    "RobotQuestions",
     "TlsFiles",
     "check_endpoint",
     "handshake_fault",

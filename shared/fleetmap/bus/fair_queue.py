@@ -9,7 +9,7 @@ _MAX_SENDERS = 20_000
 _MAX_BYTES = 32 << 20  # of all senders together
 _JOB_BYTES = 1000  # what a job takes beside its bytes, so that empty ones are bounded too
 SHARED = ""
-"""The sender of what names no robot: questions for bytes of maps, which all robots ask at once."""
+"""The sender of what names no robot, such as a survey under way."""
 
 _LIMITS = {False: (64, 2 << 20), True: (4096, 8 << 20)}  # messages and bytes that wait, of a robot and of SHARED
 _log = logging.getLogger(__name__)

@@ -5,7 +5,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Any, Self
 
@@ -16,7 +15,6 @@ from fleetmap.access import Access
 from fleetmap.bus.endpoints import TlsFiles, check_endpoint, has_tls, is_loopback, with_free_port
 from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UsageError
-from fleetmap.messages import own_map_key
 
 Answer = Callable[[str, bytes], bytes]
 """Bytes that answer the question (key, payload); a FleetmapError that it raises travels back as the answer's error."""
@@ -29,7 +27,6 @@ Attach = Callable[[bytes], bytes]
 
 MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one large message delays all others behind it
 _MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
-_ASK_AGAIN_AFTER_S = 600.0  # a server that was silent under a robot's own key
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
@@ -373,26 +370,6 @@ class Bus:
                 with self._lock:
                     if session is self._session or self._is_closed:
                         raise LinkError(f"the bus at {self.endpoint} refused ({error}); is it closed?") from error
-
-
-class RobotQuestions:
-    """Asks for maps under a robot's own keys, so that the server can serve robots in turn.
-
-    A server of before, which is silent there, is asked under the keys that all robots share.
-    """
-
-    def __init__(self, bus: Bus, robot: str, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._bus, self._robot, self._clock_s = bus, robot, clock_s
-        self._shared_until_s = 0.0
-
-    def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
-        """As Bus.get, with the shared key."""
-        if self._clock_s() >= self._shared_until_s:
-            with suppress(UnreachableError):
-                return self._bus.get(own_map_key(key, self._robot), payload, timeout_s=timeout_s)
-        answer = self._bus.get(key, payload, timeout_s=timeout_s)
-        self._shared_until_s = self._clock_s() + _ASK_AGAIN_AFTER_S
-        return answer
 
 
 def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None, str]:

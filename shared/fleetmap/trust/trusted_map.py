@@ -14,11 +14,11 @@ import msgspec
 from fleetmap.errors import LinkError, StoreError, UntrustedError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat.names import check_name
-from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, trust_key
+from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, robot_key
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus, RobotQuestions
+    from fleetmap.bus import Bus
 
 Ask = Callable[[str], bytes | None]
 """The bytes of a file of the signed lists, None where the server says that it has none; UnreachableError where nobody answers."""
@@ -227,11 +227,11 @@ def _time(seconds: float) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def ask_over(bus: "Bus | RobotQuestions", site: str, timeout_s: float = 5.0) -> Ask:
+def ask_over(bus: "Bus", site: str, robot: str, timeout_s: float = 5.0) -> Ask:
     """Asks the server on a bus. A file must come in one answer, so that nobody can make a robot wait for it byte by byte."""
 
     def ask(name: str) -> bytes | None:
-        answer = bus.get(trust_key(site, name), encode_message(ChunkRequest()), timeout_s=timeout_s)
+        answer = bus.get(robot_key(site, robot, f"trust/{name}"), encode_message(ChunkRequest()), timeout_s=timeout_s)
         part = decode_message(answer, Part)
         if part.offset or part.total_bytes != len(part.data):
             raise UntrustedError("size", f"{name} has {part.total_bytes} bytes, {len(part.data)} came in one answer")

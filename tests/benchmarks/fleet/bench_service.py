@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.fleet.server_process import SITE, measured, serving
 from fleetmap.bus import Bus
 from fleetmap.mapformat import Manifest, Tile, decode_manifest, decode_tile, verified
-from fleetmap.messages import WantedVersion, blob_key, decode_message, manifest_key, robot_key
+from fleetmap.messages import WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import ChunkReader
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
@@ -95,7 +95,7 @@ class _Robot:
         wanted = decode_message(self.bus.get(question, timeout_s=_PATIENCE_S), WantedVersion)
         assert wanted.manifest_sha256 is not None
         assert wanted.version is not None
-        key = manifest_key(SITE, wanted.version)
+        key = robot_key(SITE, self._name, f"manifests/{wanted.version}")
         old, new = (
             self.manifest,
             decode_manifest(verified(self._parts.read(key, max_bytes=1 << 24), wanted.manifest_sha256)),
@@ -103,7 +103,8 @@ class _Robot:
         known = set() if old is None else {old.vocabulary.sha256, *(tile.sha256 for tile in old.tiles)}
         for blob in (new.vocabulary, *new.tiles):
             if blob.sha256 not in known:
-                verified(self._parts.read(blob_key(SITE, blob.sha256), max_bytes=blob.bytes), blob.sha256)
+                key = robot_key(SITE, self._name, f"blobs/{blob.sha256}")
+                verified(self._parts.read(key, max_bytes=blob.bytes), blob.sha256)
         self.manifest = new
         return time.monotonic() - begun_s, self._parts.received_bytes - begun_bytes
 

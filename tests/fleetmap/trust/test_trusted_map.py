@@ -24,7 +24,7 @@ from tuf.api.metadata import (
 
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UntrustedError
 from fleetmap.mapformat import sha256_hex
-from fleetmap.messages import Part, WantedVersion, encode_message, trust_key
+from fleetmap.messages import Part, WantedVersion, encode_message, robot_key
 from fleetmap.trust import Ask, TrustedMap, ask_over, manifest_target, site_role, tuf_client
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 
@@ -295,8 +295,8 @@ def test_over_a_bus_answers_without_end_and_refusals_are_told(publisher: ListPub
 
     with MemoryBus(hub) as server, MemoryBus(hub) as bus:
         for answer, said in ((drip, "size: "), (refuse, "not now")):
-            handle = server.queryable(trust_key("*", "*"), answer)
-            robot = ListReader(tmp_path / said, ask_over(bus, SITE, 0.3), publisher.files["1.root.json"])
+            handle = server.queryable(robot_key("*", "*", "trust/*"), answer)
+            robot = ListReader(tmp_path / said, ask_over(bus, SITE, "r1", 0.3), publisher.files["1.root.json"])
             assert said in robot.refused()
             handle.close()
     assert len(asked) == 1

@@ -19,8 +19,6 @@ from fleetmap.messages import (
     WantedVersion,
     decode_message,
     encode_message,
-    manifest_key,
-    own_map_key,
     part_of,
     robot_key,
 )
@@ -70,7 +68,7 @@ class World:
         client = MapClient(bus, TileCache(self.folder / name), SITE, ROBOT)
         if trusting:
             root = (self.trust_folder / "1.root.json").read_bytes()
-            ask, folder = ask_over(bus, SITE), self.folder / name / "trust" / SITE
+            ask, folder = ask_over(bus, SITE, ROBOT), self.folder / name / "trust" / SITE
 
             def wall_s() -> float:
                 return datetime.now(UTC).timestamp() + self.ahead_s
@@ -253,7 +251,7 @@ def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
     length = info.manifest_bytes
     data = world.store.blob(info.manifest_sha256) + bytes(3_000_000)
     world.hub.queryables.insert(
-        0, (own_map_key(manifest_key(SITE, 2), ROBOT), lambda _, question: part_of(data, question), None)
+        0, (robot_key(SITE, ROBOT, "manifests/2"), lambda _, question: part_of(data, question), None)
     )
     with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {length} are expected"):
         client.fetch(client.wanted())
@@ -317,7 +315,7 @@ def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
         publish_samples(store, 1)
         service = BusService(store, Fleet(store), bus, lambda *_: None)
         client = MapClient(robot_bus, TileCache(tmp_path / "cache"), SITE, ROBOT)
-        client.require(TrustedMap(tmp_path / "trust", SITE, None, ask_over(robot_bus, SITE)))
+        client.require(TrustedMap(tmp_path / "trust", SITE, None, ask_over(robot_bus, SITE, ROBOT)))
         with pytest.raises(UntrustedError, match="the server has no signed lists"):
             client.fetch(client.wanted())
         init_here(store)

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.errors import LinkError, UnreachableError
+from fleetmap.errors import UnreachableError
 from fleetmap.mapformat import Tile, blob_path
-from fleetmap.messages import PART_BYTES, own_map_key, patch_key
+from fleetmap.messages import PART_BYTES
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from support.fleet.served_world import World, served_world
@@ -94,13 +94,6 @@ def test_a_night_costs_what_changed(world: World) -> None:
     assert world.hall.received_bytes - whole - unmoved < 0.35 * whole  # one tile of three
     fetched = world.hall.tiles(world.hall.manifest(world.hall.wanted()))
     np.testing.assert_allclose(fetched.tiles[0, 0].points_map[:450, 2], tiles[0].points_map[:450, 2] + 1.0, atol=1e-3)
-
-
-def test_a_robot_of_before_is_told_to_fetch_the_whole(world: World) -> None:
-    one, two = (tile.sha256 for tile in world.store.manifest("lab", 1).tiles)
-    for key in (patch_key("lab", f"{one}-{two}"), own_map_key(patch_key("lab", f"{one}-{two}"), "r1")):
-        with pytest.raises(LinkError, match="fetch the whole"):
-            world.robot_bus.get(key)
 
 
 @pytest.mark.parametrize("died_after", range(1, 8))
