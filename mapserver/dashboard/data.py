@@ -17,7 +17,7 @@ from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.dashboard.space.loops import Loop, loops_of_version
 from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
-from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
+from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
 from mapserver.floor_plan.survey_requests import SurveyRequest
@@ -228,7 +228,7 @@ class MapData:
 
     def survey_requests(self, site: str) -> list[SurveyRequest]:
         """What people asked to survey again."""
-        return survey_requests(self._store, site)
+        return self._store.survey_requests(site)
 
     def ask_for_survey(self, site: str, corners_map_m: Sequence[tuple[float, float]], actor: Actor) -> str:
         """Puts a polygon on the list of the next survey."""

@@ -55,7 +55,6 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
-from mapserver.floor_plan.survey_requests import open_requests
 from mapserver.grid.survey_grid import GridSession, grow_grid
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
@@ -354,7 +353,7 @@ def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, 
     places = joined.map.map_from_body[:, :2, 3]
     drives = map_trajectories(joined)
     found = {}
-    for request in open_requests(maps, site):
+    for request in maps.survey_requests(site):
         later = [
             drive.positions_m[:, :2]
             for drive in drives

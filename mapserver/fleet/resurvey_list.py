@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import TileEntry, decode_tile
-from mapserver.fleet.survey_requests import survey_requests
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.fleet_statistics.resurvey_decision import (
     ResurveySettings,
@@ -49,7 +48,7 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
         for since, until in ((recent_hour, 1 << 60), (before_hour, recent_hour))
     )
     found = concerns(recent, before, settings)
-    requests = survey_requests(store, site)
+    requests = store.survey_requests(site)
     if current is None:
         return ResurveyList(site, None, found, [], requests)
     manifest = store.manifest(site, current.version)

@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError
 from mapserver.floor_plan.areas import read_areas
-from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, open_requests
+from mapserver.floor_plan.survey_requests import KIND, SurveyRequest
 from mapserver.store import Actor, MapStore
 
 MOST_REQUESTS, MOST_CORNERS = 100, 200
@@ -23,7 +23,7 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
     """
     if store.current(site) is None:
         raise StateError(f"site {site} has no published map that could be surveyed again; publish one first")
-    if len(survey_requests(store, site)) >= MOST_REQUESTS:
+    if len(store.survey_requests(site)) >= MOST_REQUESTS:
         raise StateError(f"site {site} has {MOST_REQUESTS} requests that are not done; say of some that they are")
     if not 3 <= len(corners_map_m) <= MOST_CORNERS:
         raise UsageError(f"{len(corners_map_m)} corners; draw it with 3 to {MOST_CORNERS}")
@@ -46,12 +46,7 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
 
 def end_request(store: MapStore, site: str, request: str, actor: Actor) -> None:
     """Takes a request off the list: it was surveyed, or is not wanted any more. UsageError for one that is not there."""
-    if request not in {known.id for known in survey_requests(store, site)}:
+    store.current(site)  # an unknown site is not one without requests
+    if request not in {known.id for known in store.survey_requests(site)}:
         raise UsageError(f"site {site} has no open request {request[:40]!r} for a survey; it may be done already")
     store.keep_site_files(site, {KIND + request: None}, "done", actor=actor)
-
-
-def survey_requests(store: MapStore, site: str) -> list[SurveyRequest]:
-    """The open ones, oldest first; UsageError for an unknown site."""
-    store.current(site)
-    return open_requests(store, site)

@@ -1,7 +1,7 @@
-"""Polygons that people want surveyed again, as a site keeps them, and how much of one a survey has covered. Pure but for who reads them."""
+"""Polygons that people want surveyed again, as a site keeps them, and how much of one a survey has covered. Pure."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -50,27 +50,8 @@ class SurveyRequest:
         return float(np.mean(scipy.spatial.cKDTree(driven_map_m).query(inside)[0] <= _NEAR_M))
 
 
-class SiteFiles(Protocol):
-    """What a site keeps beside its versions; a MapStore is one."""
-
-    def site_file_kinds(self, site: str) -> list[str]:
-        """Kinds of the files, in order."""
-
-    def site_file(self, site: str, kind: str) -> bytes | None:
-        """The file of a kind, None without."""
-
-
-def open_requests(files: SiteFiles, site: str) -> list[SurveyRequest]:
-    """Those that are not done, oldest first."""
-    found = []
-    for kind in files.site_file_kinds(site):
-        data = files.site_file(site, kind) if kind.startswith(KIND) else None
-        if data is not None:
-            found.append(_read(kind.removeprefix(KIND), data))
-    return sorted(found, key=lambda request: (request.asked_ns, request.id))
-
-
-def _read(request: str, data: bytes) -> SurveyRequest:
+def read_request(kind: str, data: bytes) -> SurveyRequest:
+    """A request as a site keeps it, under this kind."""
     feature: dict[str, Any] = msgspec.json.decode(data)["features"][0]
     ring, who = feature["geometry"]["coordinates"][0], feature["properties"]
-    return SurveyRequest(request, who["asked_ns"], who["actor"], who["reason"], ring[:-1])
+    return SurveyRequest(kind.removeprefix(KIND), who["asked_ns"], who["actor"], who["reason"], ring[:-1])

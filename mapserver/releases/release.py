@@ -9,7 +9,7 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
 from fleetmap.mapformat import decode_manifest, decode_tile
 from mapserver.fleet_statistics.canary_decision import threshold_for
-from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND, open_requests
+from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND
 from mapserver.quality.figures import TRUSTED_KEY, TrustedCalibration, trusted_calibrations
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases import rules
@@ -164,7 +164,7 @@ def _change(store: MapStore, site: str, decide: Callable[[SiteReleases], Release
 
 def _end_surveyed(store: MapStore, site: str) -> None:
     """Takes requests off the list that the current version, or one that it was built on, covers with its own recordings."""
-    waiting = {request.id for request in open_requests(store, site)}
+    waiting = {request.id for request in store.survey_requests(site)}
     known = {info.version: info for info in store.versions(site)} if waiting else {}
     current = store.current(site)
     version = None if current is None else current.version

@@ -14,6 +14,7 @@ from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manife
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
+from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
 from mapserver.store.access.chain import AuditLine
 from mapserver.store.access.operators import OperatorQueries
@@ -147,9 +148,12 @@ class StoreQueries:
         sha256 = self.site_file_sha256(site, kind)
         return None if sha256 is None else self._blobs.get(sha256)
 
-    def site_file_kinds(self, site: str) -> list[str]:
-        rows = self._transactions.query("SELECT kind FROM site_files WHERE site = ? ORDER BY kind", (site,))
-        return [row["kind"] for row in rows]
+    def survey_requests(self, site: str) -> list[SurveyRequest]:
+        """Places that people ask to survey again and that are not done, oldest first; none for an unknown site."""
+        query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND kind GLOB ?"
+        rows = self._transactions.query(query, (site, f"{KIND}*"))
+        found = [read_request(row["kind"], self._blobs.get(row["sha256"])) for row in rows]
+        return sorted(found, key=lambda request: (request.asked_ns, request.id))
 
     def site_file_sha256(self, site: str, kind: str) -> str | None:
         rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))

@@ -15,7 +15,7 @@ from mapserver.cli import app
 from mapserver.drafting.draft import covered_requests
 from mapserver.fleet import survey_requests as requests
 from mapserver.fleet.resurvey_list import resurvey_list
-from mapserver.fleet.survey_requests import ask_for_survey, end_request, survey_requests
+from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.store import Actor, DraftContent, MapStore
@@ -60,13 +60,13 @@ def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_
     shown = CliRunner().invoke(app, ["fleet", "resurvey", "--site", SITE, "--store", str(tmp_path / "store")])
     assert f"request {made.id} of ada: 4 corners, racks were moved" in shown.output
     with MapStore.open(tmp_path / "store") as again:
-        assert survey_requests(again, SITE) == [made], "another process sees it"
+        assert again.survey_requests(SITE) == [made], "another process sees it"
     sha256 = store.site_file_sha256(SITE, requests.KIND + made.id)
     assert store.served_kind(sha256) is None, "no robot fetches it"
-    assert store.collect_garbage().files == 0 or survey_requests(store, SITE) == [made]
-    assert survey_requests(store, SITE) == [made]
+    assert store.collect_garbage().files == 0 or store.survey_requests(SITE) == [made]
+    assert store.survey_requests(SITE) == [made]
     end_request(store, SITE, made.id, ADA)
-    assert (listed(), survey_requests(store, SITE)) == ([], [])
+    assert (listed(), store.survey_requests(SITE)) == ([], [])
     assert [(event.kind, event.actor) for event in store.events(SITE)[-2:]] == [
         (f"survey request {made.id}", "ada")
     ] * 2
@@ -81,13 +81,13 @@ def test_a_published_survey_of_it_ends_it(store: MapStore) -> None:
     details = draft_details(path_m=213.0, surveyed_requests=said)
     content = DraftContent(tiles=hall_tiles(1), vocabulary=b"words" * 50, details=details)
     version = store.save(SITE, content).version
-    assert {request.id for request in survey_requests(store, SITE)} == {half, whole}
+    assert {request.id for request in store.survey_requests(SITE)} == {half, whole}
     releases.publish(store, SITE, version)
-    assert [request.id for request in survey_requests(store, SITE)] == [half]
+    assert [request.id for request in store.survey_requests(SITE)] == [half]
     (event,) = (event for event in store.events(SITE)[-3:] if event.kind == f"survey request {whole}")
     assert event.detail == f"done: version {version} surveyed 95% of its places"
     releases.roll_back(store, SITE)
-    assert [request.id for request in survey_requests(store, SITE)] == [half]
+    assert [request.id for request in store.survey_requests(SITE)] == [half]
 
 
 def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) -> None:
@@ -127,7 +127,7 @@ def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) 
 def test_what_is_no_polygon_is_refused(store: MapStore, corners: list[tuple[float, float]], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         ask_for_survey(store, SITE, corners, ADA)
-    assert survey_requests(store, SITE) == []
+    assert store.survey_requests(SITE) == []
 
 
 def test_limits(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_limits(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match="no site nowhere"):
         ask_for_survey(store, "nowhere", AISLE, ADA)
     releases.publish(store, "yard")
-    assert survey_requests(store, "yard") == []
+    assert store.survey_requests("yard") == []
 
 
 def test_over_http(tmp_path: Path) -> None:
