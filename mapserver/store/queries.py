@@ -36,7 +36,6 @@ from mapserver.store.rows import (
 )
 from mapserver.store.version_rows import canaries, site_releases
 
-JOB_STATES = ("running", "done", "failed")
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
 _OF_VERSIONS = ("manifest", "tile", "vocabulary")
 _SERVED_KINDS = (*_OF_VERSIONS, "grid", *FOR_ROBOTS)
@@ -307,17 +306,16 @@ class StoreQueries:
         with self._transactions.write() as connection:
             done = connection.execute(
                 "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",
-                (check_name(site, "site"), kind, self._now()),
+                (check_name(site, "site"), kind, _iso(self._clock_ns())),
             )
             return int(done.lastrowid or 0)
 
     def update_job(self, job: int, state: str, message: str, report: dict[str, Any]) -> None:
         """Keeps how a job goes on, or ended (state done or failed)."""
-        assert state in JOB_STATES
         with self._transactions.write() as connection:
             connection.execute(
                 "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?",
-                (state, None if state == "running" else self._now(), message, to_json(report).decode(), job),
+                (state, None if state == "running" else _iso(self._clock_ns()), message, to_json(report).decode(), job),
             )
 
     def _check_site(self, site: str) -> None:
@@ -333,9 +331,6 @@ class StoreQueries:
     def _current_row(self, site: str) -> VersionInfo | None:
         query = "SELECT * FROM versions WHERE site = ? AND state = 'current'"
         return self._transactions.first(VersionInfo, query, (site,))
-
-    def _now(self) -> str:
-        return _iso(self._clock_ns())
 
 
 def _iso(stamp_ns: int) -> str:
