@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fleetmap.features.flow import Pyramid, follow, forward_backward_check
+from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo import disparities
 from fleetmap.geometry import AnyArray, Array, se3, se3_inverse, so3_exp, so3_log
@@ -67,17 +67,18 @@ def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: Stereo
     if corners is None or len(corners) < _MIN_POINTS:
         return None
     pixels = corners.reshape(-1, 2).astype(np.float64)
-    first, second = Pyramid(before.left), Pyramid(after.left)
-    flow = follow(first, second, pixels, pixels, window_px=_WINDOW_PX, levels=_LEVELS)
-    is_tracked = forward_backward_check(first, second, flow, window_px=_WINDOW_PX, within_px=_RETURNED_PX)
+    images = before.left, after.left
+    places, is_tracked = core.follow_pixels(
+        *images, pixels, pixels, _WINDOW_PX // 2, _LEVELS, within_px=_RETURNED_PX, margin_px=-np.inf
+    )
     found = disparities(before, camera, pixels, _STEREO)[:, 0]
     has_depth = is_tracked & np.isfinite(found)
     if camera.baseline_m > 0 and has_depth.sum() >= _MIN_POINTS:
         points_cam = camera.point_from_pixel(pixels[has_depth], found[has_depth])
-        return _motion_of_points(points_cam, flow.places[has_depth], camera)
+        return _motion_of_points(points_cam, places[has_depth], camera)
     if is_tracked.sum() < _MIN_POINTS:
         return None
-    return _turn_of_rays(pixels[is_tracked], flow.places[is_tracked], camera)
+    return _turn_of_rays(pixels[is_tracked], places[is_tracked], camera)
 
 
 def _motion_of_points(points_cam: Array, pixels: Array, camera: StereoCamera) -> Array | None:

@@ -4,6 +4,7 @@
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <functional>
 #include <numbers>
 
 namespace fleetmap {
@@ -83,37 +84,7 @@ inline void for_each_set(const uint8_t* row, ptrdiff_t first, ptrdiff_t last, co
     if (row[x] != 0) visit(x);
 }
 
-}  // namespace
-
-std::vector<Pixel> fast_corners(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free) {
-  std::vector<Pixel> corners;
-  const ptrdiff_t width = image.width, height = image.height;
-  if (std::min(width, height) <= 2 * border) return corners;
-  // Scores of three rows: that which is looked through, the one above and the one below.
-  std::vector<uint8_t> scores(3 * size_t(width), 0);
-  auto scores_of = [&](ptrdiff_t y) { return scores.data() + (y % 3) * width; };
-  auto score = [&](ptrdiff_t y) {
-    if (y < kCircleRadius || y >= height - kCircleRadius)
-      std::fill_n(scores_of(y), width, uint8_t(0));
-    else
-      score_row(image.row(y) + kCircleRadius, width, width - 2 * kCircleRadius, uint8_t(threshold), scores_of(y) + kCircleRadius);
-  };
-  score(border - 1);
-  score(border);
-  for (ptrdiff_t y = border; y < height - border; ++y) {
-    score(y + 1);
-    const uint8_t *above = scores_of(y - 1), *here = scores_of(y), *below = scores_of(y + 1);
-    for_each_set(here, border, width - border, [&](ptrdiff_t x) {
-      const uint8_t s = here[x];
-      if (free != nullptr && free[y * width + x] == 0) return;
-      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] && s > below[x] &&
-          s > below[x + 1])
-        corners.push_back({float(x), float(y)});
-    });
-  }
-  return corners;
-}
-
+// Fills the smaller eigenvalue of the gradient matrix around each pixel; 0 at the image's rim.
 void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double* scores) {
   constexpr ptrdiff_t kHalf = 3, kRim = kHalf + 1;
   for (size_t n = 0; n < count; ++n) {
@@ -144,44 +115,7 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
   }
 }
 
-std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken, size_t taken_count,
-                                   double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
-  const ptrdiff_t columns = ptrdiff_t(double(width) / distance) + 1, rows = ptrdiff_t(double(height) / distance) + 1;
-  struct Held {
-    double x, y;
-    int64_t earlier;  // in the same cell
-  };
-  std::vector<Held> held;
-  held.reserve(taken_count + std::min(count, candidates));
-  std::vector<int64_t> newest(size_t(rows * columns), -1);
-  auto hold = [&](double x, double y, ptrdiff_t column, ptrdiff_t row) {
-    int64_t& cell = newest[size_t(row * columns + column)];
-    held.push_back({x, y, cell});
-    cell = int64_t(held.size()) - 1;
-  };
-  for (size_t n = 0; n < taken_count; ++n) {
-    const double column = std::floor(taken[n].x / distance), row = std::floor(taken[n].y / distance);
-    if (column >= 0.0 && column < double(columns) && row >= 0.0 && row < double(rows))
-      hold(taken[n].x, taken[n].y, ptrdiff_t(column), ptrdiff_t(row));
-  }
-  std::vector<int64_t> chosen;
-  for (size_t k = 0; k < candidates && chosen.size() < count; ++k) {
-    const double x = pixels[order[k]].x, y = pixels[order[k]].y;
-    const ptrdiff_t column = ptrdiff_t(x / distance), row = ptrdiff_t(y / distance);
-    bool is_free = true;
-    for (ptrdiff_t r = std::max<ptrdiff_t>(row - 1, 0); r < std::min(row + 2, rows); ++r)
-      for (ptrdiff_t c = std::max<ptrdiff_t>(column - 1, 0); c < std::min(column + 2, columns); ++c)
-        for (int64_t n = newest[size_t(r * columns + c)]; is_free && n >= 0; n = held[size_t(n)].earlier) {
-          const double dx = held[size_t(n)].x - x, dy = held[size_t(n)].y - y;
-          is_free = dx * dx + dy * dy >= distance * distance;
-        }
-    if (!is_free) continue;
-    hold(x, y, column, row);
-    chosen.push_back(order[k]);
-  }
-  return chosen;
-}
-
+// Sets what is nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
 void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius) {
   const double reach = radius - 0.75;  // from the nearest whole pixel
   const ptrdiff_t size = ptrdiff_t(reach);
@@ -194,6 +128,117 @@ void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double ra
       const ptrdiff_t first = std::max<ptrdiff_t>(x - half, 0), last = std::min(x + half + 1, free.width);
       std::fill(free.row(y + v) + first, free.row(y + v) + last, uint8_t(0));
     }
+  }
+}
+
+}  // namespace
+
+// Row by row; none where free, of the image's size, is 0 (no pointer: all is free).
+void CornerFinder::fast(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free, std::vector<Pixel>& found) {
+  found.clear();
+  const ptrdiff_t width = image.width, height = image.height;
+  if (std::min(width, height) <= 2 * border) return;
+  // Scores of three rows: that which is looked through, the one above and the one below.
+  rows_.assign(3 * size_t(width), 0);
+  auto scores_of = [&](ptrdiff_t y) { return rows_.data() + (y % 3) * width; };
+  auto score = [&](ptrdiff_t y) {
+    if (y < kCircleRadius || y >= height - kCircleRadius)
+      std::fill_n(scores_of(y), width, uint8_t(0));
+    else
+      score_row(image.row(y) + kCircleRadius, width, width - 2 * kCircleRadius, uint8_t(threshold), scores_of(y) + kCircleRadius);
+  };
+  score(border - 1);
+  score(border);
+  for (ptrdiff_t y = border; y < height - border; ++y) {
+    score(y + 1);
+    const uint8_t *above = scores_of(y - 1), *here = scores_of(y), *below = scores_of(y + 1);
+    for_each_set(here, border, width - border, [&](ptrdiff_t x) {
+      const uint8_t s = here[x];
+      if (free != nullptr && free[y * width + x] == 0) return;
+      if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] && s > below[x] &&
+          s > below[x + 1])
+        found.push_back({float(x), float(y)});
+    });
+  }
+}
+
+const std::vector<int64_t>& Suppression::operator()(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
+                                                    size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
+  const ptrdiff_t columns = ptrdiff_t(double(width) / distance) + 1, rows = ptrdiff_t(double(height) / distance) + 1;
+  held_.clear(), chosen_.clear();
+  newest_.assign(size_t(rows * columns), -1);
+  auto hold = [&](double x, double y, ptrdiff_t column, ptrdiff_t row) {
+    int64_t& cell = newest_[size_t(row * columns + column)];
+    held_.push_back({x, y, cell});
+    cell = int64_t(held_.size()) - 1;
+  };
+  for (size_t n = 0; n < taken_count; ++n) {
+    const double column = std::floor(taken[n].x / distance), row = std::floor(taken[n].y / distance);
+    if (column >= 0.0 && column < double(columns) && row >= 0.0 && row < double(rows))
+      hold(taken[n].x, taken[n].y, ptrdiff_t(column), ptrdiff_t(row));
+  }
+  for (size_t k = 0; k < candidates && chosen_.size() < count; ++k) {
+    const double x = pixels[order[k]].x, y = pixels[order[k]].y;
+    const ptrdiff_t column = ptrdiff_t(x / distance), row = ptrdiff_t(y / distance);
+    bool is_free = true;
+    for (ptrdiff_t r = std::max<ptrdiff_t>(row - 1, 0); r < std::min(row + 2, rows); ++r)
+      for (ptrdiff_t c = std::max<ptrdiff_t>(column - 1, 0); c < std::min(column + 2, columns); ++c)
+        for (int64_t n = newest_[size_t(r * columns + c)]; is_free && n >= 0; n = held_[size_t(n)].earlier) {
+          const double dx = held_[size_t(n)].x - x, dy = held_[size_t(n)].y - y;
+          is_free = dx * dx + dy * dy >= distance * distance;
+        }
+    if (!is_free) continue;
+    hold(x, y, column, row);
+    chosen_.push_back(order[k]);
+  }
+  return chosen_;
+}
+
+// Candidates by falling score: all of the best `most`, and what is as good as the last of them. Of equals the first found comes first.
+void CornerFinder::put_in_order(size_t most) {
+  double least = 0.0;
+  if (most < candidates_.size()) {
+    ordered_ = eigenvalues_;
+    std::nth_element(ordered_.begin(), ordered_.begin() + ptrdiff_t(most) - 1, ordered_.end(), std::greater<double>());
+    least = ordered_[most - 1];
+  }
+  order_.clear();
+  for (size_t n = 0; n < candidates_.size(); ++n)
+    if (eigenvalues_[n] >= least) order_.push_back(int64_t(n));
+  std::sort(order_.begin(), order_.end(), [&](int64_t a, int64_t b) {
+    const double score_a = eigenvalues_[size_t(a)], score_b = eigenvalues_[size_t(b)];
+    return score_a > score_b || (score_a == score_b && a < b);
+  });
+}
+
+void CornerFinder::find(GreyImage image, size_t count, const CornerLimits& limits, const Pixel* taken, size_t taken_count) {
+  const uint8_t* free = nullptr;
+  if (taken_count > 0) {
+    free_.assign(size_t(image.height * image.width), 255);
+    clear_discs({free_.data(), image.height, image.width}, taken, taken_count, limits.distance);
+    free = free_.data();
+  }
+  const size_t enough = 2 * count;
+  fast(image, limits.threshold, limits.border, free, candidates_);
+  if (candidates_.size() < enough) {
+    fast(image, limits.threshold, kCircleRadius, nullptr, whole_);
+    if (whole_.size() < enough) fast(image, std::max(limits.threshold / 2, 4), limits.border, free, candidates_);
+  }
+  eigenvalues_.resize(candidates_.size());
+  min_eigenvalues(image, candidates_.data(), candidates_.size(), eigenvalues_.data());
+  size_t shown = 0;
+  for (size_t n = 0; n < candidates_.size(); ++n)
+    if (eigenvalues_[n] > 0.0) candidates_[shown] = candidates_[n], eigenvalues_[shown++] = eigenvalues_[n];
+  candidates_.resize(shown), eigenvalues_.resize(shown);
+  corners.clear(), scores.clear();
+  if (count == 0) return;
+  for (const size_t most : {4 * count, shown}) {
+    put_in_order(most);
+    const std::vector<int64_t>& chosen =
+        suppress_(candidates_.data(), order_.data(), order_.size(), taken, taken_count, limits.distance, count, image.width, image.height);
+    if (chosen.size() < count && order_.size() < shown) continue;
+    for (const int64_t n : chosen) corners.push_back(candidates_[size_t(n)]), scores.push_back(eigenvalues_[size_t(n)]);
+    return;
   }
 }
 

@@ -13,23 +13,51 @@ struct Pixel {
   float x, y;
 };
 
-// Whole-pixel corners, row by row, whose score exceeds that of all eight neighbours: none nearer than border, at least 3, to an
-// edge, or where free, of the image's size, is 0 (no pointer: all is free). The score is the smallest difference of the centre to
-// nine pixels in a row of the circle of sixteen, where that is largest; a corner's exceeds the threshold.
-// Source: Rosten and Drummond 2006.
-std::vector<Pixel> fast_corners(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free);
-
-// Fills the smaller eigenvalue of the gradient matrix in a window of 7x7 around each pixel; 0 at the image's rim.
-// Source: Shi and Tomasi 1994.
-void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double* scores);
-
 // Indices of up to count pixels, best first as order says, no two within distance of each other or of taken: greedy suppression on
-// a grid of cells of that size.
-std::vector<int64_t> select_spread(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken, size_t taken_count,
-                                   double distance, size_t count, ptrdiff_t width, ptrdiff_t height);
+// a grid of cells of that size. It keeps its memory.
+class Suppression {
+ public:
+  const std::vector<int64_t>& operator()(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
+                                         size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height);
 
-// Sets what is nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
-void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius);
+ private:
+  struct Held {
+    double x, y;
+    int64_t earlier;  // in the same cell
+  };
+  std::vector<Held> held_;
+  std::vector<int64_t> newest_, chosen_;
+};
+
+// Corners are whole pixels whose score exceeds that of all eight neighbours. The score is the smallest difference of the centre to nine
+// pixels in a row of the circle of sixteen, where that is largest; a corner's exceeds the threshold. Sources: Rosten and Drummond 2006;
+// Shi and Tomasi 1994 for how well a corner can be tracked: the smaller eigenvalue of the gradient matrix in a window of 7x7 around it.
+struct CornerLimits {
+  int threshold;
+  ptrdiff_t border;  // from the image's edges, at least 3
+  double distance;   // of corners from each other
+};
+
+// Finds corners and keeps its memory.
+class CornerFinder {
+ public:
+  // Up to count corners, those that can be tracked best first, none near another or one of taken. By half the threshold where the whole
+  // image has fewer than two for each.
+  void find(GreyImage image, size_t count, const CornerLimits& limits, const Pixel* taken, size_t taken_count);
+
+  std::vector<Pixel> corners;
+  std::vector<double> scores;  // the eigenvalues
+
+ private:
+  void fast(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free, std::vector<Pixel>& found);
+  void put_in_order(size_t most);
+
+  std::vector<Pixel> candidates_, whole_;
+  std::vector<double> eigenvalues_, ordered_;
+  std::vector<int64_t> order_;
+  std::vector<uint8_t> free_, rows_;
+  Suppression suppress_;
+};
 
 // Fills the direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
 // its outermost pixels go on. Source: Rosin 1999, as ORB uses it.

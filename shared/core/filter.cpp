@@ -137,7 +137,8 @@ Vec3 Filter::propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, 
   const ImuNoise* const noises[2] = {&noise, &true_noise};
   NavMatrix phi = identity(), processes[2]{};
   Vec3 last_rate{};
-  for (const ImuInterval& interval : imu_intervals(imu, start_ns, end_ns)) {
+  imu_intervals(imu, start_ns, end_ns, intervals_);
+  for (const ImuInterval& interval : intervals_) {
     const double dt = interval.duration_s;
     const Vec3 rate = interval.gyro - state.gyro_bias;
     const Mat3 middle = state.rotation * so3_exp(0.5 * dt * rate);
@@ -181,14 +182,16 @@ void Filter::predict_random_walk(const SE3& body_from_next, double rotation_sigm
                                  const double* measured) {
   const SE3 next = state.body() * body_from_next;
   state.rotation = next.rotation, state.position = next.translation;
-  Matrix shape(kNav, 6), shape_turned, spread(6, 6), process, part;
+  Matrix &shape = gain_, &shape_turned = gain_turned_, &spread = spread_, &process = seen_, &part = part_;
+  shape.resize(kNav, 6), spread.resize(6, 6);
   store(state.rotation, shape[kRotation], 6);
   store(skew(state.position) * state.rotation, shape[kPosition], 6);
   store(state.rotation, shape[kPosition] + 3, 6);
   for (int k = 0; k < 6; ++k) spread[k][k] = k < 3 ? rotation_sigma * rotation_sigma : translation_sigma * translation_sigma;
   if (measured) {
     // (free^-1 + measured^-1)^-1: the measured one where it is narrow, the free one where that is wider
-    Matrix sum = spread, solved = spread;
+    Matrix &sum = taken_, &solved = turned_;
+    sum = spread, solved = spread;
     for (int k = 0; k < 36; ++k) sum.values[k] += measured[k];
     solve_in_place(sum, solved);
     multiply(spread, solved, part);
@@ -374,7 +377,8 @@ void Filter::remove_common_motion(Matrix& gain_turned) {
         if (information[6 * m + a][kPair + 6 * n + b] != 0.0) return true;
     return false;
   };
-  std::vector<size_t> group(count, count), members;
+  std::vector<size_t>&group = group_, &members = members_;
+  group.assign(count, count);
   for (size_t first = 0; first < count; ++first) {
     if (group[first] != count) continue;
     members.assign(1, first);
@@ -438,20 +442,20 @@ void Filter::learn(const Matrix& gain_turned) {
 }
 
 double Filter::correct_with(const Measurement& measurement, double gate) {
-  const Matrix &h = measurement.jacobian, &by_considered = measurement.by_considered;
-  const std::vector<double>& residual = measurement.residual;
+  const auto& [rows, h, by_considered, residual, noise, true_noise] = measurement;
   Matrix &p = covariance, &t = true_error_cov;
-  const size_t rows = h.rows, size = p.rows, whole = t.rows;
+  const size_t size = p.rows, whole = t.rows;
   // H P and (H, C) T, and their covariances of the residual.
-  Matrix cross(rows, size), projected(rows, whole), innovation(rows, rows), spread(rows, rows);
+  Matrix &cross = seen_, &projected = part_, &innovation = inner_, &spread = spread_, &factor = weighing_, &gain = gain_;
+  cross.resize(rows, size), projected.resize(rows, whole), innovation.resize(rows, rows), spread.resize(rows, rows);
   for (size_t a = 0; a < rows; ++a) {
-    innovation[a][a] = measurement.noise[a], spread[a][a] = measurement.true_noise[a];
+    innovation[a][a] = noise[a], spread[a][a] = true_noise[a];
     for (size_t k = 0; k < kConsidered + kNav; ++k) {
-      const double factor = k < kConsidered ? by_considered[a][k] : h[a][k - kConsidered];
-      if (factor == 0.0) continue;
-      for (size_t j = 0; j < whole; ++j) projected[a][j] += factor * t[k][j];
+      const double share = k < kConsidered ? by_considered[a][k] : h[a][k - kConsidered];
+      if (share == 0.0) continue;
+      for (size_t j = 0; j < whole; ++j) projected[a][j] += share * t[k][j];
       if (k < kConsidered) continue;
-      for (size_t j = 0; j < size; ++j) cross[a][j] += factor * p[k - kConsidered][j];
+      for (size_t j = 0; j < size; ++j) cross[a][j] += share * p[k - kConsidered][j];
     }
   }
   for (size_t a = 0; a < rows; ++a)
@@ -460,9 +464,10 @@ double Filter::correct_with(const Measurement& measurement, double gate) {
       for (size_t k = 0; k < kNav; ++k) spread[a][b] += projected[a][kConsidered + k] * h[b][k];
       for (size_t k = 0; k < kNav; ++k) innovation[a][b] += cross[a][k] * h[b][k];
     }
-  Matrix factor = spread;
-  std::vector<double> solved = residual;
-  if (!solve_spd(factor[0], solved.data(), rows, rows) || !cholesky_in_place(innovation[0], rows, rows))
+  factor = spread;
+  double solved[6];
+  std::copy_n(residual, rows, solved);
+  if (!solve_spd(factor[0], solved, rows, rows) || !cholesky_in_place(innovation[0], rows, rows))
     return std::numeric_limits<double>::infinity();
   double distance = 0.0;
   for (size_t a = 0; a < rows; ++a) distance += residual[a] * solved[a];
@@ -476,7 +481,7 @@ double Filter::correct_with(const Measurement& measurement, double gate) {
     for (size_t k = 0; k < a; ++k) subtract(cross[a], innovation[a][k], cross[k]);
     for (size_t j = 0; j < size; ++j) cross[a][j] /= innovation[a][a];
   }
-  Matrix gain = cross;
+  gain = cross;
   for (size_t a = rows; a-- > 0;) {
     for (size_t k = a + 1; k < rows; ++k) subtract(gain[a], innovation[k][a], gain[k]);
     for (size_t j = 0; j < size; ++j) gain[a][j] /= innovation[a][a];
@@ -510,12 +515,12 @@ double Filter::correct_by_wheels(Vec3 velocity_base, double yaw_rate, double sig
   const Vec3 rate = gyro - state.gyro_bias, base_body = inverse(base_from_body).translation;
   const Mat3 base_from_odom = turn * transposed(state.rotation);
   const Vec3 turning = turn * rate, moving = base_from_odom * state.velocity + turn * cross(rate, base_body);
-  Measurement m(4);
+  Measurement m{4};
   // R^T v with the invariant error changes by R^T nu alone: turning the frame turns both
   store(base_from_odom, m.jacobian[0] + kVelocity, int(kNav));
   store(turn * skew(base_body), m.jacobian[0] + kGyroBias, int(kNav));
   store(-vec3(turn[2]), m.jacobian[3] + kGyroBias);
-  store(velocity_base - moving, m.residual.data());
+  store(velocity_base - moving, m.residual);
   m.residual[3] = yaw_rate - turning[2];
   m.by_considered[0][2] = moving[0], m.by_considered[3][3] = turning[2];
   const double sigmas[4] = {sigma_mps, model_.wheel_slip_mps, model_.wheel_slip_mps, sigma_radps};
@@ -527,12 +532,12 @@ double Filter::correct_by_wheels(Vec3 velocity_base, double yaw_rate, double sig
 }
 
 double Filter::correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate) {
-  Measurement m(6);
+  Measurement m{6};
   store(-1.0 * skew(state.velocity), m.jacobian[0] + kRotation, int(kNav));
   store(kIdentity, m.jacobian[0] + kVelocity, int(kNav));
   store(kIdentity, m.jacobian[3] + kGyroBias, int(kNav));
-  store(-state.velocity, m.residual.data());
-  store(gyro_mean - state.gyro_bias, m.residual.data() + 3);
+  store(-state.velocity, m.residual);
+  store(gyro_mean - state.gyro_bias, m.residual + 3);
   for (int a = 0; a < 6; ++a) {
     const double sigma = a < 3 ? model_.still_sigma_mps : gyro_sigma;
     m.noise[a] = m.true_noise[a] = sigma * sigma;
@@ -573,29 +578,28 @@ void Filter::inflate_velocity(double sigma_mps) {
 void Filter::motion_covariance(size_t index, double* out) const {
   const Matrix& c = true_error_cov;
   const size_t at = clone_errors(kConsidered, index).rotation, end = clone_errors(kConsidered, clones_.size() - 1).rotation;
-  Matrix difference(6, 6), carry(6, 6), carry_turned, part, carried;
+  double difference[6][6], carry[36] = {}, carry_turned[36], part[36];
   for (size_t a = 0; a < 6; ++a)
     for (size_t b = 0; b < 6; ++b) difference[a][b] = c[end + a][end + b] + c[at + a][at + b] - c[end + a][at + b] - c[at + a][end + b];
   const SE3 earlier_from_odom = inverse(clones_[index]);  // and its adjoint
-  store(earlier_from_odom.rotation, carry[0], 6);
-  store(earlier_from_odom.rotation, carry[3] + 3, 6);
-  store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, carry[3], 6);
-  multiply(carry, difference, part);
-  transpose(carry, carry_turned);
-  multiply(part, carry_turned, carried);
-  std::copy(carried.values.begin(), carried.values.end(), out);
+  store(earlier_from_odom.rotation, carry, 6);
+  store(earlier_from_odom.rotation, carry + 21, 6);
+  store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, carry + 18, 6);
+  multiply(carry, difference[0], part, 6, 6, 6);
+  for (size_t k = 0; k < 36; ++k) carry_turned[k] = carry[k % 6 * 6 + k / 6];
+  multiply(part, carry_turned, out, 6, 6, 6);
 }
 
 void Filter::body_covariance(double* out) const {
-  Matrix own(9, 9), jacobian(6, 9), jacobian_turned, part, carried;
+  double own[9][9], jacobian[6][9] = {}, jacobian_turned[9][6], part[6 * 9];
   for (size_t a = 0; a < 9; ++a) std::copy_n(true_error_cov[kConsidered + a] + kConsidered, 9, own[a]);
   store(kIdentity, jacobian[0], 9);
   store(kIdentity, jacobian[3] + kPosition, 9);
   store(-1.0 * skew(state.position), jacobian[3], 9);
-  multiply(jacobian, own, part);
-  transpose(jacobian, jacobian_turned);
-  multiply(part, jacobian_turned, carried);
-  std::copy(carried.values.begin(), carried.values.end(), out);
+  multiply(jacobian[0], own[0], part, 6, 9, 9);
+  for (size_t a = 0; a < 9; ++a)
+    for (size_t b = 0; b < 6; ++b) jacobian_turned[a][b] = jacobian[b][a];
+  multiply(part, jacobian_turned[0], out, 6, 9, 6);
 }
 
 }  // namespace fleetmap

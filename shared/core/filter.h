@@ -116,10 +116,8 @@ class Filter {
   // residual = jacobian error + noise, for the state's errors. The covariances, of uncorrelated rows: noise weighs the measurement;
   // true_noise and by_considered, derivatives by the considered errors, go into the true error's covariance.
   struct Measurement {
-    explicit Measurement(size_t rows)
-        : jacobian(rows, kNav), by_considered(rows, kConsidered), residual(rows), noise(rows), true_noise(rows) {}
-    Matrix jacobian, by_considered;
-    std::vector<double> residual, noise, true_noise;
+    size_t rows;
+    double jacobian[6][kNav] = {}, by_considered[6][kConsidered] = {}, residual[6] = {}, noise[6] = {}, true_noise[6] = {};
   };
   double correct_with(const Measurement& measurement, double gate);
 
@@ -135,7 +133,9 @@ class Filter {
   TrackConstraints constraints_;
   // Kept so that nothing is allocated in a frame.
   std::vector<SE3> cameras_, prior_clones_, clones_before_;
+  std::vector<ImuInterval> intervals_;
   std::vector<double> moved_, correction_;
+  std::vector<size_t> group_, members_;
   Matrix covariance_before_, true_error_cov_before_, spare_, inner_, by_clones_, weighing_, gain_turned_, gain_, seen_, spread_, taken_,
       part_, turned_;
 };

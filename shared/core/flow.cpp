@@ -4,7 +4,6 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <vector>
 
 namespace fleetmap {
 namespace {
@@ -154,25 +153,61 @@ void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, cons
   }
 }
 
-void follow_down(const std::vector<GreyImage>& before, const std::vector<GreyImage>& now, int half, const double* pixels, double* places,
-                 bool* found, size_t count) {
+void Pyramid::set(GreyImage image) {
+  if (levels_.empty()) levels_.resize(1);
+  levels_[0].pixels.assign(image.at, image.at + image.height * image.width);
+  levels_[0].height = image.height, levels_[0].width = image.width;
+  made_ = 1;
+}
+
+GreyImage Pyramid::level(size_t number) {
+  if (levels_.size() <= number) levels_.resize(number + 1);
+  for (; made_ <= number; ++made_) {
+    const GreyImage from = levels_[made_ - 1].image();
+    Level& to = levels_[made_];
+    to.height = (from.height + 1) / 2, to.width = (from.width + 1) / 2;
+    to.pixels.resize(size_t(to.height * to.width));
+    const auto reflected = [](ptrdiff_t at, ptrdiff_t size) {
+      if (size == 1) return ptrdiff_t(0);
+      while (at < 0 || at >= size) at = at < 0 ? -at : 2 * (size - 1) - at;
+      return at;
+    };
+    // One line summed over five rows, with two more columns at either end; 256 times 255 is the most that its sums reach.
+    line_.resize(size_t(from.width) + 4);
+    uint16_t* const __restrict line = line_.data() + 2;
+    for (ptrdiff_t y = 0; y < to.height; ++y) {
+      const auto row = [&](ptrdiff_t off) { return from.row(reflected(2 * y + off, from.height)); };
+      const uint8_t *const above2 = row(-2), *const above = row(-1), *const here = row(0), *const below = row(1), *const below2 = row(2);
+      for (ptrdiff_t x = 0; x < from.width; ++x) line[x] = uint16_t(above2[x] + below2[x] + 4 * (above[x] + below[x]) + 6 * here[x]);
+      for (const ptrdiff_t x : {ptrdiff_t(-2), ptrdiff_t(-1), from.width, from.width + 1}) line[x] = line[reflected(x, from.width)];
+      uint8_t* const __restrict out = to.pixels.data() + y * to.width;
+      for (ptrdiff_t x = 0; x < to.width; ++x) {
+        const uint16_t* const at = line + 2 * x;
+        out[x] = uint8_t((at[-2] + at[2] + 4 * (at[-1] + at[1]) + 6 * at[0] + 128) >> 8);
+      }
+    }
+  }
+  return levels_[number].image();
+}
+
+void follow_down(Pyramid& before, Pyramid& now, size_t levels, int half, const double* pixels, double* places, bool* found, size_t count) {
   const FlowSteps steps{half, kSteps, kSettledPx};
   std::fill_n(found, count, true);
-  for (size_t level = std::min(before.size(), now.size()); level-- > 0;) {
-    follow(before[level], now[level], std::pow(0.5, double(level)), steps, pixels, places, found, count);
+  for (size_t level = levels + 1; level-- > 0;) {
+    follow(before.level(level), now.level(level), std::pow(0.5, double(level)), steps, pixels, places, found, count);
     if (level > 0) std::fill_n(found, count, true);
   }
 }
 
 void check_back(GreyImage before, GreyImage now, int half, const double* pixels, const double* places, double within_px, double margin_px,
-                bool* held, size_t count) {
+                bool* held, double* back, size_t count) {
   const double right = double(now.width - 1) - margin_px, bottom = double(now.height - 1) - margin_px;
   for (size_t n = 0; n < count; ++n) {
     const double x = places[2 * n], y = places[2 * n + 1];
     held[n] = held[n] && x > margin_px && y > margin_px && x < right && y < bottom;
   }
-  std::vector<double> back(pixels, pixels + 2 * count);
-  follow(now, before, 1.0, {half, kStepsBack, kSettledBackPx}, places, back.data(), held, count);
+  std::copy_n(pixels, 2 * count, back);
+  follow(now, before, 1.0, {half, kStepsBack, kSettledBackPx}, places, back, held, count);
   for (size_t n = 0; n < count; ++n) {
     const double off_x = back[2 * n] - pixels[2 * n], off_y = back[2 * n + 1] - pixels[2 * n + 1];
     held[n] = held[n] && off_x * off_x + off_y * off_y < within_px * within_px;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 #include "image.h"
@@ -27,14 +28,31 @@ struct FlowSteps {
 void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, const double* pixels, double* places, bool* found,
             size_t count);
 
-// follow by whole pyramids, each image half as large as the one before: what a coarse level does not show, a finer one may. Places are
-// where the windows are looked for first; found (N,) tells of the first images.
-void follow_down(const std::vector<GreyImage>& before, const std::vector<GreyImage>& now, int half, const double* pixels, double* places,
-                 bool* found, size_t count);
+// An image and its halvings, which are made on demand: smoothed by 1 4 6 4 1 along rows and columns, mirrored beyond the edges, so that
+// pixel (x, y) is (2x, 2y) on the level before. It keeps its memory. Source: Burt and Adelson 1983.
+class Pyramid {
+ public:
+  void set(GreyImage image);  // copies it
+  GreyImage level(size_t number);
+
+ private:
+  struct Level {
+    std::vector<uint8_t> pixels;
+    ptrdiff_t height = 0, width = 0;
+    GreyImage image() const { return {pixels.data(), height, width}; }
+  };
+  std::vector<Level> levels_;
+  size_t made_ = 0;
+  std::vector<uint16_t> line_;
+};
+
+// follow from so many levels above the images down: what a coarse level does not show, a finer one may. Places are where the windows are
+// looked for first; found (N,) tells of the images themselves.
+void follow_down(Pyramid& before, Pyramid& now, size_t levels, int half, const double* pixels, double* places, bool* found, size_t count);
 
 // Of places (N, 2) that pixels (N, 2) were followed to, and that are held (N,), leaves those further than margin_px from the image's
-// edges that lead back to within so many pixels. Source: Kalal et al. 2010.
+// edges that lead back to within so many pixels; back (N, 2) becomes where. Source: Kalal et al. 2010.
 void check_back(GreyImage before, GreyImage now, int half, const double* pixels, const double* places, double within_px, double margin_px,
-                bool* held, size_t count);
+                bool* held, double* back, size_t count);
 
 }  // namespace fleetmap

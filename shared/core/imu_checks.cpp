@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <vector>
 
 #include "lie.h"
 
@@ -24,15 +23,12 @@ int64_t difference(int64_t after_ns, int64_t before_ns) { return int64_t(uint64_
 }  // namespace
 
 size_t drop_spikes(int64_t* stamps_ns, double* gyro, double* accel, size_t known, size_t end) {
-  std::vector<uint8_t> is_spike(end - known);
   const auto stands_out = [&](const double* values, size_t n, double limit) {
     return jumps(values, n - 1, limit) && (n == end - 1 || jumps(values, n, limit));
   };
-  for (size_t n = std::max<size_t>(known, 1); n < end; ++n)
-    is_spike[n - known] = stands_out(gyro, n, kSpikeGyro) || stands_out(accel, n, kSpikeAccel);
   size_t to = known;
-  for (size_t n = known; n < end; ++n) {
-    if (is_spike[n - known]) continue;
+  for (size_t n = known; n < end; ++n) {  // whose neighbours still stand where they were: what is kept moves to n at most
+    if (n > 0 && (stands_out(gyro, n, kSpikeGyro) || stands_out(accel, n, kSpikeAccel))) continue;
     stamps_ns[to] = stamps_ns[n];
     store(vec3(gyro + 3 * n), gyro + 3 * to);
     store(vec3(accel + 3 * n), accel + 3 * to);

@@ -11,32 +11,35 @@ void Observations::add(int64_t frame, const int64_t* ids, const double* pixels, 
   for (size_t n = 0; n < count; ++n) seen_.push_back({ids[n], frame, {pixels[3 * n], pixels[3 * n + 1], pixels[3 * n + 2]}});
 }
 
-TrackBatch Observations::take(const int64_t* alive, const bool* due, size_t alive_count, const std::vector<int64_t>& held,
-                              const StereoLens& lens, double far_px) {
-  std::vector<size_t> order(seen_.size()), living(alive_count), rows;
-  std::iota(order.begin(), order.end(), size_t(0));
-  std::stable_sort(order.begin(), order.end(), [&](size_t a, size_t b) { return seen_[a].id < seen_[b].id; });
-  std::iota(living.begin(), living.end(), size_t(0));
-  if (!std::is_sorted(alive, alive + alive_count))
-    std::stable_sort(living.begin(), living.end(), [&](size_t a, size_t b) { return alive[a] < alive[b]; });
-  TrackBatch batch;
-  batch.starts.push_back(0);
-  std::vector<char> stays(seen_.size(), false);
+const TrackBatch& Observations::take(const int64_t* alive, const bool* due, size_t alive_count, const int64_t* held, size_t held_count,
+                                     const StereoLens& lens, double far_px) {
+  // Rows by rising ids, those of one id as they came.
+  const auto put_in_order = [](std::vector<size_t>& order, size_t count, const auto& id_of) {
+    order.resize(count);
+    std::iota(order.begin(), order.end(), size_t(0));
+    std::sort(order.begin(), order.end(), [&](size_t a, size_t b) { return id_of(a) < id_of(b) || (id_of(a) == id_of(b) && a < b); });
+  };
+  put_in_order(order_, seen_.size(), [&](size_t row) { return seen_[row].id; });
+  put_in_order(living_, alive_count, [&](size_t row) { return alive[row]; });
+  TrackBatch& batch = batch_;
+  batch.starts.assign(1, 0);
+  batch.clones.clear(), batch.anchors.clear(), batch.pixels.clear(), batch.points_cam.clear();
+  stays_.clear(), stays_.resize(seen_.size(), false);
   size_t lives = 0;
-  for (size_t at = 0; at < order.size();) {
-    const int64_t id = seen_[order[at]].id;
-    rows.clear();
-    for (; at < order.size() && seen_[order[at]].id == id; ++at)
-      if (std::find(held.begin(), held.end(), seen_[order[at]].frame) != held.end()) rows.push_back(order[at]);
-    while (lives < alive_count && alive[living[lives]] < id) ++lives;
-    const bool has_ended = lives == alive_count || alive[living[lives]] != id;
-    if (rows.size() < 2 || !(has_ended || due[living[lives]])) {
-      for (const size_t row : rows) stays[row] = !has_ended;
+  for (size_t at = 0; at < order_.size();) {
+    const int64_t id = seen_[order_[at]].id;
+    rows_.clear();
+    for (; at < order_.size() && seen_[order_[at]].id == id; ++at)
+      if (std::find(held, held + held_count, seen_[order_[at]].frame) != held + held_count) rows_.push_back(order_[at]);
+    while (lives < alive_count && alive[living_[lives]] < id) ++lives;
+    const bool has_ended = lives == alive_count || alive[living_[lives]] != id;
+    if (rows_.size() < 2 || !(has_ended || due[living_[lives]])) {
+      for (const size_t row : rows_) stays_[row] = !has_ended;
       continue;
     }
-    size_t nearest = rows.back();
+    size_t nearest = rows_.back();
     double largest = -std::numeric_limits<double>::infinity();
-    for (const size_t row : rows) {
+    for (const size_t row : rows_) {
       const double* pixels = seen_[row].pixels;
       if (std::isfinite(pixels[2]) && pixels[0] - pixels[2] > largest) nearest = row, largest = pixels[0] - pixels[2];
       batch.clones.push_back(seen_[row].frame);
@@ -51,7 +54,7 @@ TrackBatch Observations::take(const int64_t* alive, const bool* due, size_t aliv
   }
   size_t kept = 0;
   for (size_t row = 0; row < seen_.size(); ++row)
-    if (stays[row]) seen_[kept++] = seen_[row];
+    if (stays_[row]) seen_[kept++] = seen_[row];
   seen_.resize(kept);
   return batch;
 }

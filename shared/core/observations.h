@@ -24,8 +24,9 @@ class Observations {
 
   // Removes the tracks that ended, or are due, with two observations or more in the clones `held`. alive: ids that the newest frame saw,
   // due: which of them are to be used now. What is due but seen once stays; what ended so is forgotten.
-  TrackBatch take(const int64_t* alive, const bool* due, size_t alive_count, const std::vector<int64_t>& held, const StereoLens& lens,
-                  double far_px);
+  // The result is good until the next.
+  const TrackBatch& take(const int64_t* alive, const bool* due, size_t alive_count, const int64_t* held, size_t held_count,
+                         const StereoLens& lens, double far_px);
 
  private:
   struct Observation {
@@ -33,6 +34,10 @@ class Observations {
     double pixels[3];
   };
   std::vector<Observation> seen_;  // in order of arrival
+  // Kept so that nothing is allocated in a frame.
+  TrackBatch batch_;
+  std::vector<size_t> order_, living_, rows_;
+  std::vector<char> stays_;
 };
 
 }  // namespace fleetmap

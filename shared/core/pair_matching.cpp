@@ -68,8 +68,9 @@ bool refine(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuid
     const double coarse = coarseness(b.octaves[j]);
     weights[2 * n] = 1.0 / (guidance.sigma_px * coarse), weights[2 * n + 1] = 1.0 / std::max(guidance.sigma_px, coarse);
   }
+  ChosenSightings inliers;
   return refine_twice({points.data(), pixels.data(), weights.data(), count}, guidance.lens, guidance.refinement, nullptr, found.b_from_a,
-                      found.hessian, squared.data());
+                      found.hessian, squared.data(), inliers);
 }
 
 // The matches of a into b, and those of b into a whose features they leave free.

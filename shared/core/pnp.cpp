@@ -110,12 +110,12 @@ bool refine(const Sightings& seen, const StereoLens& lens, double width, const d
 }  // namespace
 
 bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
-                  double* hessian, double* squared) {
+                  double* hessian, double* squared, ChosenSightings& inliers) {
   constexpr double kNoPrior[36] = {};
   if (prior == nullptr) prior = kNoPrior;
   Normal normal;
   if (!refine(seen, lens, refinement.width, prior, refinement.iterations, cam_from_source, normal, squared)) return false;
-  ChosenSightings inliers;
+  inliers.clear();
   for (size_t n = 0; n < seen.count; ++n)
     if (squared[n] < refinement.gate_squared) inliers.add(seen, n);
   const Sightings again = inliers.all();
@@ -131,7 +131,8 @@ bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinemen
 std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
                                     const SE3& start) {
   Resection found{start, {}, std::vector<double>(seen.count)};
-  if (!refine_twice(seen, lens, refinement, prior, found.cam_from_source, found.information, found.squared.data())) return {};
+  ChosenSightings inliers;
+  if (!refine_twice(seen, lens, refinement, prior, found.cam_from_source, found.information, found.squared.data(), inliers)) return {};
   if (prior != nullptr)
     for (int k = 0; k < 36; ++k) found.information[k] += prior[k];
   return found;

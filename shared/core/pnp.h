@@ -27,6 +27,7 @@ struct ChosenSightings {
     pixels.insert(pixels.end(), from.pixels + 3 * n, from.pixels + 3 * n + 3);
     weights.insert(weights.end(), from.weights + 2 * n, from.weights + 2 * n + 2);
   }
+  void clear() { points.clear(), pixels.clear(), weights.clear(); }
   Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size() / 3}; }
 };
 
@@ -40,10 +41,11 @@ struct Refinement {
 // Robust least squares from a start, cam_from_source, in place: Levenberg-Marquardt on all points, and once more on the inliers alone, so
 // that no outlier biases the result. False where the points do not determine the camera.
 // The step is rotation first, applied from the left in camera axes; prior (6, 6): information that holds the start (no pointer: none).
-// Fills the last Hessian (6, 6), without the prior, and the squared normalised residuals (count,) of all points.
+// Fills the last Hessian (6, 6), without the prior, and the squared normalised residuals (count,) of all points; inliers are memory to
+// reuse.
 // Source: Geman and McClure 1987 for the weight, Marquardt 1963 for the damping.
 bool refine_twice(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior, SE3& cam_from_source,
-                  double* hessian, double* squared);
+                  double* hessian, double* squared, ChosenSightings& inliers);
 
 // A solved camera: the information (6, 6), with the prior, on a perturbation as that of the steps, and the squared normalised residuals.
 struct Resection {

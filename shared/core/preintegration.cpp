@@ -158,9 +158,9 @@ void advance_bias_jacobians(Mat3 (&by_bias)[kBiasJacobians], const Step& s) {
 
 }  // namespace
 
-std::vector<ImuInterval> imu_intervals(const ImuSamples& imu, int64_t start_ns, int64_t end_ns) {
-  std::vector<ImuInterval> intervals;
-  if (end_ns <= start_ns || imu.count == 0) return intervals;
+void imu_intervals(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, std::vector<ImuInterval>& intervals) {
+  intervals.clear();
+  if (end_ns <= start_ns || imu.count == 0) return;
   const int64_t *const stamps = imu.stamps_ns, *const stop = stamps + imu.count;
   const int64_t* const first = std::lower_bound(stamps, stop, start_ns + 1);
   const int64_t* const end = std::max(std::lower_bound(stamps, stop, end_ns), first);
@@ -184,7 +184,6 @@ std::vector<ImuInterval> imu_intervals(const ImuSamples& imu, int64_t start_ns, 
     intervals.push_back({since(after_ns, before_ns) * 1e-9, linear(imu.gyro), linear(imu.accel)});
     before_ns = after_ns;
   }
-  return intervals;
 }
 
 Preintegrated preintegrate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, Vec3 gyro_bias, Vec3 accel_bias,

@@ -29,7 +29,7 @@ struct ImuInterval {
 };
 
 // From start to end, cut at the samples between; samples are interpolated linearly, and held beyond the first and the last.
-std::vector<ImuInterval> imu_intervals(const ImuSamples& imu, int64_t start_ns, int64_t end_ns);
+void imu_intervals(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, std::vector<ImuInterval>& intervals);
 
 // Where a bias enters an increment: Jacobians of this order.
 enum BiasJacobian { kRotationByGyro, kVelocityByGyro, kVelocityByAccel, kPositionByGyro, kPositionByAccel, kBiasJacobians };

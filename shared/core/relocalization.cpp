@@ -42,7 +42,7 @@ void measure(const QueryFrame::Unmeasured& unmeasured, const std::vector<int64_t
     left.insert(left.end(), unmeasured.pixels + 3 * at, unmeasured.pixels + 3 * at + 2);
   }
   found.resize(2 * now.size());
-  match_rows(unmeasured.images, unmeasured.images, left.data(), prior.data(), now.size(), limits.stereo, found.data());
+  StereoMatcher().match_rows(unmeasured.images, unmeasured.images, left.data(), prior.data(), now.size(), limits.stereo, found.data());
   for (size_t n = 0; n < now.size(); ++n) {
     const bool is_known = found[2 * n] > limits.min_disparity_px;
     unmeasured.pixels[3 * now[n] + 2] = is_known ? left[2 * n] - found[2 * n] : std::numeric_limits<double>::quiet_NaN();

@@ -28,9 +28,10 @@ struct Peak {
 // order: all columns of a row at once.
 class Correlation {
  public:
-  explicit Correlation(ptrdiff_t most_columns) : room_(most_columns + 2 * kMostStereoHalf + 8), rows_(kMostSide * room_) {
-    for (auto* of : {&sums_, &squares_, &window_sums_, &window_squares_, &products_}) of->resize(room_);
-    rho_.resize(room_);
+  Correlation(ptrdiff_t most_columns, StereoMatcher::Columns& columns) : room_(most_columns + 2 * kMostStereoHalf + 8), of_(columns) {
+    of_.rows.resize(kMostSide * room_);
+    for (auto* each : {&of_.sums, &of_.squares, &of_.window_sums, &of_.window_squares, &of_.products}) each->resize(room_);
+    of_.correlations.resize(room_);
   }
 
   // rho[n], n < count: of the left window around (x, y) with the right one around (x_first + n, y). All windows lie inside.
@@ -38,8 +39,8 @@ class Correlation {
     const int side = 2 * half + 1;
     const double area = side * side;
     const ptrdiff_t columns = count + 2 * half;
-    std::fill_n(sums_.begin(), columns, 0.0f);
-    std::fill_n(squares_.begin(), columns, 0.0f);
+    std::fill_n(of_.sums.begin(), columns, 0.0f);
+    std::fill_n(of_.squares.begin(), columns, 0.0f);
     float l[kMostSide][kMostSide];
     double sum_l = 0.0, sum_ll = 0.0;
     for (int v = 0; v < side; ++v) {
@@ -51,7 +52,7 @@ class Correlation {
       }
       const uint8_t* right = pair.right.row(y - half + v) + x_first - half;
       float* __restrict r = row(v);
-      float* __restrict sum = sums_.data(), * __restrict square = squares_.data();
+      float* __restrict sum = of_.sums.data(), * __restrict square = of_.squares.data();
       for (ptrdiff_t k = 0; k < columns; ++k) {
         r[k] = float(right[k]);
         sum[k] += r[k];
@@ -60,26 +61,26 @@ class Correlation {
     }
     correlate(l, side, count);
     float sum_r = 0.0f, sum_rr = 0.0f;
-    for (ptrdiff_t k = 0; k < side - 1; ++k) sum_r += sums_[k], sum_rr += squares_[k];
+    for (ptrdiff_t k = 0; k < side - 1; ++k) sum_r += of_.sums[k], sum_rr += of_.squares[k];
     for (ptrdiff_t n = 0; n < count; ++n) {
-      window_sums_[n] = sum_r += sums_[n + side - 1];
-      window_squares_[n] = sum_rr += squares_[n + side - 1];
-      sum_r -= sums_[n];
-      sum_rr -= squares_[n];
+      of_.window_sums[n] = sum_r += of_.sums[n + side - 1];
+      of_.window_squares[n] = sum_rr += of_.squares[n + side - 1];
+      sum_r -= of_.sums[n];
+      sum_rr -= of_.squares[n];
     }
     const double energy_l = sum_ll - sum_l * sum_l / area;
-    const float *products = products_.data(), *window_sums = window_sums_.data(), *window_squares = window_squares_.data();
-    double* __restrict rho = rho_.data();
+    const float *products = of_.products.data(), *window_sums = of_.window_sums.data(), *window_squares = of_.window_squares.data();
+    double* __restrict rho = of_.correlations.data();
     for (ptrdiff_t n = 0; n < count; ++n) {
       const double sum = window_sums[n], energies = energy_l * (window_squares[n] - sum * sum / area);
       const double value = (products[n] - sum_l * sum / area) / std::sqrt(energies);
       rho[n] = energies < 1e-6 ? -1.0 : value;
     }
-    return rho_.data();
+    return of_.correlations.data();
   }
 
  private:
-  float* row(int v) { return rows_.data() + v * room_; }
+  float* row(int v) { return of_.rows.data() + v * room_; }
 
   // products[n] = sum l r; what stands beyond the rows' last column goes into products beyond count alone.
   void correlate(const float (&l)[kMostSide][kMostSide], int side, ptrdiff_t count) {
@@ -95,13 +96,12 @@ class Correlation {
         }
         total += of_row;
       }
-      std::memcpy(products_.data() + n, &total, sizeof total);
+      std::memcpy(of_.products.data() + n, &total, sizeof total);
     }
   }
 
   ptrdiff_t room_;
-  std::vector<float> rows_, sums_, squares_, window_sums_, window_squares_, products_;
-  std::vector<double> rho_;
+  StereoMatcher::Columns& of_;
 };
 
 // The whole-pixel disparity in [first, last] where rho is highest.
@@ -210,13 +210,27 @@ Disparity match(const StereoPair& whole, const StereoPair& halved, double x, dou
 
 }  // namespace
 
-void match_rows(const StereoPair& whole, const StereoPair& halved, const double* pixels, const double* prior_px, size_t count,
-                const StereoLimits& limits, double* out) {
-  Correlation correlation(ptrdiff_t(limits.max_disparity_px) + 8);
+void StereoMatcher::match_rows(const StereoPair& whole, const StereoPair& halved, const double* pixels, const double* prior_px,
+                               size_t count, const StereoLimits& limits, double* out) {
+  Correlation correlation(ptrdiff_t(limits.max_disparity_px) + 8, columns_);
   for (size_t n = 0; n < count; ++n) {
     const Disparity found = match(whole, halved, pixels[2 * n], pixels[2 * n + 1], prior_px[n], limits, correlation);
     out[2 * n] = found.px;
     out[2 * n + 1] = found.sigma_px;
+  }
+}
+
+void match_depth(const Grey<const float>& disparity_px, const double* pixels, size_t count, double sigma_px, double* out) {
+  for (size_t n = 0; n < count; ++n) {
+    out[2 * n] = out[2 * n + 1] = kUnknown;
+    const double x = std::nearbyint(pixels[2 * n]), y = std::nearbyint(pixels[2 * n + 1]);
+    if (!(x > 0.0 && y > 0.0 && x < double(disparity_px.width - 1) && y < double(disparity_px.height - 1))) continue;
+    float patch[9];
+    for (int v = 0; v < 3; ++v) std::copy_n(disparity_px.row(ptrdiff_t(y) - 1 + v) + ptrdiff_t(x) - 1, 3, patch + 3 * v);
+    if (!std::all_of(patch, patch + 9, [](float value) { return std::isfinite(value); })) continue;
+    std::sort(patch, patch + 9);
+    if (!(patch[8] - patch[0] < 0.08f * patch[4] + 0.5f)) continue;
+    out[2 * n] = patch[4], out[2 * n + 1] = sigma_px;
   }
 }
 

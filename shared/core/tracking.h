@@ -7,41 +7,87 @@
 #include <vector>
 
 #include "camera.h"
+#include "corners.h"
+#include "flow.h"
 #include "image.h"
 #include "lie.h"
 #include "pnp.h"
+#include "stereo.h"
 
 namespace fleetmap {
 
-// Not finite where there is no disparity.
-Vec3 stereo_point(const double* pixel, const StereoLens& lens);
-
-struct TrackLimits {
-  int half;                     // windows of 2 half + 1 pixels
-  double within_px, margin_px;  // of check_back
-  size_t least;                 // points with depth that determine a motion
+struct TrackerModel {
+  StereoLens lens;
+  int half;          // of the flow's windows, 2 half + 1 pixels
+  size_t levels;     // of the flow, above the image
+  double back_px;    // forward-backward error of the flow
+  double motion_px;  // from where the common motion takes a point
+  size_t max_points, min_inliers;
+  CornerLimits corners;
   Refinement refinement;
+  StereoLimits stereo;
+  double min_disparity_px;
 };
 
-struct PointTracks {
-  std::vector<double> places;  // (N, 2)
-  std::vector<uint8_t> kept;   // (N,) which of them hold
-  std::vector<double> points_cam;
-  int agree = -1;  // how many kept points with depth agree with the motion; -1: they determine none
+// The images of a frame, all of one size: those of a pair at half size as well; a depth sensor's disparities in place of a right one.
+// What a rig does not have is empty.
+struct TrackerFrame {
+  StereoPair whole, halved;
+  Grey<const float> disparity_px;
+};
+
+// What the points in both frames say of the motion between them.
+struct TrackedMotion {
+  bool is_known = false;
   SE3 cam_from_previous = {};
-  double information[36] = {};
-  std::vector<double> squared;  // normalised residuals of the kept points with depth
+  double information[36] = {};  // of a left perturbation in camera axes
+  double kept_share = 0.0;      // of the points that flow found: they moved as the motion says
 };
 
-// Follows pixels (N, 3) by flow down the pyramids and back, from where the motion cam_from_previous takes them, and refines that motion by
-// the points with depth. Those without move as if they were far away; those that would come to lie behind the camera stay.
-PointTracks track_points(const std::vector<GreyImage>& before, const std::vector<GreyImage>& now, const double* pixels, size_t count,
-                         const SE3& cam_from_previous, const StereoLens& lens, const TrackLimits& limits);
+// Feeds on frames in order; ids ascend and never repeat. It keeps its memory.
+class Tracker {
+ public:
+  explicit Tracker(const TrackerModel& model);
 
-// Ends in kept (N,) what was followed from pixels (N, 3) to places (N, 2) further than the limit from where the motion takes it; fills
-// carried (N, 3), which is the places and the right image's u by the depth that the motion leaves. What has no depth cannot disagree.
-void carry_points(const double* pixels, const double* points_cam, const double* places, size_t count, const SE3& cam_from_previous,
-                  const StereoLens& lens, double limit_px, bool* kept, double* carried);
+  // Follows the points into the next frame, by flow there and back from where the motion takes them: those without depth move as if they
+  // were far away, those that would come to lie behind the camera stay. The motion is refined by the points with depth, which must agree
+  // with it then. points_cam (N, 3): where the points are, where not the disparities say it (no pointer: they do). is_predicted: the motion
+  // is no mere guess. Then one level above the image is enough, coarser ones cost as much again and mix near and far points; where
+  // too few points hold, the prediction was wrong, and all levels are used.
+  TrackedMotion follow(GreyImage image, const SE3& cam_from_previous, bool is_predicted, const double* points_cam);
+
+  // A frame whose points are others: those of before are forgotten, and added ones are of this frame.
+  void begin(GreyImage image);
+  int64_t add(const double* pixels, size_t count);  // returns the first id
+
+  // Measures the disparities of the points in the newest frame, and adds corners where they have become few.
+  void renew(const TrackerFrame& frame);
+
+  const TrackerModel& model() const { return model_; }
+  const std::vector<int64_t>& ids() const { return ids_; }
+  const std::vector<double>& pixels() const { return pixels_; }
+
+ private:
+  size_t flow(const SE3& cam_from_previous, size_t levels);
+  bool find_motion(TrackedMotion& found);
+  bool search_motion(size_t agree, TrackedMotion& found);
+  void keep_agreeing(const TrackedMotion& motion);
+  void measure(const TrackerFrame& frame, const double* prior_px, size_t count);
+
+  TrackerModel model_;
+  std::vector<int64_t> ids_;
+  std::vector<double> pixels_;
+  int64_t next_id_ = 0;
+  Pyramid before_, now_;
+  CornerFinder corners_;
+  StereoMatcher stereo_;
+  // Of the points in work: where they start and where they are found, on the way there and back; which of them hold.
+  std::vector<double> points_cam_, starts_, places_, back_;
+  std::vector<uint8_t> kept_;
+  ChosenSightings seen_, inliers_;
+  std::vector<double> squared_, left_px_, prior_px_, disparities_px_;
+  std::vector<Pixel> taken_;
+};
 
 // How far the pixels of each id in both, ascending, lists have moved.
 std::vector<double> common_ways_px(const int64_t* old_ids, const double* old_pixels, size_t old_count, const int64_t* ids,

@@ -4,8 +4,6 @@ Headers there say what each function does. Images (H, W) uint8 grey, descriptors
 ValueError for sizes and numbers that cannot be, TypeError for another kind of array; what is not finite gives values.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +18,6 @@ _Floats = NDArray[np.float32]
 _Octaves = NDArray[np.int8]
 # Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), whether the disparities are measured.
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
-_Levels = Sequence[_Grey]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
 _ImageRows = tuple[_Reals, _Reals, _Reals, _Reals]
@@ -321,22 +318,24 @@ def twins(
 ) -> _Flags:
     """(N,) which landmarks at points_map (N, 3), by rising z, look like one that stands as high and further off than own_m."""
 
-def fast_corners(image: _Grey, threshold: int, border_px: int, free: _Grey | None) -> _Pixels:
-    """(N, 2) whole-pixel corners, row by row."""
+def spread_corners(
+    image: _Grey, count: int, distance_px: float, threshold: int, border_px: int, taken: _Pixels
+) -> tuple[_Pixels, _Reals]:
+    """Up to `count` whole-pixel corners (N, 2), best first, none within distance_px of another or of `taken` (M, 2); their scores (N,).
 
-def min_eigenvalue_scores(image: _Grey, pixels: _Pixels) -> NDArray[np.float64]:
-    """(N,) smaller eigenvalue of the gradient matrix around each pixel."""
+    The threshold is halved where the image is too plain to give them.
+    """
 
 def select_spread(
     pixels: _Pixels, order: _Indices, taken: _Pixels, distance_px: float, count: int, width: int, height: int
 ) -> _Indices:
     """Indices of up to `count` pixels, no two within distance_px."""
 
-def clear_discs(free: _Grey, taken: _Pixels, radius_px: float) -> None:
-    """Sets what is near to one of `taken` to 0."""
-
 def centroid_angles_deg(image: _Grey, pixels: _Pixels, radius: int) -> NDArray[np.float32]:
     """(N,) direction from each pixel to the intensity centroid of its disc."""
+
+def match_depth(disparity_px: _Floats, pixels: _Reals, sigma_px: float) -> _Reals:
+    """(N, 2) median disparity around pixels (N, 2) of a depth sensor's image, and sigma_px; NaN at depth edges."""
 
 def match_rows(
     left: _Grey,
@@ -481,46 +480,55 @@ def blend_backward(
 ) -> _Reals:
     """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""
 
-def follow_pixels(before: _Levels, now: _Levels, pixels: _Reals, predicted: _Reals, half: int) -> tuple[_Reals, _Flags]:
-    """Places (N, 2) of the windows around pixels (N, 2) in the next image, by pyramids, and which were found (N,)."""
+def allocations() -> int:
+    """How often this thread's calls have allocated memory while they computed; results are not counted."""
 
-def check_back(
+def halvings(image: _Grey, count: int) -> list[_Grey]:
+    """The image halved once, twice and so on, smoothed: pixel (x, y) is (2x, 2y) in the one before."""
+
+def follow_pixels(
     before: _Grey,
     now: _Grey,
     pixels: _Reals,
-    places: _Reals,
-    found: _Flags,
+    predicted: _Reals,
     half: int,
+    levels: int,
     within_px: float,
     margin_px: float,
-) -> _Flags:
-    """(N,) which of the found places (N, 2) lead back to pixels (N, 2)."""
+) -> tuple[_Reals, _Flags]:
+    """Places (N, 2) of the windows around pixels (N, 2) in the next image, by pyramids, and which were found and lead back (N,)."""
 
-def track_points(
-    before: _Levels,
-    now: _Levels,
-    pixels: _Reals,
-    cam_from_previous: _Reals,
-    lens: _Reals,
-    half: int,
-    within_px: float,
-    margin_px: float,
-    least: int,
-    refinement: tuple[float, float, tuple[int, int]],
-) -> tuple[_Reals, _Flags, _Reals, int, _Reals, _Reals, _Reals]:
-    """Pixels (N, 3) followed from where the motion takes them: places (N, 2), which hold (N,), points_cam (N, 3) before; how many of those
-    with depth agree (-1: they determine no motion) with the motion (4, 4), its information (6, 6), their squared residuals."""
+class Tracker:
+    """Points followed through the frames of a rectified camera; ids ascend and never repeat."""
 
-def carry_points(
-    pixels: _Reals,
-    points_cam: _Reals,
-    places: _Reals,
-    kept: _Flags,
-    cam_from_previous: _Reals,
-    lens: _Reals,
-    limit_px: float,
-) -> tuple[_Flags, _Reals]:
-    """Which of the kept places (N, 2) are where the motion takes the points; they (N, 3) with u right by the depth that it leaves."""
+    def __init__(
+        self,
+        lens: _Reals,
+        settings: object,
+        stereo: object,
+        max_disparity_px: float,
+        refinement: tuple[float, float, tuple[int, int]],
+    ) -> None: ...
+    def begin(self, left: _Grey) -> None:
+        """Forgets the points; those that are added next are of this frame."""
+    def add(self, pixels: _Reals) -> int:
+        """Adds points (N, 3) and returns the first of their ids."""
+    def track(
+        self,
+        left: _Grey,
+        pair: tuple[_Grey, _Grey, _Grey] | None,
+        disparity_px: _Floats | None,
+        cam_from_previous: _Reals | None,
+        is_predicted: bool,
+        points_cam: _Reals | None,
+    ) -> tuple[tuple[_Reals, _Reals] | None, float]:
+        """Follows the points into a frame from where a motion takes them (None: they are of it), measures disparities, adds corners.
+
+        pair: right, and both at half size. points_cam (N, 3): where the points are, by disparities where it is None. Returns the motion
+        (4, 4) and its information (6, 6), None where too few points agree, and the share of the followed points that moved so.
+        """
+    ids: _Indices
+    pixels: _Reals
 
 def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
     """How far the pixels (N, 3) of ids in both, ascending, lists have moved."""

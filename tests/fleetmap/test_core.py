@@ -18,7 +18,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
-from fleetmap.odometry.settings import FilterSettings
+from fleetmap.odometry.settings import FilterSettings, TrackerSettings
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
@@ -45,7 +45,6 @@ DTYPES = {
     "_Floats": "float32",
     "_Octaves": "int8",
     "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
-    "_Levels": "collections.abc.Sequence[dtype=uint8]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
     "_ImageRows": "tuple[dtype=float64, dtype=float64, dtype=float64, dtype=float64]",
@@ -69,6 +68,19 @@ def compiled(name: str) -> tuple[list[tuple[str, str]], str]:
     assert found, signature
     arguments = [part.split(": ", 1) for part in re.split(r", (?=\w+: )", found[1]) if part]
     return [(argument, kind.partition(" = ")[0]) for argument, kind in arguments], found[2]
+
+
+def tracker(**changed: float) -> core.Tracker:
+    settings = TrackerSettings(**changed)  # type: ignore[arg-type]
+    return core.Tracker(np.array([9.0, 15.0, 10.0, 9.0]), settings, StereoSettings(), 8.0, GUIDANCE[3])
+
+
+def tracked(pixels: Array) -> tuple[object, float]:
+    """Points followed from anywhere to anywhere."""
+    held = tracker()
+    held.begin(NOISE)
+    held.add(pixels)
+    return held.track(NOISE[::-1].copy(), (NOISE, NOISE, NOISE), None, np.eye(4), True, pixels)
 
 
 def test_the_stub_names_everything() -> None:
@@ -231,14 +243,14 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: core.choose_landmarks(THREE, BOUNDS, THREE + 1, HEIGHTS, *BUDGET), "bins: of"),
         (lambda: core.twins(WORDS, POINTS, 6, 9, 60, 0.1, 2.0), "points_map"),
         (lambda: core.twins(WORDS, POINTS[:3], 6, 0, 60, 0.1, 2.0), "most"),
-        (lambda: core.fast_corners(IMAGE, 300, 3, None), "threshold"),
-        (lambda: core.fast_corners(IMAGE, 20, 2, None), "border_px"),
-        (lambda: core.fast_corners(IMAGE, 20, 3, IMAGE[:5]), "free"),
+        (lambda: core.spread_corners(IMAGE, 9, 5.0, 300, 3, PIXELS), "threshold"),
+        (lambda: core.spread_corners(IMAGE, 9, 5.0, 20, 2, PIXELS), "border_px"),
+        (lambda: core.spread_corners(IMAGE, -1, 5.0, 20, 3, PIXELS), "count"),
+        (lambda: core.spread_corners(IMAGE, 9, float("nan"), 20, 3, PIXELS), "distance_px"),
         (lambda: core.select_spread(PIXELS, np.array([3]), PIXELS, 5.0, 9, 30, 20), "order"),
         (lambda: core.select_spread(OUTSIDE, np.array([1]), PIXELS, 5.0, 9, 30, 20), "pixels"),
         (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, float("nan"), 9, 30, 20), "distance_px"),
         (lambda: core.select_spread(PIXELS, np.array([1]), PIXELS, 0.1, 9, 1 << 30, 1 << 30), "width, height"),
-        (lambda: core.clear_discs(IMAGE.copy(), PIXELS, float("nan")), "radius_px"),
         (lambda: core.centroid_angles_deg(IMAGE[:0], PIXELS, 15), "image"),
         (lambda: core.match_rows(IMAGE, IMAGE[:9], IMAGE, IMAGE, PLACES, PLACES[:, 0].copy(), *STEREO_LIMITS), "right"),
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:2, 0].copy(), *STEREO_LIMITS), "prior_px"),
@@ -246,13 +258,18 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: core.match_rows(*[IMAGE] * 4, PLACES, PLACES[:, 0].copy(), 8.0, 0.75, 0.93, 5, 8, 0.25), "narrow_half"),
         (lambda: core.match_projected(*NEAR[:3], NEAR[3][:1], *NEAR[4:]), "octave_range"),
         (lambda: core.match_projected(*NEAR[:5], NEAR[5][:1], *NEAR[6:]), "octaves"),
-        (lambda: core.follow_pixels([IMAGE], [IMAGE], PLACES, PLACES, 8), "half"),
-        (lambda: core.follow_pixels([IMAGE], [IMAGE], PLACES, PLACES[:3], 7), "predicted"),
-        (lambda: core.follow_pixels([IMAGE], [IMAGE[:0]], PLACES, PLACES, 7), "now"),
-        (lambda: core.follow_pixels([], [IMAGE], PLACES, PLACES, 7), "before"),
-        (lambda: core.check_back(IMAGE, IMAGE, PLACES, PLACES[:1], np.ones(4, bool), 7, 1.0, 0.0), "places"),
-        (lambda: core.track_points([IMAGE], [IMAGE], SAMPLES, np.eye(4), np.ones(4), 0, 1.0, 0.0, 3, GUIDANCE[3]), "half"),
-        (lambda: core.carry_points(SAMPLES, SAMPLES, PLACES, np.ones(3, bool), np.eye(4), np.ones(4), 2.0), "places"),
+        (lambda: core.follow_pixels(IMAGE, IMAGE, PLACES, PLACES, 8, 1, 1.0, 0.0), "half"),
+        (lambda: core.follow_pixels(IMAGE, IMAGE, PLACES, PLACES[:3], 7, 1, 1.0, 0.0), "predicted"),
+        (lambda: core.follow_pixels(IMAGE, IMAGE[:0], PLACES, PLACES, 7, 1, 1.0, 0.0), "images"),
+        (lambda: core.follow_pixels(IMAGE, IMAGE, PLACES, PLACES, 7, 31, 1.0, 0.0), "levels"),
+        (lambda: core.halvings(IMAGE, -1), "levels"),
+        (lambda: tracker().begin(IMAGE[:0]), "images"),
+        (lambda: tracker().track(IMAGE, (IMAGE, IMAGE, IMAGE[:9]), None, None, False, None), "pair"),
+        (lambda: tracker().track(IMAGE, None, np.zeros((3, 3), np.float32), None, False, None), "disparity_px"),
+        (lambda: tracker().track(IMAGE, None, None, np.eye(4), True, SAMPLES), "points_cam"),
+        (lambda: tracker(min_distance_px=0.0).track(IMAGE, None, None, None, False, None), "distance_px"),
+        (lambda: tracker(window_px=17), "half"),
+        (lambda: tracker(pyramid_levels=-1), "levels"),
         (lambda: core.common_ways_px(STAMPS, SAMPLES[:2], STAMPS, SAMPLES), "pixels"),
         (lambda: core.Observations().add(0, STAMPS, SAMPLES[:2]), "pixels"),
         (lambda: core.Observations().take(STAMPS, np.ones(2, bool), STAMPS, np.ones(4), 1.0), "due"),
@@ -296,13 +313,10 @@ def test_what_cannot_be_is_refused(call: object, told: str) -> None:
 def test_what_is_not_finite_or_outside_gives_values() -> None:
     octaves = np.array([FARTHEST, -FARTHEST - 1, 0])
     assert not core.redundant_keyframes(THREE, THREE, BOUNDS, NUMBERS, NUMBERS, octaves, np.array([0, 3]), 3, 0.9).any()
-    free = np.full((20, 30), 255, np.uint8)
-    core.clear_discs(free, OUTSIDE, 5.0)
-    assert free.all()
-    assert (core.min_eigenvalue_scores(IMAGE, OUTSIDE) == 0).all()
     assert len(core.centroid_angles_deg(IMAGE, OUTSIDE, 15)) == 3
     assert len(core.select_spread(PIXELS, np.arange(3), OUTSIDE, 5.0, 9, 30, 20)) == 1
-    assert core.fast_corners(IMAGE[:2, :5].copy(), 20, 3, None).shape == (0, 2)
+    assert len(core.spread_corners(IMAGE[:2, :5].copy(), 9, 5.0, 20, 3, OUTSIDE)[0]) == 0
+    assert np.isnan(core.match_depth(np.full((20, 30), np.inf, np.float32), PLACES * [[np.nan, 1.0]], 1.0)).all()
     for strange in (np.nan, np.inf, 1e200, 0.0):
         points = np.full((5, 3), strange)
         core.lookalikes(WORDS, points[:3, 0].copy(), WORDS, points[:3], 0, 3, 9)
@@ -331,22 +345,11 @@ HOSTILE = {
     "match_rows, without a limit": lambda places: core.match_rows(
         *[NOISE] * 4, places, places[:, 1].copy(), 8.0, -np.inf, np.inf, 7, 7, np.inf
     ),
-    "follow_pixels": lambda places: core.follow_pixels([NOISE] * 3, [NOISE] * 3, places, places[::-1].copy(), 3),
-    "check_back": lambda places: core.check_back(
-        NOISE, NOISE[:5, :9].copy(), places, places[::-1].copy(), np.ones(4, bool), 7, 3.0, -np.inf
+    "follow_pixels": lambda places: core.follow_pixels(
+        NOISE, NOISE[:5, :9].copy(), places, places[::-1].copy(), 3, 9, 3.0, -np.inf
     ),
-    "track_points": lambda places: core.track_points(
-        [NOISE],
-        [NOISE],
-        np.column_stack([places, places[::-1, 0]]),
-        np.eye(4),
-        np.array([9.0, 15.0, 10.0, 9.0]),
-        3,
-        np.inf,
-        -np.inf,
-        1,
-        GUIDANCE[3],
-    ),
+    "tracker": lambda places: tracked(np.column_stack([places, places[::-1, 0]])),
+    "match_depth": lambda places: core.match_depth(NOISE.astype(np.float32), places, 1.0),
     "align_patches": lambda places: core.align_patches(
         *(PICTURES, places, OCTAVES),
         *(PICTURES, places[::-1].copy(), OCTAVES + np.int8(5)),

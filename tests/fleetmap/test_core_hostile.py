@@ -9,17 +9,18 @@ import resource
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import CodeType
+from types import CodeType, SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import asdict
 
 from fleetmap import _core  # type: ignore[attr-defined]
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
-from fleetmap.odometry.settings import FilterSettings
+from fleetmap.odometry.settings import FilterSettings, TrackerSettings
 from fleetmap.relocalization.settings import FixSettings
 
 EXAMPLES = int(os.environ.get("FLEETMAP_HOSTILE_EXAMPLES", "6"))  # of each function; of a class, times its methods
@@ -28,6 +29,7 @@ SECONDS, BYTES = 5.0, 1 << 30  # the most that a call may take
 SIZES = 0, 1, 2, 3, 4, 6, 9, 15, 40
 INTEGERS = [0, 1, 2, 3, 4, 5, 8, 40, 255, 1 << 15, 1 << 20, (1 << 31) - 1, 1 << 31, (1 << 62), (1 << 63) - 1]
 REALS = [0.0, 1.0, 0.1, 20.0, 320.0, 2.0**31, 1e18, 1e300, 1e-300, np.inf, np.nan]
+SETTINGS = SimpleNamespace(**asdict(FilterSettings()), **asdict(TrackerSettings()))
 MEMBERS = {name: getattr(_core, name) for name in dir(_core) if not name.startswith("_")}
 CALLS = [name for name, member in MEMBERS.items() if callable(member)]
 
@@ -90,7 +92,7 @@ class Arguments:
             "some": lambda: bool(self.rng.random() < 0.5),
             "several": lambda *parts: parts,
             "thrice": lambda one: [one] * 3,
-            "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, FilterSettings()),
+            "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, SETTINGS),
         }
         made: list[object] = []
         for self.name, code in asked(function):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.features.flow import Pyramid, follow, forward_backward_check
+from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.pnp.pnp import Correspondences
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -41,13 +41,14 @@ def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: 
     points_cam = transform_points(se3_inverse(map_from_cam), matched.points_source)
     seen = np.flatnonzero(points_cam[:, 2] > _NEAREST_M)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _ROW_POINTS)).astype(int)] if len(seen) else seen
-    left = matched.pixels[seen, :2]
+    left = np.ascontiguousarray(matched.pixels[seen, :2])
     lens = matched.camera.lens
     predicted = left - np.column_stack([lens[3] / points_cam[seen, 2], np.zeros(len(seen))])
-    pyramids = Pyramid(frame.left), Pyramid(frame.right)
-    flow = follow(*pyramids, left, predicted, window_px=_ROW_WINDOW_PX, levels=1)
-    good = forward_backward_check(*pyramids, flow, window_px=_ROW_WINDOW_PX, within_px=_ROW_BACK_PX)
-    out[seen[good]] = flow.places[good] - left[good] * [0.0, 1.0]
+    images, predicted = (frame.left, frame.right), np.ascontiguousarray(predicted)
+    places, good = core.follow_pixels(
+        *images, left, predicted, _ROW_WINDOW_PX // 2, 1, within_px=_ROW_BACK_PX, margin_px=-np.inf
+    )
+    out[seen[good]] = places[good] - left[good] * [0.0, 1.0]
     return out
 
 

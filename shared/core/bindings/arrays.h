@@ -10,6 +10,8 @@
 #include <utility>
 #include <vector>
 
+#include "allocations.h"
+
 namespace nb = nanobind;
 using namespace nb::literals;
 
@@ -38,5 +40,6 @@ nb::ndarray<nb::numpy, double, nb::ndim<kDimensions>> copied(const double* from,
 template <typename Compute>
 auto unlocked(Compute&& compute) {
   nb::gil_scoped_release release;
+  const fleetmap::CountedStep counted;
   return compute();
 }

@@ -20,7 +20,11 @@ using Indices = Array<int64_t, -1>;
 using Noise = std::tuple<double, double, double, double>;
 
 constexpr size_t kMostClones = 1000;
-using SharedFilter = Shared<Filter>;
+
+struct SharedFilter : Shared<Filter> {
+  using Shared<Filter>::Shared;
+  Tracks tracks;  // memory for what updates are handed
+};
 
 StereoLens lens_of(const Array<double, 4>& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
@@ -88,12 +92,14 @@ auto predict_inertial(SharedFilter& filter, const Stamps& stamps_ns, const Rows3
 
 void predict_random_walk(SharedFilter& filter, const Transform& body_from_next, double rotation_sigma_rad, double translation_sigma_m,
                          double duration_s, const std::optional<Array<double, 6, 6>>& measured_cov) {
+  const CountedStep counted;
   filter.predict_random_walk(se3(body_from_next.data()), rotation_sigma_rad, translation_sigma_m, duration_s,
                              measured_cov ? measured_cov->data() : nullptr);
 }
 
 void add_clone(SharedFilter& filter, int64_t clone_id, const Vector& rate_body_radps) {
   if (filter.clone_ids().size() == kMostClones) throw nb::value_error("clone_id: at most 1000 clones are held");
+  const CountedStep counted;
   filter.add_clone(clone_id, vec3(rate_body_radps.data()));
 }
 
@@ -105,7 +111,8 @@ auto update_by_tracks(SharedFilter& filter, const Indices& starts, const Indices
   if (starts(0) < 0 || starts(count) > int64_t(seen) || !std::is_sorted(starts.data(), starts.data() + count + 1))
     throw nb::value_error("starts: rows of clone_ids");
   if (iterations < 1 || iterations > 1000) throw nb::value_error("iterations: 1 to 1000");
-  Tracks tracks;
+  Tracks& tracks = filter.tracks;
+  tracks.sightings.clear(), tracks.anchors.clear(), tracks.first_points.clear();
   tracks.starts.assign(starts.data(), starts.data() + count + 1);
   for (size_t n = 0; n < seen; ++n) tracks.sightings.push_back({index_of(filter, clone_ids(n)), pixels(n, 0), pixels(n, 1), pixels(n, 2)});
   for (size_t t = 0; t < count; ++t) {
@@ -121,8 +128,10 @@ auto update_by_tracks(SharedFilter& filter, const Indices& starts, const Indices
 
 double correct_by_wheels(SharedFilter& filter, const Vector& velocity_base_mps, double yaw_rate_radps, double sigma_mps, double sigma_radps,
                          const Vector& gyro_radps, const Transform& base_from_body, double gate) {
-  return filter.correct_by_wheels(vec3(velocity_base_mps.data()), yaw_rate_radps, sigma_mps, sigma_radps, vec3(gyro_radps.data()),
-                                  se3(base_from_body.data()), gate);
+  return unlocked([&] {
+    return filter.correct_by_wheels(vec3(velocity_base_mps.data()), yaw_rate_radps, sigma_mps, sigma_radps, vec3(gyro_radps.data()),
+                                    se3(base_from_body.data()), gate);
+  });
 }
 
 auto motion_since(SharedFilter& filter, int64_t clone_id) {
@@ -209,11 +218,15 @@ void bind_filter(nb::module_& module) {
       .def("predict_random_walk", in_turn(&predict_random_walk), "body_from_next"_a.noconvert(), "rotation_sigma_rad"_a,
            "translation_sigma_m"_a, "duration_s"_a = 0.0, "measured_cov"_a.noconvert() = nb::none())
       .def("add_clone", in_turn(&add_clone), clone_id, "rate_body_radps"_a.noconvert())
-      .def("remove_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.remove_clone(index_of(filter, id)); }), clone_id)
+      .def("remove_clone", in_turn(+[](SharedFilter& filter, int64_t id) {
+             const CountedStep counted;
+             filter.remove_clone(index_of(filter, id));
+           }),
+           clone_id)
       .def("return_to_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }), clone_id)
       .def("begin_frame_anew", in_turn(+[](SharedFilter& filter) {
              newest(filter);
-             return transform({kIdentity, -filter.begin_frame_anew()});
+             return transform({kIdentity, -unlocked([&] { return filter.begin_frame_anew(); })});
            }))
       .def("update_by_tracks", in_turn(&update_by_tracks), "starts"_a.noconvert(), "clone_ids"_a.noconvert(), "pixels"_a.noconvert(),
            "anchors"_a.noconvert(), "points_cam"_a.noconvert(), "iterations"_a, "newest_odom_from_body"_a.noconvert().none(),
@@ -221,7 +234,7 @@ void bind_filter(nb::module_& module) {
       .def("correct_by_wheels", in_turn(&correct_by_wheels), "velocity_base_mps"_a.noconvert(), "yaw_rate_radps"_a, "sigma_mps"_a,
            "sigma_radps"_a, "gyro_radps"_a.noconvert(), "base_from_body"_a.noconvert(), gate)
       .def("correct_by_rest", in_turn(+[](SharedFilter& filter, const Vector& gyro, double sigma, double most) {
-             return filter.correct_by_rest(vec3(gyro.data()), sigma, most);
+             return unlocked([&] { return filter.correct_by_rest(vec3(gyro.data()), sigma, most); });
            }),
            "gyro_mean_radps"_a.noconvert(), "gyro_sigma_radps"_a, gate)
       .def("inflate", in_turn(+[](SharedFilter& filter, int64_t id, const Transform& seen, double gap_s) {

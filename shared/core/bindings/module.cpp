@@ -5,6 +5,8 @@
 #include <cpuid.h>
 #endif
 
+#include "allocations.h"
+
 namespace nb = nanobind;
 
 void bind_aliases(nb::module_&);
@@ -51,6 +53,7 @@ NB_MODULE(_core, module) {
         "fleetmap needs a processor with AVX2 and FMA (x86-64-v3: Intel since Haswell, 2013; AMD since Excavator, 2015), which this one "
         "is not; in a virtual machine let it see the host's processor");
 #endif
+  module.def("allocations", &fleetmap::step_allocations);
   bind_aliases(module);
   bind_block_cholesky(module);
   bind_bundle(module);

@@ -6,7 +6,8 @@ namespace {
 
 auto imu_intervals_of(const Stamps& stamps_ns, const Rows3& gyro_radps, const Rows3& accel_mps2, int64_t start_ns, int64_t end_ns) {
   const ImuSamples imu = imu_samples(stamps_ns, gyro_radps, accel_mps2);
-  const std::vector<ImuInterval> intervals = unlocked([&] { return imu_intervals(imu, start_ns, end_ns); });
+  std::vector<ImuInterval> intervals;
+  unlocked([&] { imu_intervals(imu, start_ns, end_ns, intervals); });
   const size_t count = intervals.size();
   std::vector<double> durations_s(count);
   std::vector<Vec3> gyro(count), accel(count);

@@ -1,10 +1,12 @@
 
+#include "images.h"  // first: Python's header comes before the system's
+
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <optional>
 
-#include "flow.h"
-#include "images.h"  // first: Python's header comes before the system's
+#include "in_turn.h"
 #include "observations.h"
 #include "refinement.h"
 #include "tracking.h"
@@ -13,117 +15,161 @@ using namespace fleetmap;
 
 namespace {
 
-using Levels = std::vector<Image>;  // of a pyramid
-
-void check_window(int half) {
-  if (half < 1 || half > kMostFlowHalf) throw nb::value_error("half: 1 to 7");
-}
-
-std::vector<GreyImage> greys(const Levels& levels) {
-  std::vector<GreyImage> images;
-  for (const Image& level : levels) images.push_back(grey(level));
-  if (images.empty() || std::any_of(levels.begin(), levels.end(), [](const Image& level) { return level.size() == 0; }))
-    throw nb::value_error("before, now: images that are not empty");
-  return images;
-}
-
-auto follow_pixels_of(const Levels& before, const Levels& now, const Places& pixels, const Places& predicted, int half) {
-  const size_t count = pixels.shape(0);
-  if (predicted.shape(0) != count) throw nb::value_error("predicted: one for each pixel");
-  check_window(half);
-  const std::vector<GreyImage> first = greys(before), second = greys(now);
-  std::vector<double> places(predicted.data(), predicted.data() + 2 * count);
-  std::vector<uint8_t> found(count);
-  unlocked([&] { follow_down(first, second, half, pixels.data(), places.data(), reinterpret_cast<bool*>(found.data()), count); });
-  return std::make_tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool, 1>(std::move(found), {count}));
-}
-
-auto check_back_of(const Image& before, const Image& now, const Places& pixels, const Places& places, const Array<bool, -1>& found,
-                   int half, double within_px, double margin_px) {
-  const size_t count = pixels.shape(0);
-  if (places.shape(0) != count || found.shape(0) != count) throw nb::value_error("places, found: one for each pixel");
-  check_window(half);
-  const GreyImage first = greys({before})[0], second = greys({now})[0];
-  std::vector<uint8_t> held(found.data(), found.data() + count);
-  unlocked([&] {
-    check_back(first, second, half, pixels.data(), places.data(), within_px, margin_px, reinterpret_cast<bool*>(held.data()), count);
-  });
-  return as_numpy<bool, 1>(std::move(held), {count});
-}
-
+using Matrix2 = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
+using Images = std::vector<nb::ndarray<nb::numpy, uint8_t, nb::ndim<2>>>;
 using Lens = Array<double, 4>;
 using Motion = Array<double, 4, 4>;
 using Points = Array<double, -1, 3>;
+using Ids = Array<int64_t, -1>;
+using SharedTracker = Shared<Tracker>;
+constexpr int kMostLevels = 30;
+
 StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
-auto track_points_of(const Levels& before, const Levels& now, const Points& pixels, const Motion& cam_from_previous, const Lens& lens,
-                     int half, double within_px, double margin_px, int least, const Limits& refinement) {
-  check_window(half);
-  const TrackLimits limits{half, within_px, margin_px, size_t(std::max(least, 1)), refinement_of(refinement)};
-  const std::vector<GreyImage> first = greys(before), second = greys(now);
+int checked_half(int half) {
+  if (half < 1 || half > kMostFlowHalf) throw nb::value_error("half: 1 to 7");
+  return half;
+}
+
+size_t checked_levels(int levels) {
+  if (levels < 0 || levels > kMostLevels) throw nb::value_error("levels: 0 to 30");
+  return size_t(levels);
+}
+
+GreyImage pictured(const Image& image) {
+  if (image.size() == 0) throw nb::value_error("images: not empty");
+  return grey(image);
+}
+
+Images halvings(const Image& image, int count) {
+  Pyramid pyramid;
+  const size_t levels = checked_levels(count);
+  pyramid.set(pictured(image));
+  unlocked([&] { pyramid.level(levels); });
+  Images halved;
+  for (size_t level = 1; level <= levels; ++level) {
+    const GreyImage of = pyramid.level(level);
+    const size_t height = size_t(of.height), width = size_t(of.width);
+    halved.push_back(as_numpy<uint8_t, 2>(std::vector<uint8_t>(of.at, of.at + height * width), {height, width}));
+  }
+  return halved;
+}
+
+auto follow_pixels_of(const Image& before, const Image& now, const Places& pixels, const Places& predicted, int half, int levels,
+                      double within_px, double margin_px) {
   const size_t count = pixels.shape(0);
-  PointTracks found =
-      unlocked([&] { return track_points(first, second, pixels.data(), count, se3(cam_from_previous.data()), lens_of(lens), limits); });
-  std::vector<double> motion(16), information(found.information, found.information + 36);
-  store(found.cam_from_previous, motion.data());
-  const size_t known = found.squared.size();
-  return std::make_tuple(as_numpy<double, 2>(std::move(found.places), {count, 2}), as_numpy<bool, 1>(std::move(found.kept), {count}),
-                         as_numpy<double, 2>(std::move(found.points_cam), {count, 3}), found.agree,
-                         as_numpy<double, 2>(std::move(motion), {4, 4}), as_numpy<double, 2>(std::move(information), {6, 6}),
-                         as_numpy<double, 1>(std::move(found.squared), {known}));
+  if (predicted.shape(0) != count) throw nb::value_error("predicted: one for each pixel");
+  Pyramid first, second;
+  first.set(pictured(before)), second.set(pictured(now));
+  std::vector<double> places(predicted.data(), predicted.data() + 2 * count), back(2 * count);
+  std::vector<uint8_t> found(count);
+  const size_t down_from = checked_levels(levels);
+  checked_half(half);
+  unlocked([&] {
+    bool* const held = reinterpret_cast<bool*>(found.data());
+    follow_down(first, second, down_from, half, pixels.data(), places.data(), held, count);
+    check_back(first.level(0), second.level(0), half, pixels.data(), places.data(), within_px, margin_px, held, back.data(), count);
+  });
+  return std::make_tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool, 1>(std::move(found), {count}));
 }
 
-auto carry_points_of(const Points& pixels, const Points& points_cam, const Places& places, const Array<bool, -1>& kept,
-                     const Motion& cam_from_previous, const Lens& lens, double limit_px) {
-  const size_t count = points_cam.shape(0);
-  if (pixels.shape(0) != count || places.shape(0) != count || kept.shape(0) != count)
-    throw nb::value_error("pixels, places, kept: one for each point");
-  std::vector<double> carried(3 * count);
-  std::vector<uint8_t> stays(kept.data(), kept.data() + count);
-  carry_points(pixels.data(), points_cam.data(), places.data(), count, se3(cam_from_previous.data()), lens_of(lens), limit_px,
-               reinterpret_cast<bool*>(stays.data()), carried.data());
-  return std::make_tuple(as_numpy<bool, 1>(std::move(stays), {count}), as_numpy<double, 2>(std::move(carried), {count, 3}));
+void make_tracker(SharedTracker* tracker, const Lens& lens, const nb::object& settings, const nb::object& stereo, double max_disparity_px,
+                  const Limits& refinement) {
+  constexpr int kThreshold = 12, kBorderPx = 8;
+  constexpr int64_t kMostPoints = 100'000;
+  const auto real = [](const nb::object& of, const char* name) { return nb::cast<double>(of.attr(name)); };
+  const auto whole = [](const nb::object& of, const char* name) { return nb::cast<int>(of.attr(name)); };
+  const StereoLimits limits = checked({max_disparity_px, real(stereo, "min_correlation"), real(stereo, "uniqueness"),
+                                       whole(stereo, "wide_half_px"), whole(stereo, "narrow_half_px"), real(stereo, "agreement_px")});
+  new (tracker) SharedTracker(TrackerModel{lens_of(lens),
+                                           checked_half(whole(settings, "window_px") / 2),
+                                           checked_levels(whole(settings, "pyramid_levels")),
+                                           real(settings, "back_check_px"),
+                                           real(settings, "ransac_px"),
+                                           size_t(std::clamp<int64_t>(whole(settings, "max_points"), 0, kMostPoints)),
+                                           size_t(std::max(whole(settings, "min_inliers"), 1)),
+                                           {kThreshold, kBorderPx, real(settings, "min_distance_px")},
+                                           refinement_of(refinement),
+                                           limits,
+                                           real(stereo, "min_disparity_px")});
 }
 
-auto common_ways_px_of(const Array<int64_t, -1>& old_ids, const Points& old_pixels, const Array<int64_t, -1>& ids, const Points& pixels) {
+auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std::tuple<Image, Image, Image>>& pair,
+              const std::optional<Array<float, -1, -1>>& disparity_px, const std::optional<Motion>& cam_from_previous, bool is_predicted,
+              const std::optional<Points>& points_cam) {
+  const GreyImage image = pictured(left);
+  TrackerFrame frame{{image, {}}, {}, {}};
+  if (pair) {
+    const auto& [right, left_half, right_half] = *pair;
+    if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("pair: right images of the left ones' size");
+    frame.whole.right = pictured(right), frame.halved = {pictured(left_half), pictured(right_half)};
+  }
+  if (disparity_px && !same_size(left, *disparity_px)) throw nb::value_error("disparity_px: of the image's size");
+  if (disparity_px) frame.disparity_px = grey(*disparity_px);
+  if (points_cam && points_cam->shape(0) != tracker.ids().size()) throw nb::value_error("points_cam: one for each point");
+  check_corners(tracker.model().corners.distance, double(image.width), double(image.height));
+  const double* const known = points_cam ? points_cam->data() : nullptr;
+  TrackedMotion found;
+  unlocked([&] {
+    if (cam_from_previous) found = tracker.follow(image, se3(cam_from_previous->data()), is_predicted, known);
+    tracker.renew(frame);
+  });
+  std::optional<std::tuple<Matrix2, Matrix2>> motion;
+  double matrix[16];
+  store(found.cam_from_previous, matrix);
+  if (found.is_known) motion = std::make_tuple(copied<2>(matrix, {4, 4}), copied<2>(found.information, {6, 6}));
+  return std::make_tuple(motion, found.kept_share);
+}
+
+auto common_ways_px_of(const Ids& old_ids, const Points& old_pixels, const Ids& ids, const Points& pixels) {
   if (old_ids.shape(0) != old_pixels.shape(0) || ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
   auto ways = common_ways_px(old_ids.data(), old_pixels.data(), old_ids.shape(0), ids.data(), pixels.data(), ids.shape(0));
   const size_t count = ways.size();
   return as_numpy<double, 1>(std::move(ways), {count});
 }
 
-auto take_of(Observations& table, const Array<int64_t, -1>& alive, const Array<bool, -1>& due, const Array<int64_t, -1>& held,
-             const Lens& lens, double far_px) {
+using SharedObservations = Shared<Observations>;
+
+auto take_of(SharedObservations& table, const Ids& alive, const Array<bool, -1>& due, const Ids& held, const Lens& lens, double far_px) {
   if (due.shape(0) != alive.shape(0)) throw nb::value_error("due: one for each alive");
-  TrackBatch batch =
-      table.take(alive.data(), due.data(), alive.shape(0), {held.data(), held.data() + held.shape(0)}, lens_of(lens), far_px);
-  const size_t tracks = batch.anchors.size(), rows = batch.clones.size();
-  return std::make_tuple(as_numpy<int64_t, 1>(std::move(batch.starts), {tracks + 1}), as_numpy<int64_t, 1>(std::move(batch.clones), {rows}),
-                         as_numpy<double, 2>(std::move(batch.pixels), {rows, 3}), as_numpy<int64_t, 1>(std::move(batch.anchors), {tracks}),
-                         as_numpy<double, 2>(std::move(batch.points_cam), {tracks, 3}));
+  const TrackBatch* batch = nullptr;
+  unlocked([&] { batch = &table.take(alive.data(), due.data(), alive.shape(0), held.data(), held.shape(0), lens_of(lens), far_px); });
+  const size_t tracks = batch->anchors.size(), rows = batch->clones.size();
+  const auto ids = [](const std::vector<int64_t>& of) { return as_numpy<int64_t, 1>(std::vector<int64_t>(of), {of.size()}); };
+  return std::make_tuple(ids(batch->starts), ids(batch->clones), copied<2>(batch->pixels.data(), {rows, 3}), ids(batch->anchors),
+                         copied<2>(batch->points_cam.data(), {tracks, 3}));
 }
 
 }  // namespace
 
 void bind_tracking(nb::module_& module) {
-  const auto before = "before"_a.noconvert(), now = "now"_a.noconvert(), pixels = "pixels"_a.noconvert(), lens = "lens"_a.noconvert();
-  const auto motion = "cam_from_previous"_a.noconvert();
-  const auto half = "half"_a, within = "within_px"_a, margin = "margin_px"_a;
-  module.def("follow_pixels", &follow_pixels_of, before, now, pixels, "predicted"_a.noconvert(), half);
-  module.def("check_back", &check_back_of, before, now, pixels, "places"_a.noconvert(), "found"_a.noconvert(), half, within, margin);
-  module.def("track_points", &track_points_of, before, now, pixels, motion, lens, half, within, margin, "least"_a, "refinement"_a);
-  module.def("carry_points", &carry_points_of, pixels, "points_cam"_a.noconvert(), "places"_a.noconvert(), "kept"_a.noconvert(), motion,
-             lens, "limit_px"_a);
+  const auto image = "image"_a.noconvert(), pixels = "pixels"_a.noconvert(), lens = "lens"_a.noconvert();
+  module.def("halvings", &halvings, image, "count"_a);
+  module.def("follow_pixels", &follow_pixels_of, "before"_a.noconvert(), "now"_a.noconvert(), pixels, "predicted"_a.noconvert(), "half"_a,
+             "levels"_a, "within_px"_a, "margin_px"_a);
+  nb::class_<SharedTracker>(module, "Tracker")
+      .def("__init__", &make_tracker, lens, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
+      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) { tracker.begin(pictured(left)); }), "left"_a.noconvert())
+      .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
+      .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),
+           "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none())
+      .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) {
+                     std::vector<int64_t> ids = tracker.ids();
+                     const size_t count = ids.size();
+                     return as_numpy<int64_t, 1>(std::move(ids), {count});
+                   }),
+                   nb::rv_policy::automatic)
+      .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),
+                   nb::rv_policy::automatic);
   module.def("common_ways_px", &common_ways_px_of, "old_ids"_a.noconvert(), "old_pixels"_a.noconvert(), "ids"_a.noconvert(), pixels);
-  nb::class_<Observations>(module, "Observations")
+  nb::class_<SharedObservations>(module, "Observations")
       .def(nb::init<>())
-      .def(
-          "add",
-          [](Observations& table, int64_t frame_index, const Array<int64_t, -1>& ids, const Points& pixels) {
-            if (ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
-            table.add(frame_index, ids.data(), pixels.data(), ids.shape(0));
-          },
-          "frame_index"_a, "ids"_a.noconvert(), pixels)
-      .def("clear", &Observations::clear)
-      .def("take", &take_of, "alive"_a.noconvert(), "due"_a.noconvert(), "held"_a.noconvert(), lens, "far_px"_a);
+      .def("add", in_turn(+[](SharedObservations& table, int64_t frame_index, const Ids& ids, const Points& seen) {
+             if (ids.shape(0) != seen.shape(0)) throw nb::value_error("pixels: one for each id");
+             const CountedStep counted;
+             table.add(frame_index, ids.data(), seen.data(), ids.shape(0));
+           }),
+           "frame_index"_a, "ids"_a.noconvert(), pixels)
+      .def("clear", in_turn(+[](SharedObservations& table) { table.clear(); }))
+      .def("take", in_turn(&take_of), "alive"_a.noconvert(), "due"_a.noconvert(), "held"_a.noconvert(), lens, "far_px"_a);
 }

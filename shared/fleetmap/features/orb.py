@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features.corners import corner_candidates, select_best
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
@@ -100,9 +99,8 @@ def _detect_level(
         if level == 0
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
-    candidates = corner_candidates(scaled, 2 * quota, settings.fast_threshold, _BORDER_PX)
-    scores, nothing = core.min_eigenvalue_scores(scaled, candidates), np.zeros((0, 2), np.float32)
-    chosen = select_best(candidates, scores, nothing, settings.min_distance_px, quota, (width, height))
+    limits = settings.min_distance_px, settings.fast_threshold, _BORDER_PX
+    chosen, _ = core.spread_corners(scaled, quota, *limits, np.zeros((0, 2), np.float32))
     return (scale * chosen.astype(np.float64)).astype(np.float32), core.centroid_angles_deg(
         scaled, chosen, _PATCH_RADIUS
     )

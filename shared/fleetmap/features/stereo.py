@@ -18,10 +18,10 @@ def disparities(
     """
     count = len(pixels)
     if frame.disparity_px is not None:
-        return _from_depth(frame, pixels, settings)
+        return core.match_depth(frame.disparity_px, np.ascontiguousarray(pixels, np.float64), settings.depth_sigma_px)
     if frame.right is None or count == 0:
         return np.full((count, 2), np.nan)
-    max_disparity = min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)
+    max_disparity = max_disparity_px(camera, settings)
     prior = np.full(count, np.nan) if prior_px is None else np.asarray(prior_px, np.float64)
     # whole images are only searched at half size
     halves = (frame.left, frame.right) if np.isfinite(prior).all() else (frame.half_left, frame.half_right)
@@ -33,20 +33,6 @@ def disparities(
     return matched
 
 
-def _from_depth(frame: RectifiedFrame, pixels: Array, settings: StereoSettings) -> Array:
-    """Median of the 3x3 neighbourhood; NaN at depth edges, where colour and depth cannot be registered well enough."""
-    assert frame.disparity_px is not None
-    height, width = frame.disparity_px.shape
-    out = np.full((len(pixels), 2), np.nan)
-    column, row = np.rint(pixels[:, 0]).astype(np.int64), np.rint(pixels[:, 1]).astype(np.int64)
-    inside = (column > 0) & (row > 0) & (column < width - 1) & (row < height - 1)
-    steps = np.arange(-1, 2)
-    patches = frame.disparity_px[(row[inside, None, None] + steps[:, None]), (column[inside, None, None] + steps)]
-    patches = patches.reshape(-1, 9)
-    middle = np.median(patches, axis=1)
-    spread = patches.max(axis=1) - patches.min(axis=1)
-    good = np.isfinite(middle) & (spread < 0.08 * middle + 0.5)
-    index = np.flatnonzero(inside)[good]
-    out[index, 0] = middle[good]
-    out[index, 1] = settings.depth_sigma_px
-    return out
+def max_disparity_px(camera: StereoCamera, settings: StereoSettings) -> float:
+    """The largest disparity that is looked for."""
+    return min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)

@@ -224,13 +224,14 @@ class VisualMode(WindowMode):
         An update takes the few tracks that are due or ended. Where they cluster or slip together the state must not
         follow them further than all the others allow; so loose, it adds no information to speak of.
         """
-        if tracked.pnp is None:
+        if tracked.information is None:
             return None
         body_from_cam = np.zeros((6, 6))
         rotation = self._rig.body_from_cam[:3, :3]
         body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
         body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
-        wide = self._rig.settings.filter.seen_motion_scale**2 * tracked.pnp.cov_rot_trans
+        cov_rot_trans = np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
+        wide = self._rig.settings.filter.seen_motion_scale**2 * cov_rot_trans
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 

@@ -15,8 +15,8 @@ from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_
 from fleetmap.mapformat import Tile
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.settings import TrackerSettings
-from fleetmap.odometry.tracking.tracker import Followed, MotionSince, Tracked, Tracker
-from fleetmap.pnp.pnp import Correspondences, refine_pnp
+from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
+from fleetmap.pnp.pnp import Correspondences, PnpResult, ransac_pnp, refine_pnp
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
@@ -32,71 +32,84 @@ from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = LocalizerSettings()
 _TILE_M = 1024.0
-_NEVER_S = 1e9
 _LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of the frame that is handled, for stamps that are too early
 _EVERY_M, _EVERY_RAD = 0.4, 0.2
 _NOISE = np.random.default_rng(0).integers(0, 255, (7, 48, 64), np.uint8)
 
 
 class EstimatorTracker(Tracker):
-    """The tracker with its eyes replaced: flow, disparities and corners come from a session, everything else is its own.
+    """The tracker with its eyes replaced: flow, disparities and corners come from a session, the motion is found as the core finds it.
 
     Track ids are the landmarks'. After a gap the flow simply goes on.
     """
 
     def __init__(self, session: EstimatorSession, camera: StereoCamera, settings: TrackerSettings) -> None:
-        fields = {name: getattr(settings, name) for name in settings.__struct_fields__}
-        super().__init__(camera, TrackerSettings(**(fields | {"max_gap_s": _NEVER_S})))
+        super().__init__(camera, settings)
         self._session = session
+        self._ids, self._pixels = np.zeros(0, np.int64), np.zeros((0, 3))
         self._begun_px: dict[int, Array] = {}
 
     def track(
         self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
     ) -> Tracked:
         """As the tracker's; frames must come one by one from the session's first."""
-        return super().track(frame, motion_since, rotation_sigma_rad)
+        self._frame_index += 1
+        motion, information, share = None, None, 1.0
+        if self._frame_index:
+            guess = motion_since(self._frame_index - 1)
+            found, share = self._follow(np.eye(4) if guess is None else guess)
+            if found is not None:
+                motion, information = found.cam_from_source, found.information
+        self._add_corners()
+        ids, pixels = self._ids.copy(), self._pixels.copy()
+        return Tracked(ids, pixels, (), motion, share, by_descriptors=False, information=information)
 
     def _measure(self, ids: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
         begun = np.array([self._begun_px[number] for number in ids.tolist()]).reshape(-1, 2)
         return self._session.follow(self._frame_index, ids.astype(np.uint64), begun)
 
-    def _followed(self, cam_from_previous: Array, levels: int) -> Followed:
-        before, (pixels, kept) = self._points.pixels, self._measure(self._points.ids)
+    def _follow(self, guess: Array) -> tuple[PnpResult | None, float]:
+        before, (pixels, kept) = self._pixels, self._measure(self._ids)
         has_depth = self._camera.baseline_m > 0
         disparities = before[:, 0] - before[:, 2] if has_depth else np.full(len(before), np.nan)
         points_cam = self._camera.point_from_pixel(before[:, :2], disparities)
-        places = np.where(kept[:, None], pixels[:, :2], before[:, :2])
         known = kept & np.isfinite(points_cam).all(axis=1)
-        measured, sigmas = np.column_stack([places[known], np.full(known.sum(), np.nan)]), np.ones((known.sum(), 2))
-        found = None
-        if known.sum() >= self._settings.min_inliers:
-            matches = Correspondences(self._camera, points_cam[known], measured, sigmas)
-            found = refine_pnp(matches, cam_from_previous)
-        if found is None:
-            return Followed(places, kept, points_cam, -1, cam_from_previous, np.zeros((6, 6)), np.zeros(known.sum()))
-        agree = int(found.inliers.sum())
-        return Followed(places, kept, points_cam, agree, found.cam_from_source, found.information, found.squared)
+        found, followed = self._motion(points_cam[known], pixels[known, :2], guess), max(int(kept.sum()), 1)
+        if found is not None:
+            expected = self._camera.pixel_from_point(transform_points(found.cam_from_source, points_cam))
+            near = np.linalg.norm((expected - pixels)[:, :2], axis=1) < self._settings.ransac_px
+            kept = kept & (near | ~known)
+        self._ids, self._pixels = self._ids[kept], pixels[kept]
+        return found, float(kept.sum()) / followed
 
-    def _renew_disparities(self, frame: RectifiedFrame) -> None:
-        pixels, _ = self._measure(self._points.ids)
-        self._points.pixels[:, 2] = pixels[:, 2]
+    def _motion(self, points_cam: Array, places: Array, guess: Array) -> PnpResult | None:
+        count, least = len(points_cam), self._settings.min_inliers
+        if count < least:
+            return None
+        measured = np.column_stack([places, np.full(count, np.nan)])
+        matches = Correspondences(self._camera, points_cam, measured, np.ones((count, 2)))
+        refined = refine_pnp(matches, guess)
+        if refined is not None and refined.inliers.sum() > 0.6 * count:
+            return refined
+        limits = {"threshold_px": self._settings.ransac_px, "min_inliers": least, "iterations": 200}
+        searched = ransac_pnp(matches, **limits, seed=count)  # type: ignore[arg-type]
+        best = max((each for each in (refined, searched) if each), key=lambda each: each.inliers.sum(), default=None)
+        return best if best is not None and best.inliers.sum() >= least else None
 
-    def _add_corners(self, frame: RectifiedFrame) -> None:
-        missing = self._settings.max_points - len(self._points.ids)
+    def _add_corners(self) -> None:
+        missing = self._settings.max_points - len(self._ids)
         if missing < 0.15 * self._settings.max_points:
             return
         distance_px = self._settings.min_distance_px
-        wanted, begun = self._session.corners(self._frame_index, self._points.pixels, missing, distance_px)
-        is_new = ~np.isin(wanted.astype(np.int64), self._points.ids)
+        wanted, begun = self._session.corners(self._frame_index, self._pixels, missing, distance_px)
+        is_new = ~np.isin(wanted.astype(np.int64), self._ids)
         ids = wanted[is_new].astype(np.int64)
-        held = {number: self._begun_px[number] for number in self._points.ids.tolist()}
+        held = {number: self._begun_px[number] for number in self._ids.tolist()}
         self._begun_px = held | dict(zip(ids.tolist(), begun[is_new], strict=True))
         pixels, kept = self._measure(ids)
-        ids, pixels = (
-            np.concatenate([self._points.ids, ids[kept]]), np.concatenate([self._points.pixels, pixels[kept]])
-        )  # fmt: skip
+        ids, pixels = np.concatenate([self._ids, ids[kept]]), np.concatenate([self._pixels, pixels[kept]])
         rising = np.argsort(ids)  # as those of the tracker, which numbers them one after another
-        self._points = type(self._points)(ids[rising], pixels[rising])
+        self._ids, self._pixels = ids[rising], pixels[rising]
 
 
 def seen(session: EstimatorSession, frame: int) -> FrameFeatures:

@@ -1,13 +1,16 @@
 """Optical flow against OpenCV's and against shifts that are known."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap.features import flow
+from fleetmap import core
 from fleetmap.geometry import Array
 
+UNCHECKED = np.inf, -np.inf  # no way back, no margin
 CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
 
 
@@ -39,7 +42,7 @@ def test_as_opencv_does(levels: int) -> None:
         before, now, pixels.astype(np.float32)[:, None], pixels.astype(np.float32)[:, None].copy(), winSize=(15, 15),
         maxLevel=levels, criteria=CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    _, places, found = flow.follow(flow.Pyramid(before), flow.Pyramid(now), pixels, pixels, window_px=15, levels=levels)
+    places, found = core.follow_pixels(before, now, pixels, pixels, 7, levels, *UNCHECKED)
     both = found & (found_too.ravel() > 0)
     assert both.mean() > 0.95
     off = np.linalg.norm(places - reference[:, 0], axis=1)[both]
@@ -51,48 +54,45 @@ def test_as_opencv_does(levels: int) -> None:
 @pytest.mark.parametrize(("window_px", "within_px"), [(5, 0.1), (9, 0.04), (15, 0.02)])
 def test_fractions_of_a_pixel(window_px: int, within_px: float) -> None:
     pixels = grid(25.0, 9.0)
-    _, places, found = flow.follow(
-        flow.Pyramid(painted()), flow.Pyramid(painted((0.37, 0.61))), pixels, pixels, window_px=window_px, levels=0
-    )
+    places, found = core.follow_pixels(painted(), painted((0.37, 0.61)), pixels, pixels, window_px // 2, 0, *UNCHECKED)
     assert found.mean() > 0.95
     assert np.median(np.linalg.norm(places - pixels - (0.37, 0.61), axis=1)[found]) < within_px
 
 
 def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
     pixels = np.array([[3.0, 60.0], [156.0, 60.0], [80.0, 2.5], [80.0, 117.0], [2.0, 2.0]])
-    _, places, found = flow.follow(
-        flow.Pyramid(painted()), flow.Pyramid(painted((0.3, -0.4))), pixels, pixels, window_px=15, levels=0
-    )
+    places, found = core.follow_pixels(painted(), painted((0.3, -0.4)), pixels, pixels, 7, 0, *UNCHECKED)
     assert found.all()
     np.testing.assert_allclose(places - pixels, np.tile((0.3, -0.4), (5, 1)), atol=0.15)
 
 
 def test_nothing_is_found_without_texture_or_outside() -> None:
     plain, pixels = np.full((120, 160), 90, np.uint8), np.array([[80.0, 60.0], [20.0, 20.0]])
-    *_, found = flow.follow(flow.Pyramid(plain), flow.Pyramid(painted()), pixels, pixels, window_px=15, levels=1)
+    _, found = core.follow_pixels(plain, painted(), pixels, pixels, 7, 1, *UNCHECKED)
     assert not found.any()
     far = np.array([[500.0, 60.0], [20.0, -90.0]])
-    *_, found = flow.follow(flow.Pyramid(painted()), flow.Pyramid(painted()), pixels, far, window_px=15, levels=1)
+    _, found = core.follow_pixels(painted(), painted(), pixels, far, 7, 1, *UNCHECKED)
     assert not found.any()
 
 
 def test_what_went_wrong_does_not_lead_back() -> None:
-    """A place two pixels off shows what was two pixels off before, and that is where its way back ends."""
-    pyramids, pixels = (flow.Pyramid(painted()), flow.Pyramid(painted((2.0, 0.0)))), grid(30.0, 20.0)
-    _, places, found = flow.follow(*pyramids, pixels, pixels, window_px=15, levels=1)
-    wrong = np.arange(len(pixels)) % 3 == 0
-    places[wrong] += (0.0, 2.0)
-    held = flow.forward_backward_check(*pyramids, flow.Flow(pixels, places, found), window_px=15, within_px=0.5)
-    assert found.all()
-    np.testing.assert_array_equal(held, ~wrong)
-    nothing = np.zeros(len(pixels), bool)
-    assert not flow.forward_backward_check(
-        *pyramids, flow.Flow(pixels, places, nothing), window_px=15, within_px=0.5
-    ).any()
+    """Another texture covers the right half: flow finds places there, which lead elsewhere on the way back."""
+    before, now, pixels = painted(), painted((2.0, 0.0)), grid(30.0, 20.0)
+    now[:, 80:] = painted(seed=4)[:, 80:]
+    right = pixels[:, 0] > 90
+    _, found = core.follow_pixels(before, now, pixels, pixels, 7, 1, *UNCHECKED)
+    _, held = core.follow_pixels(before, now, pixels, pixels, 7, 1, 0.5, -np.inf)
+    assert found[right].mean() > 0.5
+    np.testing.assert_array_equal(held[right], False)
+    assert held[pixels[:, 0] < 70].all()
+    places, inside = core.follow_pixels(before, now, pixels, pixels, 7, 1, 0.5, 35.0)
+    expected = ((places > 35.0) & (places < [159 - 35.0, 119 - 35.0])).all(axis=1)
+    np.testing.assert_array_equal(inside, held & expected)
 
 
-def test_a_pyramid_is_made_once() -> None:
-    pyramid = flow.Pyramid(painted())
-    assert pyramid.level(2) is pyramid.level(2)
-    assert pyramid.level(1).shape == (60, 80)
-    np.testing.assert_array_equal(pyramid.level(1), cv2.pyrDown(painted()))
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (3, 2), (5, 4), (121, 160), (480, 752), (376, 1241)])
+def test_halvings_are_those_of_opencv(size: tuple[int, int]) -> None:
+    """To the bit, also where a picture is narrower than what is mirrored at its edges."""
+    image = np.random.default_rng(sum(size)).integers(0, 256, size, np.uint8)
+    for level, halved in pairwise([image, *core.halvings(image, 3)]):
+        np.testing.assert_array_equal(halved, cv2.pyrDown(level))

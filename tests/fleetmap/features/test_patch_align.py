@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fleetmap import core
 from fleetmap.features import orb, patch_align
-from fleetmap.features.corners import spread_corners
 from fleetmap.features.patch_align import Patches, half_pyramid
 from fleetmap.features.settings import AlignSettings
 from fleetmap.geometry import Array, se3_exp, transform_points
@@ -14,6 +14,7 @@ from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smoot
 WIDTH, HEIGHT = 320, 240
 CENTRE = np.array([160.0, 120.0])
 SETTINGS = AlignSettings()
+NOTHING = np.zeros((0, 2), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def similarity(scale: float, angle_deg: float) -> Array:
 def test_known_warps_are_recovered(texture: Texture, current_from_reference: Array) -> None:
     """Starting a pixel off, under another gain and offset, the median error is below 0.05 px."""
     reference, current = warped_pair(texture, current_from_reference, gain=0.8)
-    pixels = spread_corners(reference, 120, min_distance_px=10.0, border_px=50).astype(np.float64)
+    pixels = core.spread_corners(reference, 120, 10.0, 12, 50, NOTHING)[0].astype(np.float64)
     expected = (pixels - CENTRE) @ current_from_reference.T + CENTRE
     start = expected + np.random.default_rng(1).uniform(-1.0, 1.0, expected.shape)
     level0 = np.zeros(len(pixels), np.int8)
@@ -64,7 +65,7 @@ def test_features_of_different_octaves_meet_across_scales() -> None:
     """The current picture is 1.9 times larger: octave 4 there matches octave 0 or 1 here (1.2^4 = 2.07)."""
     texture = smooth_texture(np.random.default_rng(12), shortest_px=16.0, longest_px=80.0)
     reference, current = warped_pair(texture, similarity(1.9, 0.0))
-    pixels = spread_corners(reference, 60, min_distance_px=8.0, border_px=75).astype(np.float64)
+    pixels = core.spread_corners(reference, 60, 8.0, 12, 75, NOTHING)[0].astype(np.float64)
     expected = (pixels - CENTRE) * 1.9 + CENTRE
     count = len(pixels)
     warp = np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0)
@@ -82,7 +83,7 @@ def test_features_of_different_octaves_meet_across_scales() -> None:
 def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
     u, v = pixel_grid(WIDTH, HEIGHT)
     reference, other = picture(texture, u, v), picture(smooth_texture(np.random.default_rng(77)), u, v)
-    pixels = spread_corners(reference, 120, min_distance_px=10.0, border_px=30).astype(np.float64)
+    pixels = core.spread_corners(reference, 120, 10.0, 12, 30, NOTHING)[0].astype(np.float64)
     level0, warp = np.zeros(len(pixels), np.int8), np.repeat(np.eye(2)[None], len(pixels), axis=0)
     for current in (other, np.full_like(reference, 90)):
         found = patch_align.refine_matches(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleetmap.features.corners import spread_corners
+from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.features.stereo import disparities
 from fleetmap.geometry import Array
@@ -13,6 +13,7 @@ from support.worlds.synthetic_texture import Texture, picture, pixel_grid, smoot
 WIDTH, HEIGHT = 320, 200
 CAMERA = StereoCamera(250.0, 160.0, 100.0, 0.1, WIDTH, HEIGHT)
 SETTINGS = StereoSettings()
+NOTHING = np.zeros((0, 2), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def plane_pair(texture: Texture, at_origin_px: float, per_u: float = 0.0, per_v:
 
 
 def corners(frame: RectifiedFrame, count: int = 150) -> Array:
-    found = spread_corners(frame.left, count, min_distance_px=8.0, border_px=12).astype(np.float64)
+    found = core.spread_corners(frame.left, count, 8.0, 12, 12, NOTHING)[0].astype(np.float64)
     return found[found[:, 0] > 60]
 
 

@@ -7,7 +7,8 @@ interpolation. A bias that hangs on how a picture was made would change the scal
 import numpy as np
 import pytest
 
-from fleetmap.features import flow, stereo
+from fleetmap import core
+from fleetmap.features import stereo
 from fleetmap.features.patch_align import Patches, half_pyramid, refine_matches
 from fleetmap.features.settings import AlignSettings, StereoSettings
 from fleetmap.geometry import Array
@@ -83,6 +84,6 @@ def test_patches_and_flow_are_right_whatever_the_camera_makes_of_it(name: str) -
     seen = Patches(half_pyramid(left), PIXELS, octaves), Patches(half_pyramid(right), there, octaves)
     aligned = refine_matches(*seen, warps, AlignSettings(min_correlation=0.0))
     _check(PIXELS[:, 0] - aligned[:, 0])
-    followed = flow.follow(flow.Pyramid(left), flow.Pyramid(right), PIXELS, there, window_px=13, levels=1)
-    moved = np.where(followed.found, PIXELS[:, 0] - followed.places[:, 0], np.nan)
+    places, found = core.follow_pixels(left, right, PIXELS, there, 6, 1, np.inf, -np.inf)
+    moved = np.where(found, PIXELS[:, 0] - places[:, 0], np.nan)
     _check(moved)

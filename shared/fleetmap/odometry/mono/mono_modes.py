@@ -317,8 +317,7 @@ class MonocularTracker(Tracker):
             return replace(tracked, cam_from_previous=np.eye(4) if guess is None else guess)
         return tracked
 
-    def _points_cam(self, pixels: Array) -> Array:
-        assert len(pixels) == len(self._points.ids)
+    def _points_cam(self) -> Array:
         points = self._points_in_camera(self._points.ids)
         points[~(points[:, 2] > 0.0)] = np.nan
         return points

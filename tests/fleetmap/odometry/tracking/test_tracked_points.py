@@ -1,39 +1,77 @@
-"""Predicted and carried points against the camera's own projection."""
+"""Points followed by the core: what moves as all do goes on, the rest ends; and what a frame costs besides time."""
 
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import se3, so3_exp, transform_points
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import transform_points
+from fleetmap.odometry import Odometry, OdometrySettings
+from fleetmap.odometry.settings import TrackerSettings
 from fleetmap.pnp.pnp import REFINEMENT
-from support.worlds.point_world import CAMERA
+from fleetmap.sensors.calibration import ImuNoise
+from support.worlds.point_world import noisy_imu
+from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
 
-LENS = np.array([CAMERA.focal_px, CAMERA.cx_px, CAMERA.cy_px, CAMERA.focal_px * CAMERA.baseline_m])
-MOTION = se3(so3_exp(np.array([0.01, -0.03, 0.02])), np.array([0.05, -0.02, 0.3]))
-
-
-def test_points_are_projected_and_those_without_depth_turned() -> None:
-    rng = np.random.default_rng(5)
-    points = rng.uniform([-2, -1, 1], [2, 1, 8], (40, 3))
-    points[3, 2] = -0.5  # behind the camera it stays where it was
-    pixels = CAMERA.pixel_from_point(points)
-    pixels[:2, 2] = np.nan
-    blank = [np.zeros((240, 320), np.uint8)]  # where flow leaves them where it would have begun
-    predicted = core.track_points(blank, blank, pixels, MOTION, LENS, 7, 1.0, 0.0, 5, REFINEMENT)[0]
-    np.testing.assert_allclose(predicted[4:], CAMERA.pixel_from_point(transform_points(MOTION, points[4:]))[:, :2])
-    far = CAMERA.point_from_pixel(pixels[:2, :2], np.full(2, 1e-9))
-    np.testing.assert_allclose(predicted[:2], CAMERA.pixel_from_point(transform_points(MOTION, far))[:, :2], rtol=1e-6)
-    np.testing.assert_array_equal(predicted[3], pixels[3, :2])
+WIDTH, HEIGHT, FOCAL_PX, DISPARITY_PX = 320, 200, 250.0, 10.0
+LENS = np.array([FOCAL_PX, 160.0, 100.0, 25.0])
+FRAME_NS = 50_000_000
+IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 
 
-def test_what_disagrees_ends_and_the_rest_keeps_its_depth() -> None:
-    points = np.array([[0.0, 0.0, 4.0], [0.5, 0.2, 5.0], [np.nan] * 3, [0.1, 0.1, 3.0]])
-    expected = CAMERA.pixel_from_point(transform_points(MOTION, np.nan_to_num(points, nan=1.0)))
-    flowed = expected[:, :2] + [[0.5, 0.0], [3.0, 0.0], [90.0, 0.0], [0.0, 1.9]]
-    kept = np.array([True, True, True, False])
-    pixels = CAMERA.pixel_from_point(np.nan_to_num(points, nan=1.0))
-    kept, carried = core.carry_points(pixels, points, flowed, kept, MOTION, LENS, 2.0)
-    assert kept.tolist() == [True, False, True, False]
-    np.testing.assert_array_equal(carried[:, :2], flowed)
-    disparities = expected[[0, 1, 3], 0] - expected[[0, 1, 3], 2]
-    np.testing.assert_allclose(carried[[0, 1, 3], 0] - carried[[0, 1, 3], 2], disparities)
-    assert np.isnan(carried[2, 2])
+def test_what_moves_otherwise_ends() -> None:
+    """All is 2.5 m away and moves by 2 px, but for a part that moves by -3 px; points without depth go on with either."""
+    texture, (u, v) = smooth_texture(np.random.default_rng(7)), pixel_grid(WIDTH, HEIGHT)
+    before, now = picture(texture, u, v), picture(texture, u - 2.0, v)
+    now[60:140, 100:200] = picture(texture, u + 3.0, v)[60:140, 100:200]
+    tracker = core.Tracker(LENS, TrackerSettings(max_points=0), StereoSettings(), 50.0, REFINEMENT)
+    columns, rows = np.meshgrid(np.arange(30.0, 300.0, 15.0), np.arange(30.0, 180.0, 10.0))
+    pixels = np.column_stack([columns.ravel(), rows.ravel(), columns.ravel() - DISPARITY_PX])
+    pixels[::4, 2] = np.nan
+    tracker.begin(before)
+    assert tracker.add(pixels) == 0
+    motion, share = tracker.track(now, None, None, np.eye(4), False, None) or (None, 0.0)
+    assert motion is not None
+    rays = np.column_stack([(pixels[:, :2] - LENS[1:3]) / FOCAL_PX, np.ones(len(pixels))])
+    seen = transform_points(motion[0], 2.5 * rays)
+    np.testing.assert_allclose(
+        FOCAL_PX * seen[:, :2] / seen[:, 2:] + LENS[1:3] - pixels[:, :2] - [2.0, 0.0], 0.0, atol=0.3
+    )
+    ids, moved = tracker.ids, tracker.pixels - pixels[tracker.ids]
+    around = (pixels[:, :2] > [80, 40]) & (pixels[:, :2] < [220, 160])
+    outside, inside = ~around.all(axis=1), ((pixels[:, :2] > [115, 75]) & (pixels[:, :2] < [185, 125])).all(axis=1)
+    assert np.isin(np.flatnonzero(outside), ids).mean() > 0.9
+    np.testing.assert_allclose(moved[outside[ids], :2], np.tile([2.0, 0.0], (outside[ids].sum(), 1)), atol=0.3)
+    has_depth = np.isfinite(pixels[:, 2])
+    assert not np.isin(np.flatnonzero(inside & has_depth), ids).any()
+    assert np.isin(np.flatnonzero(inside & ~has_depth), ids).mean() > 0.6
+    assert 0.5 < share < 0.95
+
+
+def test_points_that_are_known_need_no_disparity() -> None:
+    """A single camera's points, from where several frames saw them: its motion is found by them."""
+    texture, (u, v) = smooth_texture(np.random.default_rng(7)), pixel_grid(WIDTH, HEIGHT)
+    columns, rows = np.meshgrid(np.arange(30.0, 300.0, 15.0), np.arange(30.0, 180.0, 10.0))
+    pixels = np.column_stack([columns.ravel(), rows.ravel(), np.full(columns.size, np.nan)])
+    points = 2.5 * np.column_stack([(pixels[:, :2] - LENS[1:3]) / FOCAL_PX, np.ones(len(pixels))])
+    for known, is_found in ((points, True), (None, False)):
+        tracker = core.Tracker(LENS * [1, 1, 1, 0], TrackerSettings(), StereoSettings(), 0.0, REFINEMENT)
+        tracker.begin(picture(texture, u, v))
+        tracker.add(pixels)
+        motion, _ = tracker.track(picture(texture, u - 2.0, v), None, None, np.eye(4), False, known)
+        assert (motion is not None) == is_found
+        assert np.isnan(tracker.pixels[:, 2]).all()
+
+
+def test_a_frame_allocates_nothing() -> None:
+    """Tracker, window and filter keep their memory, once as many points were followed as fit."""
+    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    samples, counts, fed_ns = noisy_imu(np.random.default_rng(1), 6.5, IMU, np.zeros(3), np.zeros(3)), [], 0
+    for stamp_ns in range(FRAME_NS, 60 * FRAME_NS, FRAME_NS):
+        odometry.handle_imu(samples.between(fed_ns, stamp_ns + 1))
+        frame, fed_ns, before = stereo_frame(stamp_ns), stamp_ns + 1, core.allocations()
+        estimate = odometry.handle_stereo(frame)
+        counts.append(core.allocations() - before)
+    assert estimate.inertial
+    assert sum(counts[:20]) > 50
+    assert counts[-12:] == [0] * 12
