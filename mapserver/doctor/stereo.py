@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _MIN_MATCHES = 40
+_ALIKE = 47  # bits of 256 by which two descriptors may differ
 _NEAR = "drive in the light where both cameras see the same things, some of them near"
 SWAPPED = "left and right"
 ROTATE_BACK = "switch the driver's rotation (flip) off, or calibrate the rig with these images"
@@ -44,12 +46,10 @@ def match_stereo(frame: RectifiedFrame) -> StereoMatches:
     right_points, right_words = orb.detectAndCompute(frame.right, None)
     if left_words is None or right_words is None:
         return empty
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_words, right_words)
-    close = [m for m in matches if m.distance < 48]
-    if not close:
-        return empty
-    left = np.array([left_points[m.queryIdx].pt for m in close], np.float32)
-    right = np.array([right_points[m.trainIdx].pt for m in close], np.float32)
+    words = np.asarray(left_words, np.uint8), np.asarray(right_words, np.uint8)
+    a, b = match_mutual(*words, _ALIKE, 1.0).T
+    left, right = (np.asarray(cv2.KeyPoint.convert(points), np.float32) for points in (left_points, right_points))
+    left, right = left[a], right[b]
     width = frame.left.shape[1]
     plausible = (np.abs(left - right) < [_LARGEST_SHARE_OF_WIDTH * width, _SEARCH_ROWS_PX]).all(axis=1)
     return _refined(frame, left[plausible], right[plausible])

@@ -1,16 +1,18 @@
 """What C libraries behind OpenCV print about an image while they decode it: libpng and libjpeg return no errors, they write to stderr."""
 
 import ctypes
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
-_LOCK = threading.Lock()  # the stream is the process's own
 _text, _size = ctypes.c_void_p(), ctypes.c_size_t()
 try:
     _LIBC = ctypes.CDLL(None)
     _STDERR = ctypes.c_void_p.in_dll(_LIBC, "stderr")
+    _USUAL = _STDERR.value
     _LIBC.open_memstream.restype = ctypes.c_void_p
     _LIBC.rewind.argtypes = _LIBC.fflush.argtypes = [ctypes.c_void_p]
     # Never closed: another thread may still print to it
@@ -25,17 +27,57 @@ except (
 
 
 def with_messages(decode: Callable[[], T]) -> tuple[T, str]:
-    """The result of `decode`, and what C libraries printed meanwhile. Python's own stderr and child processes are left as they are."""
+    """The result of `decode`, and what C libraries printed meanwhile. Python's own stderr and child processes are left as they are.
+
+    Several threads may decode at once. When one of them has printed nobody knows which: all of them then decode again, one by one.
+    """
     if not _CAUGHT:
         return decode(), ""
-    with _LOCK:
-        usual = _STDERR.value
+    with _stream.caught(alone=False):
+        before = _written()
+        result = decode()
+        if _written() == before:
+            return result, ""
+    with _stream.caught(alone=True):
         _LIBC.rewind(_CAUGHT)
-        _STDERR.value = _CAUGHT
+        result = decode()
+        return result, ctypes.string_at(_text, _written()).decode("utf-8", "replace")
+
+
+def _written() -> int:
+    _LIBC.fflush(_CAUGHT)
+    return _size.value
+
+
+class _Stream:
+    """The stderr of C libraries, which the whole process has in common."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Condition()
+        self._inside = self._waiting = 0  # who catches it, and who waits to do so alone
+        self._is_alone = False
+        if _CAUGHT:
+            _STDERR.value = _USUAL
+
+    @contextmanager
+    def caught(self, *, alone: bool) -> Iterator[None]:
+        """It goes to memory; alone: for nobody else meanwhile."""
+        with self._turn:
+            self._waiting += alone
+            self._turn.wait_for(lambda: not (self._is_alone or (self._inside if alone else self._waiting)))
+            self._waiting -= alone
+            if not self._inside:
+                _STDERR.value = _CAUGHT
+            self._inside, self._is_alone = self._inside + 1, alone
         try:
-            result = decode()
+            yield
         finally:
-            _STDERR.value = usual
-        _LIBC.fflush(_CAUGHT)
-        said = ctypes.string_at(_text, _size.value).decode("utf-8", "replace") if _size.value else ""
-    return result, said
+            with self._turn:
+                self._inside, self._is_alone = self._inside - 1, False
+                if not self._inside:
+                    _STDERR.value = _USUAL
+                self._turn.notify_all()
+
+
+_stream = _Stream()
+os.register_at_fork(after_in_child=_stream.__init__)  # type: ignore[misc]  # threads that were inside are not in the child

@@ -1,9 +1,12 @@
 """Images as recordings store them, and their decoding to grey or metres."""
 
+import os
 import re
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -22,6 +25,8 @@ _JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_BESIDE = ThreadPoolExecutor(1, "decoder")  # decodes the left image while its partner is decoded
+os.register_at_fork(after_in_child=partial(_BESIDE.__init__, 1, "decoder"))  # type: ignore[misc]  # a child has no thread of its parent's
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -170,10 +175,12 @@ class StoredFrame:
 
 
 def decode_frame(stored: StoredFrame) -> CameraFrame:
-    """The frame with its images decoded; RecordingError naming the image that cannot be."""
+    """The frame with its images decoded, of files two at a time; RecordingError naming the image that cannot be."""
+    is_slow = stored.left.encoding == "file" and (stored.right or stored.depth) is not None
+    left = _BESIDE.submit(decode_grey, stored.left) if is_slow else None
     right = None if stored.right is None else decode_grey(stored.right)
     depth = None if stored.depth is None else decode_depth(stored.depth)
-    return CameraFrame(stored.stamp_ns, decode_grey(stored.left), right, depth)
+    return CameraFrame(stored.stamp_ns, decode_grey(stored.left) if left is None else left.result(), right, depth)
 
 
 def decode_grey(stored: StoredImage) -> Image:

@@ -113,8 +113,8 @@ def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | 
     best, words = given, ""
     if given.mean() > _GOOD_PX2:
         for lens, other in _other_lenses(rig):
-            errors = _errors_px2(other, pairs)
-            if errors.mean() < best.mean() and (errors < given).mean() >= _MORE_OFTEN:
+            errors = _smaller_errors_px2(other, pairs, given)
+            if errors is not None and errors.mean() < best.mean():
                 best, words = errors, lens
     if best.mean() > FITS_PX2:
         best, words = given, ""
@@ -179,6 +179,17 @@ def _is_possible(camera: CameraCalibration) -> bool:
 def _errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> Array:
     """(K,) mean squared error of each pair of frames: where the points of the first lie in the later one, and in their own."""
     return np.array([_error_px2(rig, points) for points in pairs])
+
+
+def _smaller_errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints], given: Array) -> Array | None:
+    """(K,) as `_errors_px2`; None as soon as they cannot be smaller than `given` as often as another lens must be better."""
+    errors = np.zeros(len(pairs))
+    for number, points in enumerate(pairs, 1):
+        errors[number - 1] = _error_px2(rig, points)
+        worse = np.count_nonzero(errors[:number] >= given[:number])
+        if (len(pairs) - worse) / len(pairs) < _MORE_OFTEN:
+            return None
+    return errors
 
 
 def _error_px2(rig: RigCalibration, points: FollowedPoints) -> float:

@@ -6,7 +6,7 @@ single camera has baseline 0.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
 _MAX_ZOOM = 1.5  # beyond it one rig sees corners that the other cannot
@@ -116,7 +117,11 @@ class Rectifier:
         for camera in used:
             body_from_rect = self.body_from_cam[:3, :3]
             cam_from_rect = camera.body_from_cam[:3, :3].T @ body_from_rect
-            self._maps.append(_remap_tables(self.camera, camera, cam_from_rect))
+            numbers = camera.intrinsics_px, camera.distortion, cam_from_rect.ravel()
+            size = camera.width_px, camera.height_px
+            self._maps.append(
+                _remap_tables(self.camera, camera.model, size, *(tuple(each.tolist()) for each in numbers))
+            )
 
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
         """The rectified frame; raises RecordingError where an image's size is not the calibration's."""
@@ -181,8 +186,16 @@ def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
     return replace(pinhole, baseline_m=own.baseline_m)
 
 
+@lru_cache(
+    maxsize=4
+)  # those of two pairs: a build makes the rectifier of a recording for its checks, and again for its survey
 def _remap_tables(
-    rectified: StereoCamera, camera: CameraCalibration, cam_from_rect: Array
+    rectified: StereoCamera,
+    model: str,
+    size_px: tuple[int, int],
+    intrinsics_px: tuple[float, ...],
+    distortion: tuple[float, ...],
+    cam_from_rect: tuple[float, ...],
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
     """Fixed-point look-up tables for cv2.remap, or None where the image is rectified already (as KITTI's are)."""
     u, v = np.meshgrid(
@@ -191,8 +204,10 @@ def _remap_tables(
     rays = np.stack(
         [(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1
     )
-    pixels = camera.pixel_from_ray(rays.reshape(-1, 3) @ cam_from_rect.T).reshape(*u.shape, 2)
-    same_size = (rectified.width_px, rectified.height_px) == (camera.width_px, camera.height_px)
+    rays = rays.reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
+    lens = np.array(intrinsics_px), np.array(distortion)
+    pixels = CAMERA_MODELS[model].pixel_from_ray(*lens, rays).reshape(*u.shape, 2)
+    same_size = (rectified.width_px, rectified.height_px) == size_px
     if same_size and np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
         return None
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)

@@ -3,6 +3,7 @@
 import struct
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -64,6 +65,23 @@ def test_damage_is_an_error_in_our_words(data: bytes, capfd: pytest.CaptureFixtu
 def test_packed_depth_too(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RecordingError, match="damaged"):
         decode_depth(StoredImage(INVERSE_DEPTH, flipped(DEPTH), "depth"))
+    assert capfd.readouterr().err == ""
+
+
+def test_threads_that_decode_at_once_accuse_no_good_image(capfd: pytest.CaptureFixture[str]) -> None:
+    """What a decoder prints is the process's own: it must be laid to the image that it is about."""
+    large = np.tile(NOISE, (8, 8))
+    png, jpeg = (bytes(cv2.imencode(kind, large)[1]) for kind in (".png", ".jpg"))
+    pictures = [png, without_middle(jpeg), jpeg, without_middle(jpeg)] * 10
+
+    def is_good(data: bytes) -> bool:
+        try:
+            return decode_grey(StoredImage("file", data, "camera")).shape == large.shape
+        except RecordingError:
+            return False
+
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(is_good, pictures)) == [True, False, True, False] * 10
     assert capfd.readouterr().err == ""
 
 
