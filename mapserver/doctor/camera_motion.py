@@ -67,10 +67,8 @@ def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: Stereo
     if corners is None or len(corners) < _MIN_POINTS:
         return None
     pixels = corners.reshape(-1, 2).astype(np.float64)
-    images = before.left, after.left
-    places, is_tracked = core.follow_pixels(
-        *images, pixels, pixels, _WINDOW_PX // 2, _LEVELS, within_px=_RETURNED_PX, margin_px=-np.inf
-    )
+    limits = _WINDOW_PX // 2, _LEVELS, _RETURNED_PX, -np.inf
+    places, is_tracked = core.follow_pixels(before.left, after.left, pixels, pixels, *limits)
     found = disparities(before, camera, pixels, _STEREO)[:, 0]
     has_depth = is_tracked & np.isfinite(found)
     if camera.baseline_m > 0 and has_depth.sum() >= _MIN_POINTS:

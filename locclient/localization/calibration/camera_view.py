@@ -44,10 +44,8 @@ def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: 
     left = np.ascontiguousarray(matched.pixels[seen, :2])
     lens = matched.camera.lens
     predicted = left - np.column_stack([lens[3] / points_cam[seen, 2], np.zeros(len(seen))])
-    images, predicted = (frame.left, frame.right), np.ascontiguousarray(predicted)
-    places, good = core.follow_pixels(
-        *images, left, predicted, _ROW_WINDOW_PX // 2, 1, within_px=_ROW_BACK_PX, margin_px=-np.inf
-    )
+    limits = _ROW_WINDOW_PX // 2, 1, _ROW_BACK_PX, -np.inf
+    places, good = core.follow_pixels(frame.left, frame.right, left, np.ascontiguousarray(predicted), *limits)
     out[seen[good]] = places[good] - left[good] * [0.0, 1.0]
     return out
 

@@ -1,5 +1,7 @@
 """Versions on trial while a robot drives: it keeps its place whatever a new version turns out to be."""
 
+import gc
+import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import Status
@@ -15,6 +18,8 @@ from locclient.robot.robot import Robot
 from locclient.robot.version_trial import Change
 from mapserver.store import MapStore
 from support.worlds import robot_world
+
+LAPS, LAP_FRAMES = 20, 70
 
 
 @pytest.fixture
@@ -113,3 +118,21 @@ def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
     drive(robot, range(70, 120), bundles)
     assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
     assert [held.version for held in robot.held] == [1]
+
+
+def test_laps_cost_no_memory(store: MapStore) -> None:
+    """What a robot keeps is full after ten laps: ten more leave less than a page of memory a frame."""
+
+    def resident_bytes() -> int:
+        gc.collect()
+        give_back_free_memory()
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    robot, resident = robot_world.new_robot(), []
+    robot.use(robot_world.loaded(store))
+    for number, bundle in enumerate(robot_world.bundles(LAPS * LAP_FRAMES)):
+        robot.handle(bundle)
+        robot.take_changes()
+        if number % LAP_FRAMES == LAP_FRAMES - 1:
+            resident.append(resident_bytes())
+    assert resident[-1] - resident[LAPS // 2 - 1] < LAPS // 2 * LAP_FRAMES * resource.getpagesize()
