@@ -25,7 +25,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 COMPILE := $(BIN)/python -m compileall -q shared mapserver locclient
 # What the compiled core is built with, beside a C++ compiler.
-CORE_TOOLS := cmake ninja nanobind cmeel-eigen scikit-build-core
+CORE_TOOLS := cmake ninja nanobind scikit-build-core
 BUILD_CORE := shared/core/build.sh $(VENV)
 # Stamps: the time of the last install. Installing for development covers what the demo runs.
 RUN_STAMP := $(VENV)/.installed-run

@@ -12,7 +12,7 @@ python=$tools/venv/bin/python
 PIP_CONSTRAINT=$PWD/constraints.txt
 export PIP_CONSTRAINT PIP_DISABLE_PIP_VERSION_CHECK=1
 echo "fetching the compiler and what builds with it"
-"$python" -m pip install --quiet ziglang wheel scikit-build-core nanobind cmeel-eigen cmake ninja
+"$python" -m pip install --quiet ziglang wheel scikit-build-core nanobind cmake ninja
 PATH=$tools/venv/bin:$PATH
 suffix=$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("SOABI").split("-")[1])')
 for processor in "$@"; do

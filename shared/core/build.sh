@@ -1,6 +1,6 @@
 #!/bin/sh
-# Builds fleetmap._core into shared/fleetmap, as far as its sources changed: shared/core/build.sh VENV [sanitize]. VENV has cmake, ninja,
-# nanobind and Eigen's headers. With `sanitize` it builds the core of `make sanitize`, into VENV/core-sanitize. Where no C++ compiler is
+# Builds fleetmap._core into shared/fleetmap, as far as its sources changed: shared/core/build.sh VENV [sanitize]. VENV has cmake, ninja
+# and nanobind. With `sanitize` it builds the core of `make sanitize`, into VENV/core-sanitize. Where no C++ compiler is
 # installed it takes that of `ziglang` from the package index.
 set -eu
 core=$(cd "$(dirname "$0")" && pwd)
