@@ -8,7 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap import core
 from fleetmap.features import orb, patch_align
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
@@ -96,9 +98,9 @@ class Keyframe:
         return self.pictures.pyramid
 
     def with_pyramid(self) -> "Keyframe":
-        """The same keyframe with the left picture's pyramid in memory, and no other picture."""
+        """The same keyframe with the left picture's pyramid and the depth image in memory, and no right picture."""
         images, pyramid = MemoryImageStore(), self.pyramid
-        frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, None)
+        frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, self.frame.disparity_px)
         return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)))
 
     def without_pictures(self) -> "Keyframe":
@@ -108,6 +110,13 @@ class Keyframe:
     def measured(self, features: NDArray[np.integer]) -> Array:
         """(n, 2) disparities of features (n,) and their sigmas as its own pictures have them; NaN where other keyframes say them."""
         return np.full((len(features), 2), np.nan) if self.from_views else self.disparities[features]
+
+    def measured_at(self, features: NDArray[np.integer], pixels: Array, settings: StereoSettings) -> Array:
+        """As `measured`, of features that are at left pixels (n, 2) now: depth images are read there, pairs are not matched again."""
+        depth = self.frame.disparity_px
+        if depth is None:
+            return self.measured(features)
+        return core.match_depth(depth, np.ascontiguousarray(pixels, np.float64), settings.depth_sigma_px)
 
     @property
     def median_depth_m(self) -> float:

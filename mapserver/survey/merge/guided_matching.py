@@ -98,7 +98,7 @@ def _refined(
     sure = np.isfinite(aligned[:, 0])
     left[sure] = aligned[sure, :2]
     sigma[sure] = np.hypot(noise.aligned_sigma_px, aligned[sure, 2])
-    disparities, sigmas = keyframe.measured(features).T
+    disparities, sigmas = keyframe.measured_at(features, left, settings.stereo).T
     sigma_depth = np.hypot(noise.disparity_sigma_px, np.nan_to_num(sigmas, nan=1.0))
     pixels = np.column_stack([left, left[:, 0] - disparities])
     return Sighting(rows, features, pixels, np.column_stack([sigma, sigma_depth]))

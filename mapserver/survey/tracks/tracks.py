@@ -223,7 +223,7 @@ def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
-        disparities, its_sigmas = own.measured(features).T
+        disparities, its_sigmas = own.measured_at(features, left, settings.stereo).T
         pixels[rows] = np.column_stack([left, left[:, 0] - disparities])
         sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(its_sigmas, nan=1.0))])
     return pixels, sigmas

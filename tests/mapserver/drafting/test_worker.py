@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from pathlib import Path
 
 import pytest
 from distributed import Client, LocalCluster
@@ -16,6 +17,7 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
+from mapserver import BuildOptions, build_map, open_map
 from mapserver.drafting import worker as workers
 from mapserver.drafting.worker import Cluster, Threads, open_executor, read_ahead
 from mapserver.store.archive import encode_archive
@@ -24,7 +26,8 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.tiles.tiling import tiles_from_survey
-from support.recordings.recording_samples import calibration, make_sample
+from support.recordings.recording_samples import calibration, make_sample, write_euroc
+from support.worlds.box_room import out_and_back, ride_sample
 
 
 def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
@@ -57,10 +60,15 @@ def test_linear_algebra_has_no_threads_beside_those_of_a_survey() -> None:
         assert set(_blas_threads()) == {3}
 
 
-def test_threads_make_the_same_map() -> None:
-    with open_executor(3, None) as worker:
-        assert isinstance(worker, Threads)
-        assert surveyed_by(worker) == alone()
+def test_threads_make_the_same_map(tmp_path: Path) -> None:
+    recording = write_euroc(tmp_path / "ride", ride_sample(out_and_back(3.0), 31, 0.1))
+    made = []
+    for threads in (1, 2, 4):
+        build = build_map(recording, tmp_path / str(threads), "hall", BuildOptions(threads=threads))
+        tiles = [tile.sha256 for tile in open_map(build.store, "hall", build.version).manifest.tiles]
+        made.append((encode_archive(build.map), tiles))
+    assert made[1] == made[0]
+    assert made[2] == made[0]
 
 
 @pytest.fixture(scope="module")
