@@ -13,6 +13,7 @@ from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, over, read_given, refuse_internal
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sensors.source_settings import SourceSection, Topics
+from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
@@ -26,6 +27,7 @@ TIERS = {
         "": "site store",
         "source": "kind sensors calibration endpoint recording device",
         "topics": "*",
+        "alerts": "*",
     },
     "tuning": {
         "source": "domain keys speed width_px height_px rate_hz delay_s",
@@ -59,6 +61,7 @@ class MapserverConfig(Section, frozen=True):
     ingest: IngestSettings = IngestSettings()
     canary: CanarySettings = CanarySettings()
     resurvey: ResurveySettings = ResurveySettings()
+    alerts: AlertSettings = AlertSettings()
 
 
 def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig, Options]:

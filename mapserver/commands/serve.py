@@ -204,11 +204,13 @@ def _run(
     from mapserver.serving.background_tasks import (
         BackgroundTask,
         admission_tasks,
+        alert_tasks,
         run_background_tasks,
         server_tasks,
     )
     from mapserver.serving.bus_service import BusService
     from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
+    from mapserver.serving.webhook import Webhook
 
     # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
@@ -217,6 +219,7 @@ def _run(
         logging.getLogger(__name__).warning("%s", guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet)
+    webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
 
@@ -224,9 +227,8 @@ def _run(
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
         import asyncio
 
-        background = [
-            asyncio.create_task(run_background_tasks(some)) for some in (tasks, admission_tasks(robots, fleet))
-        ]
+        groups = (tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook))
+        background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
         background.append(asyncio.create_task(listener.watch(server.server_state.connections)))
         host, port = listener.getsockname()[:2]
         typer.echo(f"http: {'https' if certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
@@ -277,6 +279,8 @@ def _run(
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
             server.run(sockets=[listener])
     finally:
+        if webhook is not None:
+            webhook.close()
         bus_service.close()
         fleet.flush()
 

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from fleetmap.errors import FleetmapError
 from fleetmap.log_lines import LogLimit
 from mapserver.drafting.job_lock import end_interrupted
+from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
+from mapserver.serving.webhook import AlertWatch, Webhook
 from mapserver.store import MapStore
 from mapserver.trust import update_lists
 
@@ -26,6 +28,7 @@ _LOOK_EVERY_S = 0.2
 _JOBS_EVERY_S = 20.0
 _ADMIT_EVERY_S = 1.0  # what changes meanwhile goes together
 _CONNECTED_EVERY_S = 5.0
+_ALERTS_EVERY_S = 10.0
 _log = logging.getLogger(__name__)
 
 
@@ -55,6 +58,16 @@ def server_tasks(
         ),
         BackgroundTask("looking at canaries", _CANARIES_EVERY_S, lambda: review(store, canary, time.time_ns())),
     ]
+
+
+def alert_tasks(
+    store: MapStore, fleet: Fleet, settings: AlertSettings, webhook: Webhook | None
+) -> list[BackgroundTask]:
+    """Looks for what the webhook should be told; nothing without one."""
+    if webhook is None:
+        return []
+    watch = AlertWatch(lambda: active_alerts(store, fleet, settings, time.time_ns()), webhook.put, time.time_ns)
+    return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, watch.look)]
 
 
 def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:

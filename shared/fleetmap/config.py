@@ -47,7 +47,6 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     "add": "`mapserver trust rotate root --stick DIR` makes another root key",
     **dict.fromkeys(("signer", "keys", "adopt"), "the account that serves also builds and signs; delete the key"),
     **dict.fromkeys(("with_trust", "root"), "an imported version is a draft that you judge; delete the key"),
-    "alerts": "Prometheus and its Alertmanager tell a webhook by deploy/prometheus-alerts.yml; delete the section",
     "format": "the simulator writes MCAP, which every reader takes",
     "images": "the simulator stores pictures as PNG, without loss",
     "witness": "`mapserver audit --verify` checks the log by itself; delete the key",

@@ -15,7 +15,6 @@ from mapserver.config import read_config
             "[gate]\nallow_unjudged_calibration = true\n",
             r"`\$\.gate`; `mapserver publish --trust-calibration .* replaces it",
         ),
-        ('[alerts]\nwebhook = "https://a.example"\n', "Alertmanager tell a webhook"),
         ("[train_vocabulary]\nlevels = 3\n", "maps use the vocabulary that ships"),
     ],
 )

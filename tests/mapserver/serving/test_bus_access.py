@@ -17,6 +17,7 @@ from fleetmap.messages import RobotHealth, decode_message, encode_message, robot
 from fleetmap.trust import enrolment
 from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
+from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_access import COPIED_AFTER_S, BusGuard, check_binding, prepare_bus
 from mapserver.serving.bus_service import BusService
@@ -181,6 +182,8 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
             assert [event.kind for event in register._store.events("lab")].count("robot connected twice") == 1
             (status,) = fleet.robots("lab")
             assert status.is_copied
+            found = active_alerts(register._store, fleet, AlertSettings(), register._store.now_ns())
+            assert [(alert.name, alert.about) for alert in found] == [("FleetmapRobotCopied", "r2")]
             clock["s"] += COPIED_AFTER_S
             guard.look()
             assert not guard.copied

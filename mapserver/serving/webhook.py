@@ -1,0 +1,172 @@
+"""Alerts as JSON to a webhook, in the form of Prometheus Alertmanager (version 4), so that its receivers take them.
+
+Whoever answers there is not trusted: nothing but the status of the answer is read, no redirect is followed, and each attempt ends after
+some seconds whatever comes. A thread of its own sends, so that nobody waits for it.
+"""
+
+import http.client
+import logging
+import queue
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import UsageError, disk_errors
+from fleetmap.log_lines import LogLimit
+from mapserver.fleet.alerts import Alert, AlertSettings
+from mapserver.serving.http_connections import is_loopback_name
+
+_ATTEMPT_S = 5.0
+_PAUSES_S = (2.0, 10.0, 60.0)  # between four attempts
+_MOST_WAITING = 50
+_MOST_ALERTS = 200  # in one message
+_log = logging.getLogger(__name__)
+Body = dict[str, Any]
+
+
+class Webhook:
+    """Sends messages one after the other until `close`; those that wait too long or fail four times are dropped, which the log says."""
+
+    def __init__(self, settings: AlertSettings) -> None:
+        """UsageError for an address that must not be told, and a token that cannot be read."""
+        address = check_address(settings.webhook or "")
+        self._secure, self._host, self._port = address.scheme == "https", address.hostname or "", address.port
+        self._path = f"{address.path or '/'}{f'?{address.query}' if address.query else ''}"
+        self._headers = {"Content-Type": "application/json", "User-Agent": "fleetmap"}
+        if settings.token_file is not None:
+            self._headers["Authorization"] = f"Bearer {_token(Path(settings.token_file))}"
+        self._waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
+        self._ended = threading.Event()
+        self._refusals = LogLimit(_log)
+        self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
+        self._thread.start()
+
+    def put(self, body: Body) -> None:
+        try:
+            self._waiting.put_nowait(to_json(body))
+        except queue.Full:
+            self._refusals.warning("full", "an alert is dropped: %d wait for the webhook", _MOST_WAITING)
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(_ATTEMPT_S + 1.0)
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                body = self._waiting.get(timeout=0.2)
+            except queue.Empty:
+                continue
+            self._deliver(body)
+
+    def _deliver(self, body: bytes) -> None:
+        for pause_s in (*_PAUSES_S, None):
+            fault = self._attempt(body)
+            if not fault:
+                return
+            self._refusals.warning("fault", "the webhook at %s did not take an alert: %s", self._host, fault)
+            if pause_s is not None and self._ended.wait(pause_s):
+                return
+        self._refusals.warning(
+            "dropped", "an alert is dropped: the webhook did not take it %d times", len(_PAUSES_S) + 1
+        )
+
+    def _attempt(self, body: bytes) -> str:
+        made = http.client.HTTPConnection(self._host, self._port or (443 if self._secure else 80), timeout=_ATTEMPT_S)
+        # A timeout of sockets begins anew with each byte: who sends them one by one would hold us for ever.
+        watch = threading.Timer(_ATTEMPT_S, _cut, (made,))
+        try:
+            made.connect()
+            if self._secure:
+                tls = ssl.create_default_context()
+                made.sock = tls.wrap_socket(made.sock, server_hostname=self._host, do_handshake_on_connect=False)
+            watch.start()
+            if isinstance(made.sock, ssl.SSLSocket):
+                made.sock.do_handshake()
+            made.request("POST", self._path, body, self._headers)
+            status = made.getresponse().status
+        except Exception as error:  # whatever it is, the next alert is tried all the same
+            return f"{type(error).__name__}: {error}"[:200]
+        finally:
+            watch.cancel()
+            made.close()
+        return "" if 200 <= status < 300 else f"status {status}"
+
+
+class AlertWatch:
+    """Tells the webhook what begins to hold and what no longer does. After a restart of the server what holds is told again."""
+
+    def __init__(
+        self, look: Callable[[], Sequence[Alert]], put: Callable[[Body], None], clock_ns: Callable[[], int]
+    ) -> None:
+        self._look, self._put, self._clock_ns = look, put, clock_ns
+        self._known: dict[tuple[str, str, str], Alert] = {}
+
+    def look(self) -> None:
+        """Compares what holds with the last time."""
+        now = {alert.key: alert for alert in self._look()}
+        begun = [alert for key, alert in now.items() if key not in self._known]
+        ended = [alert for key, alert in self._known.items() if key not in now]
+        self._known = {key: self._known.get(key, alert) for key, alert in now.items()}
+        for status, alerts in (("firing", begun), ("resolved", ended)):
+            if alerts:
+                self._put(message(alerts[:_MOST_ALERTS], status, self._clock_ns()))
+                if len(alerts) > _MOST_ALERTS:
+                    _log.warning("%d alerts at once; the first %d are told", len(alerts), _MOST_ALERTS)
+
+
+def message(alerts: Sequence[Alert], status: str, now_ns: int) -> Body:
+    """Alerts of one status, as Alertmanager's webhooks send them."""
+    told = [
+        {
+            "status": status,
+            "labels": {"alertname": alert.name, "site": alert.site, **({"about": alert.about} if alert.about else {})},
+            "annotations": {"summary": alert.words},
+            "startsAt": _moment(alert.since_ns),
+            "endsAt": _moment(now_ns) if status == "resolved" else "0001-01-01T00:00:00Z",
+        }
+        for alert in alerts
+    ]
+    return {"version": "4", "receiver": "fleetmap", "status": status, "truncatedAlerts": 0, "alerts": told}
+
+
+def check_address(webhook: str) -> Any:
+    """The parts of a webhook's address; UsageError for one that is no https, beyond this machine, or holds a password."""
+    try:
+        parts = urlsplit(webhook)
+        host, _ = parts.hostname, parts.port
+    except ValueError as error:
+        raise UsageError(f"[alerts] webhook = {webhook[:200]!r}: {error}") from error
+    if parts.scheme not in {"https", "http"} or not host or any(c.isspace() or not c.isprintable() for c in webhook):
+        raise UsageError(f"[alerts] webhook = {webhook[:200]!r}: write it like https://alerts.example/fleetmap")
+    if parts.username is not None or parts.password is not None:
+        raise UsageError("[alerts] webhook holds a name or password; put a token into a file and name it in token_file")
+    if parts.scheme == "http" and not is_loopback_name(host):
+        raise UsageError(f"[alerts] webhook = {webhook[:200]!r}: beyond this machine only https:// is told")
+    return parts
+
+
+def _token(path: Path) -> str:
+    with disk_errors(f"[alerts] token_file = {path} cannot be read", "check the path and its rights", UsageError):
+        token = path.read_text("utf-8").strip()
+    if not token.isascii() or not token.isprintable() or not 1 <= len(token) <= 4096:
+        raise UsageError(f"[alerts] token_file = {path}: it must hold one line of ASCII")
+    return token
+
+
+def _cut(connection: http.client.HTTPConnection) -> None:
+    sock = connection.sock
+    if sock is not None:
+        with suppress(OSError):
+            sock.shutdown(socket.SHUT_RDWR)
+
+
+def _moment(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).isoformat().replace("+00:00", "Z")
