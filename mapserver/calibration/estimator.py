@@ -212,22 +212,9 @@ class _Problem:
             info[at, at] += each.by_keyframes.T @ each.by_keyframes
             info[at, border:] += each.by_keyframes.T @ each.by_calibration
             info[border:, border:] += each.by_calibration.T @ each.by_calibration
-        self._add_edges(edges, rhs)
+            rhs[at] -= each.by_keyframes.T @ each.residual
+            rhs[border:] -= each.by_calibration.T @ each.residual
         return _System(info, rhs, images, edges, gone)
-
-    def _add_edges(self, edges: list[Rows], rhs: Array) -> None:
-        for each in edges:
-            rhs[each.first * self.stride : (each.first + 2) * self.stride] -= each.by_keyframes.T @ each.residual
-            rhs[self.size - UNKNOWNS :] -= each.by_calibration.T @ each.residual
-
-    def _with_residuals(self, system: _System, images: Array, edges: list[Array]) -> _System:
-        """The system for other residuals (M, 4) of images and of each edge, with the same derivatives and without the gauge's pull."""
-        rows, rhs = system.images._replace(residuals=images), np.zeros(self.size)
-        gone = system.eliminated._replace(rhs=np.empty_like(system.eliminated.rhs))
-        core.reduce_residuals(rows, self.keyframes, self.starts, self.stride, rhs, gone)
-        others = [replace(each, residual=residual) for each, residual in zip(system.edges, edges, strict=True)]
-        self._add_edges(others, rhs)
-        return _System(system.information, rhs, rows, others, gone)
 
     def solve(self, system: _System, factor: tuple[Array, bool]) -> tuple[Array, Array]:
         """Step of the unknowns (D,) and of the landmarks (N, 3)."""
@@ -318,21 +305,18 @@ class _Problem:
         border = self.size - UNKNOWNS
         for draw in range(_DRAWS):
             drawn = np.where(active, rng.standard_normal(active.shape), 0.0)
-            edges = [rng.standard_normal(len(each.residual)) for each in system.edges]
-            random = self._with_residuals(system, drawn, edges)
+            edges = [replace(each, residual=rng.standard_normal(len(each.residual))) for each in system.edges]
+            random = self._reduced(images._replace(residuals=drawn), edges, 0.0)
             step, points = self.solve(random, factor)
             by_keyframe = step[:border].reshape(self.count, self.stride)
             left = drawn + np.einsum("meij,mj->mei", images.by_point[:, None], points[self.data.obs_landmark])[:, 0]
             left += np.einsum("mij,mj->mi", images.by_keyframe, by_keyframe[self.keyframes, :6])
             left += images.by_calibration @ step[border:]
             rest = []
-            for each in random.edges:
+            for each in edges:
                 ends = by_keyframe[each.first : each.first + 2].ravel()
-                rest.append(
-                    replace(
-                        each, residual=each.residual + each.by_keyframes @ ends + each.by_calibration @ step[border:]
-                    )
-                )
+                residual = each.residual + each.by_keyframes @ ends + each.by_calibration @ step[border:]
+                rest.append(replace(each, residual=residual))
             sums[draw] = _squares(np.where(active, left, 0.0), rest)
         return np.asarray(sums.mean(axis=0))
 

@@ -21,6 +21,10 @@ inline void subtract_rows(double a0, double a1, double a2, const double* __restr
   for (size_t c = first; c < n; ++c) to[c] = to[c] - a0 * x[c] - a1 * x[n + c] - a2 * x[2 * n + c];
 }
 
+inline void subtract(const double* slopes, double value, size_t count, double* from) {
+  for (size_t a = 0; a < count; ++a) from[a] -= slopes[a] * value;
+}
+
 }  // namespace
 
 bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
@@ -31,6 +35,7 @@ bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
   for (size_t n = 0; n < rows.landmarks; ++n) {
     const size_t begin = size_t(rows.starts[n]), end = size_t(rows.starts[n + 1]);
     double *coupling = out.coupling + 3 * columns * n, block[9] = {};
+    Vec3 slope = {};
     std::fill_n(coupling, 3 * columns, 0.0);
     coupled.assign((end - begin) * kPose * 3, 0.0);
     for (size_t row = begin; row < end; ++row) {
@@ -47,12 +52,21 @@ bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
         add_rows(pose + a, kPose, calibration, columns, information + (size_t(rows.keyframes[row]) * stride + a) * size + border);
       }
       for (size_t a = 0; a < columns; ++a) add_rows(calibration + a, columns, calibration, columns, &corner[a * columns], a);
+      for (size_t e = 0; e < kRows; ++e) {
+        const double residual = rows.residuals[row * kRows + e];
+        subtract(point + e * 3, residual, 3, slope.at);
+        subtract(pose + e * kPose, residual, kPose, rhs + size_t(rows.keyframes[row]) * stride);
+        subtract(calibration + e * columns, residual, columns, rhs + border);
+      }
     }
     Mat3 damped = mat3(block);
     const double sum = trace(damped);
     for (int a = 0; a < 3; ++a) damped[a][a] += damping * damped[a][a] + 1e-9 * sum + 1e-12;
     const Mat3 held = out.inverse[n] = inverse_symmetric(damped);
     finite = finite && is_finite(held[0], 9);
+    out.rhs[n] = slope;
+    const Vec3 pulled = held * slope;
+    subtract_rows(pulled[0], pulled[1], pulled[2], coupling, columns, rhs + border);
     multiply(held[0], coupling, lifted.data(), 3, 3, columns);
     for (size_t a = 0; a < columns; ++a)
       subtract_rows(coupling[a], coupling[columns + a], coupling[2 * columns + a], lifted.data(), columns, &corner[a * columns], a);
@@ -61,6 +75,8 @@ bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
       const double* from = &coupled[(m - begin) * kPose * 3];
       double turned[kPose * 3];  // W H_ll^-1
       multiply(from, held[0], turned, kPose, 3, 3);
+      for (size_t a = 0; a < kPose; ++a)
+        for (size_t d = 0; d < 3; ++d) rhs[at + a] -= from[3 * a + d] * pulled[int(d)];
       for (size_t a = 0; a < kPose; ++a)
         subtract_rows(from[3 * a], from[3 * a + 1], from[3 * a + 2], lifted.data(), columns, information + (at + a) * size + border);
       for (size_t other = m; other < end; ++other) {
@@ -77,41 +93,7 @@ bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping
   }
   for (size_t a = 0; a < columns; ++a)
     for (size_t b = 0; b < columns; ++b) information[(border + a) * size + border + b] += corner[std::min(a, b) * columns + std::max(a, b)];
-  reduce_residuals(rows, stride, size, rhs, out);
   return finite;
-}
-
-void reduce_residuals(const CalibrationRows& rows, size_t stride, size_t size, double* rhs, const CalibrationLandmarks& out) {
-  const size_t columns = rows.columns;
-  double* of_calibration = rhs + size - columns;
-  for (size_t n = 0; n < rows.landmarks; ++n) {
-    const size_t begin = size_t(rows.starts[n]), end = size_t(rows.starts[n + 1]);
-    Vec3 slope = {};
-    auto subtract = [](const double* slopes, double value, size_t count, double* from) {
-      for (size_t a = 0; a < count; ++a) from[a] -= slopes[a] * value;
-    };
-    for (size_t row = begin; row < end; ++row)
-      for (size_t e = row * kRows; e < (row + 1) * kRows; ++e) {
-        const double value = rows.residuals[e];
-        subtract(rows.by_point + e * 3, value, 3, slope.at);
-        subtract(rows.by_keyframe + e * kPose, value, kPose, rhs + size_t(rows.keyframes[row]) * stride);
-        subtract(rows.by_calibration + e * columns, value, columns, of_calibration);
-      }
-    out.rhs[n] = slope;
-    const Vec3 pulled = out.inverse[n] * slope;
-    const double* coupling = out.coupling + 3 * columns * n;
-    subtract_rows(pulled[0], pulled[1], pulled[2], coupling, columns, of_calibration);
-    for (size_t row = begin; row < end; ++row) {
-      const double *pose = rows.by_keyframe + row * kRows * kPose, *point = rows.by_point + row * kRows * 3;
-      double* to = rhs + size_t(rows.keyframes[row]) * stride;
-      for (size_t a = 0; a < kPose; ++a)
-        for (size_t d = 0; d < 3; ++d) {
-          double coupled = 0.0;
-          for (size_t e = 0; e < kRows; ++e) coupled += pose[e * kPose + a] * point[e * 3 + d];
-          to[a] -= coupled * pulled[int(d)];
-        }
-    }
-  }
 }
 
 void landmark_steps(const CalibrationRows& rows, size_t stride, const CalibrationLandmarks& eliminated, const double* of_keyframes,

@@ -35,9 +35,6 @@ struct CalibrationLandmarks {
 bool reduce_landmarks(const CalibrationRows& rows, size_t stride, double damping, size_t size, double* information, double* rhs,
                       const CalibrationLandmarks& out);
 
-// The part of reduce_landmarks that residuals change: rhs, and that of the landmarks in `out`, which holds the rest.
-void reduce_residuals(const CalibrationRows& rows, size_t stride, size_t size, double* rhs, const CalibrationLandmarks& out);
-
 // Back-substitution: fills x_l = H_ll^-1 (b_l - E x_c - sum W_k^T x_k) for steps of the poses, `stride` apart, and of the calibration.
 void landmark_steps(const CalibrationRows& rows, size_t stride, const CalibrationLandmarks& eliminated, const double* of_keyframes,
                     const double* of_calibration, Vec3* steps);

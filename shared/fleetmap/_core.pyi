@@ -1000,11 +1000,6 @@ def reduce_landmarks(
     where the information of one has no inverse of finite numbers.
     """
 
-def reduce_residuals(
-    images: _ImageRows, keyframes: _Indices, starts: _Indices, stride: int, rhs: _Reals, landmarks: _Landmarks
-) -> None:
-    """The part of `reduce_landmarks` that residuals change: rhs (D,), and that of `landmarks`, which holds the rest."""
-
 def landmark_steps(
     images: _ImageRows, keyframes: _Indices, starts: _Indices, landmarks: _Landmarks, stride: int, step: _Reals
 ) -> _Reals:

@@ -55,13 +55,6 @@ bool reduce_landmarks_of(const Images& images, const Indices& keyframes, const I
   return unlocked([&] { return reduce_landmarks(rows, size_t(stride), damping, size, information.data(), rhs.data(), out); });
 }
 
-void reduce_residuals_of(const Images& images, const Indices& keyframes, const Indices& starts, int stride, const MutableReals<-1>& rhs,
-                         const Landmarks& landmarks) {
-  const auto rows = rows_of(images, keyframes, starts, keyframes_in(rhs.shape(0), images, stride));
-  const auto out = landmarks_of(landmarks, rows);
-  unlocked([&] { reduce_residuals(rows, size_t(stride), rhs.shape(0), rhs.data(), out); });
-}
-
 auto landmark_steps_of(const Images& images, const Indices& keyframes, const Indices& starts, const Landmarks& landmarks, int stride,
                        const Reals<-1>& step) {
   const auto rows = rows_of(images, keyframes, starts, keyframes_in(step.shape(0), images, stride));
@@ -84,7 +77,6 @@ void bind_calibration(nb::module_& module) {
   const auto landmarks = "landmarks"_a.noconvert(), rhs = "rhs"_a.noconvert();
   module.def("reduce_landmarks", &reduce_landmarks_of, images, keyframes, starts, "stride"_a, "damping"_a, "information"_a.noconvert(), rhs,
              landmarks);
-  module.def("reduce_residuals", &reduce_residuals_of, images, keyframes, starts, "stride"_a, rhs, landmarks);
   module.def("landmark_steps", &landmark_steps_of, images, keyframes, starts, landmarks, "stride"_a, "step"_a.noconvert());
   module.def("weigh", &weigh_of, "slopes"_a.noconvert(), "factors"_a.noconvert());
 }

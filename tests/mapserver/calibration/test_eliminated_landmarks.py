@@ -48,17 +48,6 @@ def test_the_reduced_system_is_the_schur_complement() -> None:
     np.testing.assert_allclose(rhs, pull[:SIZE] - share @ pull[SIZE:], atol=1e-6)
 
 
-def test_other_residuals_change_the_right_hand_side_alone() -> None:
-    rows, keyframes, starts = scene(1)
-    other = rows._replace(residuals=np.random.default_rng(2).standard_normal(rows.residuals.shape))
-    _, rhs, expected = reduced(other, keyframes, starts)
-    _, _, out = reduced(rows, keyframes, starts)
-    found = np.zeros(SIZE)
-    core.reduce_residuals(other, keyframes, starts, STRIDE, found, out)
-    assert np.array_equal(found, rhs)
-    assert np.array_equal(out.rhs, expected.rhs)
-
-
 @pytest.mark.parametrize("slope", [np.nan, np.inf, np.finfo(np.float64).max])
 def test_a_landmark_that_is_not_finite_is_told(slope: float) -> None:
     rows, keyframes, starts = scene(4)
