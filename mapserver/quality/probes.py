@@ -7,10 +7,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.features.extraction import extract
 from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
-from fleetmap.relocalization.frame_features import FrameFeatures, features_with_depth
+from fleetmap.relocalization.frame_features import FrameFeatures, with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
@@ -39,7 +40,7 @@ class Probe:
 def probe_features(frame: RectifiedFrame, camera: StereoCamera, survey_orb: OrbSettings) -> FrameFeatures:
     """What a robot that extracts as the survey did would extract from a frame, as many as robots do, with the depth of all."""
     orb = msgspec.structs.replace(survey_orb, count=_ROBOTS.orb.count)
-    return features_with_depth(frame, camera, orb, _ROBOTS.stereo)
+    return with_depth(frame, extract(frame.left, orb), camera, _ROBOTS.stereo)
 
 
 def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix | None:

