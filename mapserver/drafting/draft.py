@@ -255,10 +255,11 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
 
         def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
             options.look_at([path])
-            return survey_recording(path, admitted[path], run.reading, pinhole, survey_options, tools)
+            return survey_recording(path, admitted.pop(path), run.reading, pinhole, survey_options, tools)
 
-        surveyed = survey_all(list(admitted), survey_one, None if base is None else base.camera, run.unusable)
-        options.look_at(list(admitted))
+        paths = list(admitted)
+        surveyed = survey_all(paths, survey_one, None if base is None else base.camera, run.unusable)
+        options.look_at(paths)
         tools.progress("joining", 0, 1)
         joining = MapMerger(base, settings)
         for done in surveyed:

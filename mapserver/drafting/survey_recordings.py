@@ -39,7 +39,7 @@ from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.stages import Survey, begin_survey, survey
+from mapserver.survey.stages import Survey, begin_survey, finish_survey
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 
 _log = logging.getLogger(__name__)
@@ -319,8 +319,8 @@ def survey_recording(
     options: SurveyConfig,
     tools: SurveyTools,
 ) -> Surveyed:
-    """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it."""
-    found, given = admission.checked, admission.given
+    """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it. The caller lets go of what was begun."""
+    found, given, chain = admission.checked, admission.given, admission.begun
     rig, said = found.rig, () if given is None else (given.words,)
     with reading.open(path) as (opened, indices):
         recording = replace(opened, calibration=rig)
@@ -328,10 +328,11 @@ def survey_recording(
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
-        begun = admission.begun
-        if begun is not None and begun.state.camera != rectifier.camera:
-            begun = None
-        done = survey(inputs, options, tools, begun)
+        if chain is None or chain.state.camera != rectifier.camera:
+            chain = begin_survey(inputs, options.settings, tools)
+        held = [chain]
+        del admission, chain  # or it would be in memory twice
+        done = finish_survey(held.pop(), inputs, options, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
             entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),

@@ -78,12 +78,10 @@ class Survey:
     seen: NDArray[np.bool_]
 
 
-def survey(
-    inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None, begun: AdjustedChain | None = None
-) -> Survey:
-    """Maps one recording; begun: its first stages, where they were made already. SurveyError where it holds too little to map."""
+def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
+    """Maps one recording. Raises SurveyError where it holds too little to map."""
     tools = tools or SurveyTools()
-    return _finished(begun or begin_survey(inputs, config.settings, tools), inputs, config, tools)
+    return finish_survey(begin_survey(inputs, config.settings, tools), inputs, config, tools)
 
 
 def survey_from(
@@ -91,7 +89,7 @@ def survey_from(
 ) -> Survey:
     """All stages after the initial trajectory."""
     tools = tools or SurveyTools()
-    return _finished(adjust_chain(odometry, inputs, config.settings, tools), inputs, config, tools)
+    return finish_survey(adjust_chain(odometry, inputs, config.settings, tools), inputs, config, tools)
 
 
 def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
@@ -103,7 +101,8 @@ def _whole(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -
     return adjust_chain(follow(inputs, settings, tools), inputs, settings, tools)
 
 
-def _finished(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
+def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
+    """The stages after `begin_survey`. The caller lets go of the chain, or a long survey is in memory twice."""
     settings, depths = config.settings, chain.depths
     state, loops = close_loops(chain, inputs, config, tools)
     # Neighbours need not be matched again. Of one camera they are, as depths by which they were matched have changed.

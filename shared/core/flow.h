@@ -34,6 +34,7 @@ class Pyramid {
  public:
   void set(GreyImage image);  // copies it
   GreyImage level(size_t number);
+  bool is_empty() const { return made_ == 0; }
 
  private:
   struct Level {

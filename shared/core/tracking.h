@@ -59,6 +59,7 @@ class Tracker {
   // A frame whose points are others: those of before are forgotten, and added ones are of this frame.
   void begin(GreyImage image);
   int64_t add(const double* pixels, size_t count);  // returns the first id
+  bool has_begun() const { return !now_.is_empty(); }
 
   // Measures the disparities of the points in the newest frame, and adds corners where they have become few.
   void renew(const TrackerFrame& frame);

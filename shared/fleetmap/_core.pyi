@@ -510,7 +510,7 @@ class Tracker:
         refinement: tuple[float, float, tuple[int, int]],
     ) -> None: ...
     def begin(self, left: _Grey) -> None:
-        """Forgets the points; those that are added next are of this frame."""
+        """Forgets the points; those that are added next are of this frame. Comes before the first `track`."""
     def add(self, pixels: _Reals) -> int:
         """Adds points (N, 3) and returns the first of their ids."""
     def track(

@@ -267,6 +267,7 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: tracker().track(IMAGE, (IMAGE, IMAGE, IMAGE[:9]), None, None, False, None), "pair"),
         (lambda: tracker().track(IMAGE, None, np.zeros((3, 3), np.float32), None, False, None), "disparity_px"),
         (lambda: tracker().track(IMAGE, None, None, np.eye(4), True, SAMPLES), "points_cam"),
+        (lambda: tracker().track(IMAGE, None, None, np.eye(4), True, None), "cam_from_previous"),
         (lambda: tracker(min_distance_px=0.0).track(IMAGE, None, None, None, False, None), "distance_px"),
         (lambda: tracker(window_px=17), "half"),
         (lambda: tracker(pyramid_levels=-1), "levels"),

@@ -107,6 +107,7 @@ auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std
   if (disparity_px && !same_size(left, *disparity_px)) throw nb::value_error("disparity_px: of the image's size");
   if (disparity_px) frame.disparity_px = grey(*disparity_px);
   if (points_cam && points_cam->shape(0) != tracker.ids().size()) throw nb::value_error("points_cam: one for each point");
+  if (cam_from_previous && !tracker.has_begun()) throw nb::value_error("cam_from_previous: there is none, begin with a frame");
   check_corners(tracker.model().corners.distance, double(image.width), double(image.height));
   const double* const known = points_cam ? points_cam->data() : nullptr;
   TrackedMotion found;

@@ -1,19 +1,33 @@
 """Recordings of a build: opened once, and their frames decoded once."""
 
-from dataclasses import replace
+import weakref
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fleetmap.errors import RecordingError
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings import image_series as series
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet
 from mapserver.drafting import mapped_images, survey_recordings
-from mapserver.drafting.survey_recordings import BegunSurvey, OpenRecordings, RecordingOptions
+from mapserver.drafting.admission import CheckedRecording
+from mapserver.drafting.survey_recordings import (
+    Admission,
+    BegunSurvey,
+    OpenRecordings,
+    RecordingOptions,
+    survey_recording,
+)
+from mapserver.quality.figures import RigEvidence
+from mapserver.survey import stages
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyTools
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
 
 
@@ -94,6 +108,30 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
         assert [begun.chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
         second = begun(replace(recording, calibration=corrected), corrected)
         assert [begun.chain_of(rig) for rig in (given, corrected)] == [None, second]
+
+
+def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its landmarks are as large as those that are made anew then."""
+
+    @dataclass
+    class State:
+        camera: StereoCamera
+        landmarks: object = None
+
+    def adjust(*_: object) -> None:
+        raise SurveyError("held" if begun() else "let go of")
+
+    with open_recording(euroc) as recording:
+        rig, camera = recording.calibration, Rectifier(recording.calibration).camera
+    chain: Any = SimpleNamespace(state=State(camera), odometry=None, depths=object())
+    admitted = [Admission(CheckedRecording(rig, [], RigEvidence("", [], {}, {}), {}), begun=chain)]
+    begun = weakref.ref(chain.state)
+    del chain
+    monkeypatch.setattr(stages, "close_loops", lambda *_: (State(camera), None))
+    monkeypatch.setattr(stages, "adjust_globally", adjust)
+    config = SurveyConfig(SurveySettings(), default_vocabulary())
+    with pytest.raises(SurveyError, match="let go of"):
+        survey_recording(euroc, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
 
 
 @pytest.mark.parametrize(
