@@ -30,6 +30,7 @@ class MappedImageStore:
     """An ImageStore over an unnamed file in `folder`, which the system removes with the process. Methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
             self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with its owner
         self._lock = threading.Lock()
@@ -70,6 +71,10 @@ class MappedImageStore:
         """See ImageStore."""
         self._leave_memory()
         give_back_free_memory()
+
+    def apart(self) -> "MappedImageStore":
+        """See ImageStore."""
+        return MappedImageStore(self._folder)
 
     def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
         """As what an empty one is in another process, which need not have the folder."""

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -211,16 +211,15 @@ class BegunSurvey:
 
     def __call__(self, recording: Recording, rig: RigCalibration) -> CalibrationData:
         """What the frames show under the calibration `rig`. SurveyError where they hold too little to be followed."""
-        rectifier = Rectifier(rig)
-        chain = begin_survey(
-            survey_inputs_of(replace(recording, calibration=rig), self._indices, rectifier, None),
-            self._settings,
-            self._tools,
-        )
-        self._tools.at("local adjustment", 1, 1)
-        if rig is recording.calibration:  # which is the one that is believed
-            self._made = rig, chain
-        return busiest_stretch(chain, (rig, rectifier), recording.wheel)
+        rectifier, images = Rectifier(rig), self._tools.images
+        inputs = survey_inputs_of(replace(recording, calibration=rig), self._indices, rectifier, None)
+        is_believed = rig is recording.calibration
+        with nullcontext(images) if is_believed or images is None else images.apart() as images:
+            chain = begin_survey(inputs, self._settings, replace(self._tools, images=images))
+            self._tools.at("local adjustment", 1, 1)
+            if is_believed:
+                self._made = rig, chain
+            return busiest_stretch(chain, (rig, rectifier), recording.wheel)
 
     def chain_of(self, rig: RigCalibration) -> AdjustedChain | None:
         """What was made under a calibration; None where the last one believed was another."""

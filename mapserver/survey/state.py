@@ -1,6 +1,7 @@
 """State of a survey under way: its keyframes, the odometry that led to them, their motion, and the landmarks that they see. Pure values."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, Protocol
@@ -44,6 +45,9 @@ class ImageStore(Protocol):
     def release(self) -> None:
         """A stage is over: what `keep` returned may leave memory until it is read again."""
 
+    def apart(self) -> AbstractContextManager["ImageStore"]:
+        """Another one, for a survey that nobody goes on with: what it holds goes with the last who uses it."""
+
 
 class MemoryImageStore:
     """Keeps all pictures as they are."""
@@ -65,6 +69,9 @@ class MemoryImageStore:
 
     def release(self) -> None:
         pass
+
+    def apart(self) -> AbstractContextManager[ImageStore]:
+        return nullcontext(MemoryImageStore())
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,21 +93,25 @@ def test_a_recording_that_cannot_be_used_is_closed(
 
 
 def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
-    euroc: Path, monkeypatch: pytest.MonkeyPatch
+    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And from nothing else: a calibration that was tried on the way, or given before a correction, is not the survey's."""
-    monkeypatch.setattr(survey_recordings, "begin_survey", lambda *_: object())
+    """And from nothing else: a calibration that was tried on the way, or given before a correction, is not the survey's.
+
+    The pictures of one that was tried do not fill the build's file.
+    """
+    monkeypatch.setattr(survey_recordings, "begin_survey", lambda _inputs, _settings, tools: [tools.images])
     monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
-    with open_recording(euroc) as recording:
-        begun = BegunSurvey(np.arange(8), SurveySettings(), SurveyTools())
+    with open_recording(euroc) as recording, mapped_images.MappedImageStore(tmp_path) as images:
+        begun = BegunSurvey(np.arange(8), SurveySettings(), SurveyTools(images=images))
         given = recording.calibration
         tried, corrected = replace(given), replace(given)
         assert begun.chain_of(given) is None
         first = begun(recording, given)
-        begun(recording, tried)
+        assert begun(recording, tried) != [images]
         assert [begun.chain_of(rig) for rig in (given, tried, corrected)] == [first, None, None]
         second = begun(replace(recording, calibration=corrected), corrected)
         assert [begun.chain_of(rig) for rig in (given, corrected)] == [None, second]
+        assert first == second == [images]
 
 
 def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monkeypatch: pytest.MonkeyPatch) -> None:
