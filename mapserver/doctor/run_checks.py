@@ -51,16 +51,17 @@ class _Frames:
 
     def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
         self._recording, self._on_frame = recording, on_frame
-        self.tried = self.repeats = 0
-        self.errors: list[str] = []
+        self.tried: set[int] = set()
+        self.errors: dict[int, str] = {}
+        self.repeats = 0
 
     def read(self, index: int) -> CameraFrame | None:
-        self.tried += 1
+        self.tried.add(index)
         self._on_frame()
         try:
             return self._recording.read_frame(index)
         except RecordingError as error:
-            self.errors.append(str(error))
+            self.errors[index] = str(error)
             return None
 
 
@@ -279,7 +280,8 @@ def _repeated_images(repeats: int, count: int) -> Finding:
 
 def _readable(frames: _Frames) -> Finding:
     limit = "every frame that was looked at must be readable"
-    if not frames.errors:
-        return Finding("images", Verdict.OK, 0.0, limit, f"all {frames.tried} frames that were looked at are whole")
-    sentence = f"{len(frames.errors)} of {frames.tried} cannot be read; {frames.errors[0]}"
-    return Finding("images", Verdict.FAIL, float(len(frames.errors)), limit, sentence)
+    tried, errors = len(frames.tried), list(frames.errors.values())
+    if not errors:
+        return Finding("images", Verdict.OK, 0.0, limit, f"all {tried} frames that were looked at are whole")
+    sentence = f"{len(errors)} of {tried} cannot be read; {errors[0]}"
+    return Finding("images", Verdict.FAIL, float(len(errors)), limit, sentence)

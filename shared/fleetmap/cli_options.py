@@ -110,7 +110,7 @@ class RetiringCommand(typer.core.TyperCommand):
         for option in {word.partition("=")[0] for word in args if word.startswith("--")} - known:
             from fleetmap.config import RETIRED
 
-            if instead := RETIRED.get(option.lstrip("-").replace("-", "_")):
+            if instead := RETIRED.get(option) or RETIRED.get(option.lstrip("-").replace("-", "_")):
                 raise UsageError(f"{option} is gone: {instead.removesuffix('; delete the key')}")
         return super().parse_args(ctx, args)
 

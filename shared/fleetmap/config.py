@@ -25,7 +25,7 @@ _OF_PEOPLE = (
     "a proxy that signs people in, such as oauth2-proxy, stands in front: `--sign-in-proxy ADDRESS --sign-in-group GROUP=ROLE`; "
     "docs/security.md shows it"
 )
-RETIRED = {  # keys of files (behind their section where that decides), and options of commands with _ for -; what replaces them
+RETIRED = {  # keys of files (behind their section where that decides), and options of commands (with _ for -, or with --)
     "allow_unjudged_calibration": "`mapserver publish --trust-calibration --reason TEXT` replaces it; delete the key",
     "manifest": "`--version N` names another version of `--store DIR`",
     "walls": "`mapserver align --pin ...` replaces it; delete the key",
@@ -47,7 +47,7 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     "add": "`mapserver trust rotate root --stick DIR` makes another root key",
     **dict.fromkeys(("signer", "keys", "adopt"), "the account that serves also builds and signs; delete the key"),
     **dict.fromkeys(("with_trust", "root"), "an imported version is a draft that you judge; delete the key"),
-    "format": "the simulator writes MCAP, which every reader takes",
+    "--format": "the simulator writes MCAP, which every reader takes",
     "images": "the simulator stores pictures as PNG, without loss",
     "witness": "`mapserver audit --verify` checks the log by itself; delete the key",
     **{

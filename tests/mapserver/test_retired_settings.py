@@ -15,6 +15,7 @@ from mapserver.config import read_config
             "[gate]\nallow_unjudged_calibration = true\n",
             r"`\$\.gate`; `mapserver publish --trust-calibration .* replaces it",
         ),
+        ('[gate]\nformat = "ros2"\n', r"`\$\.gate`; docs/settings.md"),  # a word of others, too
         ("[train_vocabulary]\nlevels = 3\n", "maps use the vocabulary that ships"),
     ],
 )
