@@ -1,6 +1,6 @@
 """Reads the frames that the checks need and runs all of them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,11 +79,12 @@ def run_checks(
     turn_frames: int = TURN_FRAMES,
     executor: Executor = SERIAL,
     follow: Follow | None = None,
+    before_calibration: Callable[[Sequence[Finding]], None] = lambda _: None,
 ) -> CheckResults:
     """Everything the checks say about a recording.
 
     Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair what `follow` reads, the busiest
-    30 s without it; `on_frame` is called after each.
+    30 s without it; `on_frame` is called after each. before_calibration: told the findings so far, before the drive is followed.
     """
     imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
@@ -111,6 +112,8 @@ def run_checks(
             given = next((fit for fit in fits if fit.is_given), None)
     wheels, metres = judge_metres(seen.wheels, given, seen.images, has_imu=len(imu) > 0)
 
+    findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres]
+    before_calibration(findings)
     calibration = MeasuredCalibration([], None)
     if has_pair and is_unsteady:
         reason = "the stamps of images and IMU move against each other"
@@ -119,8 +122,8 @@ def run_checks(
         used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
         calibration = measure_calibration(used, on_frame, executor, follow)
 
-    findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres, *calibration.findings]
-    findings += [images.sharpness(seen.variances), images.flicker_check(recording, frames.read), _readable(frames)]
+    findings += [*calibration.findings, images.sharpness(seen.variances)]
+    findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
         findings.append(_repeated_images(frames.repeats, min(turn_frames, len(recording))))
     return CheckResults(findings + sensors.other_issues(recording.issues), measured_offset_s, calibration)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
@@ -115,8 +116,9 @@ def checked(
     evidence conflicts, and a person must look at it.
     """
     limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
-    checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow)
-    _refuse(recording, checks.findings)
+    refuse = partial(_refuse, recording)
+    checks = run_checks(recording, on_frame, **limits, executor=executor, follow=follow, before_calibration=refuse)
+    refuse(checks.findings)
     used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
     rig, corrections = corrected(recording.calibration, checks.calibration)

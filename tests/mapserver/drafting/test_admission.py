@@ -1,5 +1,6 @@
 """What a build makes of a recording's calibration before it surveys."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
 from mapserver.calibration.parameters import COLUMNS, RANGES
-from mapserver.doctor import Finding, Verdict
+from mapserver.doctor import Finding, Verdict, sensors
 from mapserver.doctor.calibration import MeasuredCalibration, findings_of
 from mapserver.doctor.findings import not_judged
 from mapserver.doctor.run_checks import CheckResults
@@ -65,6 +66,17 @@ def test_a_correction_that_the_second_look_denies_is_for_a_person(
 ) -> None:
     found = checked(recording, monkeypatch, measured(P.PAIR_YAW, 0.003), measured(P.PAIR_YAW, 0.002))
     assert "after its correction" in found.calibration.doubted["pair geometry"]
+
+
+def test_a_wrong_recording_is_refused_before_its_drive_is_followed(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swapped = Finding("left and right", Verdict.FAIL, None, "", "the cameras are swapped")
+    monkeypatch.setattr(sensors, "stream_checks", lambda _: [swapped])
+    checks = sys.modules[admission.run_checks.__module__]
+    monkeypatch.setattr(checks, "measure_calibration", lambda *_: pytest.fail("was followed"))
+    with pytest.raises(RecordingError, match="left and right: the cameras are swapped"):
+        admission.checked(recording)
 
 
 def test_checks_that_lack_the_same_are_one_remark(recording: Recording) -> None:
