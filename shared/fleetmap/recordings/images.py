@@ -25,8 +25,9 @@ _JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
-_BESIDE = ThreadPoolExecutor(1, "decoder")  # decodes the left image while its partner is decoded
-os.register_at_fork(after_in_child=partial(_BESIDE.__init__, 1, "decoder"))  # type: ignore[misc]  # a child has no thread of its parent's
+_THREADS = max(os.cpu_count() or 1, 2)  # a survey reads its parts at once
+_BESIDE = ThreadPoolExecutor(_THREADS, "decoder")  # decodes left images while their partners are decoded
+os.register_at_fork(after_in_child=partial(_BESIDE.__init__, _THREADS, "decoder"))  # type: ignore[misc]  # a child has no thread of its parent's
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:

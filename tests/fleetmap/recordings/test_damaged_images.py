@@ -1,6 +1,7 @@
 """Images that are damaged inside cost their frame, and no sentence of a decoder reaches stderr."""
 
 import struct
+import threading
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import open_recording
+from fleetmap.recordings import images, open_recording
 from fleetmap.recordings.images import INVERSE_DEPTH, StoredImage, decode_depth, decode_grey
 from support.recordings.recording_samples import make_sample, write_euroc
 
@@ -83,6 +84,18 @@ def test_threads_that_decode_at_once_accuse_no_good_image(capfd: pytest.CaptureF
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(is_good, pictures)) == [True, False, True, False] * 10
     assert capfd.readouterr().err == ""
+
+
+def test_readers_do_not_wait_for_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are in the middle of their left image at once."""
+    both = threading.Barrier(2, timeout=20.0)
+    decode = images.decode_grey
+    monkeypatch.setattr(
+        images, "decode_grey", lambda stored: (stored.where == "left" and both.wait(), decode(stored))[1]
+    )
+    pair = images.StoredFrame(0, StoredImage("file", PNG, "left"), StoredImage("file", PNG, "right"))
+    with ThreadPoolExecutor(2) as pool:
+        assert len([frame.right for frame in pool.map(images.decode_frame, [pair, pair])]) == 2
 
 
 @pytest.mark.parametrize("spoil", [without_middle, lambda _: JPEG])
