@@ -27,6 +27,7 @@ class CameraModel:
     pixel_from_ray(intrinsics_px (4,) fx fy cx cy, distortion (k,), rays_cam (N, 3)) -> (N, 2) px, NaN where the lens cannot see.
     ray_from_pixel(intrinsics_px, distortion, pixels (N, 2)) -> (N, 3) unit rays, NaN where no ray maps to the pixel.
     core_lens(distortion) -> the coefficients as the core takes them, and the x^2 + y^2 at which a radial-tangential image folds back.
+    The core chooses the lens by their number: 8 are radial-tangential, 4 equidistant.
     """
 
     pixel_from_ray: _Project
