@@ -174,6 +174,7 @@ class Ros2Localizer(Publisher):
         self._state = LifecycleState.ACTIVE if section.autostart else LifecycleState.UNCONFIGURED
         self._lock = threading.Lock()  # of the state
         self._last: tuple[Estimate, PublishedPose] | None = None
+        self._fix_refused = ""  # by the newest query that ended: most frames end none
         self._refused: deque[str] = deque(maxlen=1)
         self._alive_s = time.monotonic()
         self._bond: BondStatus | None = None
@@ -229,6 +230,8 @@ class Ros2Localizer(Publisher):
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """A pose is sent only with its covariance, and is that of the base in the map."""
         before, self._last = self._last, (estimate, published)
+        if estimate.fix is not None or estimate.refused:
+            self._fix_refused = estimate.refused
         if self._state is not LifecycleState.ACTIVE:
             return
         section, stamp_ns = self._section, estimate.stamp_ns
@@ -286,7 +289,7 @@ class Ros2Localizer(Publisher):
                 "status": estimate.status.value,
                 "cause": estimate.cause.value,
                 "map_version": "none" if estimate.map_version is None else str(estimate.map_version),
-                "refused": estimate.refused,
+                "refused": self._fix_refused,
                 "calibration": estimate.calibration.text,
             }
             if estimate.cov_rot_trans is not None:

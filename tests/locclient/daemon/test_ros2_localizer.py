@@ -18,6 +18,7 @@ from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import open_publisher
 from locclient.daemon.ros2_localizer import Ros2Localizer
+from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub
@@ -292,16 +293,25 @@ def test_bytes_that_are_no_message_change_nothing(robot: Robot, caplog: pytest.L
 
 
 @pytest.mark.parametrize(
-    ("statuses", "silent", "level", "words"),
+    ("estimates", "silent", "level", "words", "refused"),
     [
-        ([], False, 1, "no frame yet"),
-        ([Status.TRACKING], False, 0, "TRACKING"),
-        ([Status.AMBIGUOUS], False, 1, "AMBIGUOUS"),
-        ([Status.LOST], False, 2, "LOST"),
-        ([Status.TRACKING], True, 2, "no frames come"),
+        ([], False, 1, "no frame yet", None),
+        ([estimate(1.0)], False, 0, "TRACKING", ""),
+        (
+            [estimate(1.0, Status.AMBIGUOUS, refused="2 places"), estimate(1.1, Status.AMBIGUOUS)],
+            False,
+            1,
+            "AMBIGUOUS",
+            "2 places",
+        ),
+        ([estimate(1.0, Status.AMBIGUOUS, refused="2 places"), estimate(1.1, fix=True)], False, 0, "TRACKING", ""),
+        ([estimate(1.0, Status.LOST)], False, 2, "LOST", ""),
+        ([estimate(1.0)], True, 2, "no frames come", ""),
     ],
 )
-def test_diagnostics_say_status_and_cause(statuses: list[Status], silent: bool, level: int, words: str) -> None:
+def test_diagnostics_say_status_and_cause(
+    estimates: list[Estimate], silent: bool, level: int, words: str, refused: str | None
+) -> None:
     hub, heard = MemoryHub(), []  # type: ignore[var-annotated]
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         inputs = (bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0))
@@ -310,13 +320,14 @@ def test_diagnostics_say_status_and_cause(statuses: list[Status], silent: bool, 
         )
         localizer = open_publisher(OutputSection(format="ros2"), *inputs)
         odom = ContinuousOdom(np.eye(4))
-        for one in (estimate(1.0, status) for status in statuses):
+        for one in estimates:
             localizer.publish(one, odom.handle(one), np.eye(4))
         localizer.alive(silent)
         localizer.close()
     (told,) = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(heard[-1], "diagnostic_msgs/msg/DiagnosticArray").status
     assert (int.from_bytes(told.level) if isinstance(told.level, bytes) else told.level, told.message) == (level, words)
     assert (told.name, told.hardware_id) == (f"{NODE}: localization", "r1")
+    assert {value.key: value.value for value in told.values}.get("refused") == refused  # that of the newest query
 
 
 def test_planners_get_the_grid_of_the_version(robot: Robot) -> None:
