@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -104,7 +104,7 @@ def measure_calibration(
         focal_px = Rectifier(recording.calibration).camera.focal_px
         enough = partial(_is_good, focal_px)
         estimate = estimate_calibration([recording], SurveySettings(), tools, enough, follow)
-    except (FleetmapError, np.linalg.LinAlgError) as error:
+    except (RecordingError, SurveyError, np.linalg.LinAlgError) as error:
         return unknown_calibration(
             f"the frames could not be followed: {error}", "record a drive in the light, with every frame"
         )

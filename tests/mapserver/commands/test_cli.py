@@ -110,7 +110,7 @@ def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 def test_every_option_has_its_key_in_the_file() -> None:
     """And every section and key belongs to a command, to a command of a group, or to settings of their own."""
     file = file_type(MapserverConfig, cli.COMMANDS)()
-    settings = {"site", "store", "source", "topics", "survey", "gate", "ingest", "canary", "resurvey"}
+    settings = {"site", "store", "source", "topics", "survey", "gate", "ingest", "canary", "resurvey", "alerts"}
     assert set(_keys(file)) == settings | {name.replace("-", "_") for name in cli.COMMANDS}
     shown = typer.main.get_command(cli.app).commands
     commands = {name: (command, _keys(file)[name.replace("-", "_")]) for name, command in shown.items()}

@@ -7,10 +7,12 @@ from typing import cast
 import numpy as np
 import pytest
 
+from fleetmap.errors import FleetmapError, StoreError, SurveyError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
 from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.calibration.problem import CalibrationData
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import (
     TOLERANCES,
@@ -142,6 +144,21 @@ def test_subjects_are_judged_by_all_of_their_parameters() -> None:
     conflict = rig_evidence("a1", findings_of(estimate(pair_yaw=0.003), FOCAL_PX))
     assert set(conflict.doubted) == {"pair geometry"}
     assert conflict.judged == ["metric scale"]
+
+
+@pytest.mark.parametrize("error", [StoreError("the disk is full"), SurveyError("it is dark")])
+def test_only_what_the_frames_lack_is_not_judged(error: FleetmapError) -> None:
+    def follow(*_: object) -> CalibrationData:
+        raise error
+
+    stamps_ns = np.arange(100, dtype=np.int64) * 50_000_000
+    recording = cast(Recording, SimpleNamespace(frame_stamps_ns=stamps_ns, calibration=calibration(), path="drive"))
+    if isinstance(error, StoreError):
+        with pytest.raises(StoreError, match="the disk is full"):
+            measure_calibration(recording, lambda: None, SERIAL, follow)
+    else:
+        found = measure_calibration(recording, lambda: None, SERIAL, follow)
+        assert "it is dark" in found.findings[0].sentence
 
 
 def test_keyframes_alone_are_not_judged() -> None:
