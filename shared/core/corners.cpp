@@ -117,7 +117,7 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
 
 // Sets what is nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
 void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius) {
-  const double reach = radius - 0.75;  // from the nearest whole pixel
+  const double reach = std::min(radius, double(free.width + free.height)) - 0.75;  // from the nearest whole pixel
   const ptrdiff_t size = ptrdiff_t(reach);
   for (size_t n = 0; n < count; ++n) {
     const double nearest_x = std::floor(double(taken[n].x) + 0.5), nearest_y = std::floor(double(taken[n].y) + 0.5);
