@@ -305,9 +305,11 @@ void Filter::apply(const double* error) {
     clones_[m] = turned(vec3(error + kClones + 6 * m), clones_[m], vec3(error + kClones + 6 * m + 3));
 }
 
-void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE3>& newest_odom_from_body, double sigma_scale,
-                    int8_t* used) {
-  if (tracks.count() == 0) return;
+const std::vector<int8_t>& Filter::update(const LivingPoints& living, double first_depth_m, int iterations,
+                                          const std::optional<SE3>& newest_odom_from_body, double sigma_scale) {
+  const Tracks& tracks = observations_.take(living, clone_ids_, model_.pixels.lens, first_depth_m);
+  used_.assign(tracks.count(), 0);
+  if (used_.empty()) return used_;
   const NavState state_before = state;
   const double offset_before_s = imu_minus_cam_s;
   clones_before_ = clones_, covariance_before_ = covariance, true_error_cov_before_ = true_error_cov;
@@ -332,7 +334,7 @@ void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE
   cameras_.resize(clones_.size());
   for (int iteration = 0; iteration < iterations; ++iteration) {
     for (size_t m = 0; m < clones_.size(); ++m) cameras_[m] = clones_[m] * model_.body_from_cam;
-    constraints_.accumulate(cameras_, tracks, pixels, inner_, moved_, used);
+    constraints_.accumulate(cameras_, tracks, pixels, inner_, moved_, used_.data());
     // K^T = (1 + P_cc I^T)^-1 P_c, for the information I and the clones' rows P_c of the covariance.
     const NormalEquations& equations = constraints_.equations;
     by_clones_.resize(size, size);  // transposed
@@ -352,10 +354,11 @@ void Filter::update(const Tracks& tracks, int iterations, const std::optional<SE
   }
   learn(gain_turned_);
   move_origin(-begin);
-  if (is_finite()) return;
+  if (is_finite()) return used_;
   state = state_before, imu_minus_cam_s = offset_before_s;
   std::swap(clones_, clones_before_), std::swap(covariance, covariance_before_), std::swap(true_error_cov, true_error_cov_before_);
-  std::replace(used, used + tracks.count(), int8_t(1), int8_t(-1));
+  std::replace(used_.begin(), used_.end(), int8_t(1), int8_t(-1));
+  return used_;
 }
 
 bool Filter::is_finite() const {

@@ -12,6 +12,7 @@
 
 #include "dense.h"
 #include "lie.h"
+#include "observations.h"
 #include "preintegration.h"
 #include "track_constraints.h"
 
@@ -71,11 +72,15 @@ class Filter {
   // numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
   Vec3 begin_frame_anew();
 
-  // Uses each track once; used (T,) as of TrackConstraints. More than one iteration relinearises (iterated Kalman filter), for large
+  // What one frame saw: ids (count,), pixels (count, 3) u left, v, u right, NaN where that is unknown.
+  void observe(int64_t frame, const int64_t* ids, const double* pixels, size_t count) { observations_.add(frame, ids, pixels, count); }
+  // Uses what was observed of tracks that ended or are due, each observation once; used (T,) as of TrackConstraints, by rising ids, good
+  // until the next. For first_depth_m see Observations. More than one iteration relinearises (iterated Kalman filter), for large
   // corrections; newest_odom_from_body is then where the newest clone is linearised first, when vision knows it better than the
   // prediction. It adds no information. sigma_scale widens the noise, for matches that are less exact than flow. Nothing is changed, and
   // no track counts as taken, where the result would not be finite.
-  void update(const Tracks& tracks, int iterations, const std::optional<SE3>& newest_odom_from_body, double sigma_scale, int8_t* used);
+  const std::vector<int8_t>& update(const LivingPoints& living, double first_depth_m, int iterations,
+                                    const std::optional<SE3>& newest_odom_from_body, double sigma_scale);
 
   // By the motion of `base` on its wheels: forward speed, no other, and yaw rate; gyro measured at the same time. Each returns the
   // squared Mahalanobis distance by true_error_cov, infinity where it or the correction is no number; nothing is changed where that
@@ -130,10 +135,12 @@ class Filter {
   FilterModel model_;
   std::vector<int64_t> clone_ids_;
   std::vector<SE3> clones_;
+  Observations observations_;
   TrackConstraints constraints_;
   // Kept so that nothing is allocated in a frame.
   std::vector<SE3> cameras_, prior_clones_, clones_before_;
   std::vector<ImuInterval> intervals_;
+  std::vector<int8_t> used_;
   std::vector<double> moved_, correction_;
   std::vector<size_t> group_, members_;
   Matrix covariance_before_, true_error_cov_before_, spare_, inner_, by_clones_, weighing_, gain_turned_, gain_, seen_, spread_, taken_,

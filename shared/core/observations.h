@@ -5,28 +5,25 @@
 #include <cstdint>
 #include <vector>
 
-#include "camera.h"
+#include "track_constraints.h"
 
 namespace fleetmap {
 
-// T tracks: starts (T + 1,) delimits each one's rows, which are the clones that saw it and its pixels (3 each: u left, v, u right).
-// A first guess of each point is points_cam (T, 3) as the clone `anchors` (T,) sees it: the stereo point of the nearest view, or as far as
-// a disparity of far_px along the last ray where no view has a disparity.
-struct TrackBatch {
-  std::vector<int64_t> starts, clones, anchors;
-  std::vector<double> pixels, points_cam;
+// Points that the newest frame saw, and which of them are to be used now.
+struct LivingPoints {
+  const int64_t* ids;
+  const bool* due;
+  size_t count;
 };
 
 class Observations {
  public:
   void add(int64_t frame, const int64_t* ids, const double* pixels, size_t count);
-  void clear() { seen_.clear(); }
 
-  // Removes the tracks that ended, or are due, with two observations or more in the clones `held`. alive: ids that the newest frame saw,
-  // due: which of them are to be used now. What is due but seen once stays; what ended so is forgotten.
-  // The result is good until the next.
-  const TrackBatch& take(const int64_t* alive, const bool* due, size_t alive_count, const int64_t* held, size_t held_count,
-                         const StereoLens& lens, double far_px);
+  // Removes the tracks that ended, or are due, with two observations or more in the clones, frames in the window's order. What is due but
+  // seen once stays; what ended so is forgotten. The first guess of a point is the stereo point of the nearest view, or first_depth_m along
+  // the last ray where no view has a disparity. The result is good until the next.
+  const Tracks& take(const LivingPoints& living, const std::vector<int64_t>& clones, const StereoLens& lens, double first_depth_m);
 
  private:
   struct Observation {
@@ -35,7 +32,7 @@ class Observations {
   };
   std::vector<Observation> seen_;  // in order of arrival
   // Kept so that nothing is allocated in a frame.
-  TrackBatch batch_;
+  Tracks tracks_;
   std::vector<size_t> order_, living_, rows_;
   std::vector<char> stays_;
 };

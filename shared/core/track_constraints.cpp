@@ -163,7 +163,7 @@ void TrackConstraints::accumulate(const std::vector<SE3>& odom_from_cam, const T
   equations.vector.assign(size, 0.0);
   for (size_t t = 0; t < tracks.count(); ++t) {
     const Sighting* const track = tracks.sightings.data() + tracks.starts[t];
-    const size_t count = size_t(tracks.starts[t + 1] - tracks.starts[t]);
+    const size_t count = tracks.starts[t + 1] - tracks.starts[t];
     Vec3 point = odom_from_cam[tracks.anchors[t]] * tracks.first_points[t];
     const bool is_point = triangulate(odom_from_cam.data(), track, count, model.lens, model.weights, point);
     used[t] = is_point ? add(odom_from_cam, track, count, point, model, covariance, moved) : 0;

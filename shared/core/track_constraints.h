@@ -60,7 +60,7 @@ void linearise_track(Vec3 point, const SE3* odom_from_cam, const Sighting* track
 // T tracks, one after the other; where each begins among the sightings, (T + 1,). first_points: where triangulation starts, in the
 // camera of the anchors' clones.
 struct Tracks {
-  std::vector<int64_t> starts;
+  std::vector<size_t> starts;
   std::vector<Sighting> sightings;
   std::vector<size_t> anchors;
   std::vector<Vec3> first_points;

@@ -533,19 +533,6 @@ class Tracker:
 def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
     """How far the pixels (N, 3) of ids in both, ascending, lists have moved."""
 
-class Observations:
-    """Observations of points until an update uses them."""
-
-    def __init__(self) -> None: ...
-    def add(self, frame_index: int, ids: _Indices, pixels: _Reals) -> None:
-        """What one frame saw."""
-    def clear(self) -> None:
-        """Forgets all."""
-    def take(
-        self, alive: _Indices, due: _Flags, held: _Indices, lens: _Reals, far_px: float
-    ) -> tuple[_Indices, _Indices, _Reals, _Indices, _Reals]:
-        """Removes tracks that ended or are due: starts (T + 1,), clone_ids and pixels (n, 3), anchors (T,), points_cam (T, 3)."""
-
 def align_patches(
     reference: _Pyramid,
     reference_pixels: _Reals,
@@ -850,18 +837,28 @@ class Filter:
         Motions between clones, and what is known of them, stay. Velocity and biases must be idle.
         """
 
-    def update_by_tracks(
+    def observe(self, frame_index: int, ids: _Indices, pixels: _Reals) -> None:
+        """What one frame saw: ids (N,), pixels (N, 3) u_left v u_right, NaN where that is unknown. Of use once a clone has its index."""
+
+    def update(
         self,
-        starts: _Indices,
-        clone_ids: _Indices,
-        pixels: _Reals,
-        anchors: _Indices,
-        points_cam: _Reals,
-        iterations: int,
-        newest_odom_from_body: _Reals | None,
-        sigma_scale: float,
+        alive: _Indices,
+        due: _Flags,
+        first_depth_m: float,
+        iterations: int = 1,
+        newest_odom_from_body: _Reals | None = None,
+        sigma_scale: float = 1.0,
     ) -> NDArray[np.int8]:
-        """See `InvariantFilter.update`; starts (T + 1,) delimits each track's rows of clone_ids and pixels."""
+        """Uses each observation once, of tracks that ended, or are due, with two or more in the clones.
+
+        alive (N,): ids that the newest frame saw, due (N,): which of them are to be used now. What is due but seen once stays; what ended
+        so is forgotten. Returns for each track (T,), by rising ids: 1 taken, 0 not triangulated, -1 rejected by its gate.
+
+        A point is looked for from its nearest view, by the disparity, or first_depth_m along the newest ray where no view has one.
+        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body (4, 4) is then where
+        the newest clone is linearised first, when vision knows it better than the prediction. It adds no information. sigma_scale
+        widens the measurement noise, for matches that are less exact than flow.
+        """
 
     def correct_by_wheels(
         self,

@@ -272,8 +272,6 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: tracker(window_px=17), "half"),
         (lambda: tracker(pyramid_levels=-1), "levels"),
         (lambda: core.common_ways_px(STAMPS, SAMPLES[:2], STAMPS, SAMPLES), "pixels"),
-        (lambda: core.Observations().add(0, STAMPS, SAMPLES[:2]), "pixels"),
-        (lambda: core.Observations().take(STAMPS, np.ones(2, bool), STAMPS, np.ones(4), 1.0), "due"),
         (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((4, 2, 2)), 16, 3.0, 0.8), "half"),
         (lambda: core.align_patches(*PATCHES, *PATCHES, np.ones((3, 2, 2)), 4, 3.0, 0.8), "reference_from_current"),
         (lambda: core.align_patches(*PATCHES[:2], OCTAVES[:3], *PATCHES, np.ones((4, 2, 2)), 4, 3.0, 0.8), "octaves"),
@@ -299,10 +297,9 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: core.adjust_window(POSES, 1, SAMPLES[:1], np.array([0, 3]), ONE, PLACES[:3], np.ones(4), 1.0, 2.5, 8), "pixels"),
         (lambda: FILTER.odom_from_clone(1), "clone_id"),
         (FILTER.begin_frame_anew, "a clone is needed"),
-        (lambda: FILTER.update_by_tracks(np.array([0, 4]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 1, None, 1.0), "starts"),
-        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 0, None, 1.0), "iterations"),
-        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES, ONE, SAMPLES[:1], 1, None, 1.0), "clone_id"),
-        (lambda: FILTER.update_by_tracks(np.array([0, 3]), STAMPS, SAMPLES[:2], ONE, SAMPLES[:1], 1, None, 1.0), "pixels"),
+        (lambda: FILTER.observe(0, STAMPS, SAMPLES[:2]), "pixels"),
+        (lambda: FILTER.update(STAMPS, UNSET[:2], 1.0), "due"),
+        (lambda: FILTER.update(STAMPS, UNSET, 1.0, 0), "iterations"),
         (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
     ],
 )  # fmt: skip
@@ -416,8 +413,9 @@ def test_no_number_of_a_track_or_sample_harms_the_filter(numbers: Array, seen: l
     for clone in range(3):
         window.add_clone(clone, numbers[clone])
         window.predict_random_walk(np.eye(4), *numbers[0])
-    tracks = np.array([0, 1, 3, 6]), np.array(seen), numbers, np.arange(3), numbers[:3].copy()
-    assert len(window.update_by_tracks(*tracks, 2, np.eye(4), 1.0)) == 3
+    for number, frame, pixel in zip([0, 1, 1, 2, 2, 2], seen, numbers, strict=True):
+        window.observe(frame, np.array([number]), pixel[None])
+    assert len(window.update(ONE[:0], UNSET[:0], numbers[0, 0], 2, np.eye(4), 1.0)) == 2
     window.predict_inertial(np.arange(6), numbers, numbers, -(2**63), 2**63 - 1, (0.0,) * 4, (0.0,) * 4)
     window.predict_inertial(np.arange(6), numbers, numbers, 0, 9, (1.0, np.nan, np.inf, 0.0), (0.0,) * 4)
     window.correct_by_wheels(numbers[0], 1.0, 1.0, 0.0, numbers[1], np.eye(4), 10.0)

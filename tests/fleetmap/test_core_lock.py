@@ -21,13 +21,6 @@ TINY, NOWHERE, ZERO = NOISE[:8, :8].copy(), np.zeros((0, 2), np.float32), np.zer
 CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
 PLACES = np.random.default_rng(2).uniform(50.0, 400.0, (200, 2))
 PIXELS, IDS = np.column_stack([PLACES, PLACES[:, 0] - 8.0]), np.arange(200)
-TRACKS = (
-    np.arange(0, 401, 2),
-    np.tile([0, 1], 200),
-    np.repeat(PIXELS, 2, axis=0),
-    np.zeros(200, np.int64),
-    np.ones((200, 3)),
-)
 IMU = np.arange(0, 10**10, 10**7), np.zeros((1000, 3)), np.zeros((1000, 3))
 STEREO = 60.0, 0.75, 0.93, 5, 4, 0.25
 CALLS_AT_MOST = 3000
@@ -47,17 +40,16 @@ def tracking() -> Callable[[], object]:
     return lambda: tracker.track(NOISE, (NOISE, half, half), None, np.eye(4), True, None)
 
 
-def taking() -> Callable[[], object]:
-    table = core.Observations()
-    for frame in range(50):
-        table.add(frame, IDS, PIXELS)
-    return lambda: table.take(IDS, np.zeros(200, bool), np.arange(50), CAMERA.lens, 1.0)
+def updating() -> Callable[[], object]:
+    held = window()
+    for frame in range(12):
+        held.observe(frame, IDS, PIXELS)
+    return lambda: held.update(IDS, np.zeros(200, bool), 1.0)
 
 
 CALLS: dict[str, Callable[[], Callable[[], object]]] = {
     "Tracker.track": tracking,
-    "Observations.take": taking,
-    "Filter.update_by_tracks": lambda: partial(window().update_by_tracks, *TRACKS, 1, None, 1.0),
+    "Filter.update": updating,
     "Filter.correct_by_rest": lambda: partial(window().correct_by_rest, ZERO, 0.1, 99.0),
     "Filter.begin_frame_anew": lambda: window().begin_frame_anew,
     "Filter.predict_inertial": lambda: partial(window().predict_inertial, *IMU, 0, 10**10, (1e-3,) * 4, (1e-3,) * 4),

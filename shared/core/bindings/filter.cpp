@@ -19,12 +19,9 @@ using Transform = Array<double, 4, 4>;
 using Indices = Array<int64_t, -1>;
 using Noise = std::tuple<double, double, double, double>;
 
-constexpr size_t kMostClones = 1000;
+using SharedFilter = Shared<Filter>;
 
-struct SharedFilter : Shared<Filter> {
-  using Shared<Filter>::Shared;
-  Tracks tracks;  // memory for what updates are handed
-};
+constexpr size_t kMostClones = 1000;
 
 StereoLens lens_of(const Array<double, 4>& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
@@ -103,27 +100,15 @@ void add_clone(SharedFilter& filter, int64_t clone_id, const Vector& rate_body_r
   filter.add_clone(clone_id, vec3(rate_body_radps.data()));
 }
 
-auto update_by_tracks(SharedFilter& filter, const Indices& starts, const Indices& clone_ids, const Rows3& pixels, const Indices& anchors,
-                      const Rows3& points_cam, int iterations, const std::optional<Transform>& newest_odom_from_body, double sigma_scale) {
-  const size_t count = anchors.shape(0), seen = clone_ids.shape(0);
-  if (starts.shape(0) != count + 1 || points_cam.shape(0) != count) throw nb::value_error("starts, points_cam: one for each anchor");
-  if (pixels.shape(0) != seen) throw nb::value_error("pixels: one for each of clone_ids");
-  if (starts(0) < 0 || starts(count) > int64_t(seen) || !std::is_sorted(starts.data(), starts.data() + count + 1))
-    throw nb::value_error("starts: rows of clone_ids");
+auto update(SharedFilter& filter, const Indices& alive, const Array<bool, -1>& due, double first_depth_m, int iterations,
+            const std::optional<Transform>& newest_odom_from_body, double sigma_scale) {
+  if (due.shape(0) != alive.shape(0)) throw nb::value_error("due: one for each alive");
   if (iterations < 1 || iterations > 1000) throw nb::value_error("iterations: 1 to 1000");
-  Tracks& tracks = filter.tracks;
-  tracks.sightings.clear(), tracks.anchors.clear(), tracks.first_points.clear();
-  tracks.starts.assign(starts.data(), starts.data() + count + 1);
-  for (size_t n = 0; n < seen; ++n) tracks.sightings.push_back({index_of(filter, clone_ids(n)), pixels(n, 0), pixels(n, 1), pixels(n, 2)});
-  for (size_t t = 0; t < count; ++t) {
-    tracks.anchors.push_back(index_of(filter, anchors(t)));
-    tracks.first_points.push_back(vec3(&points_cam(t, 0)));
-  }
   std::optional<SE3> hint;
   if (newest_odom_from_body) hint = se3(newest_odom_from_body->data());
-  std::vector<int8_t> used(count);
-  unlocked([&] { filter.update(tracks, iterations, hint, sigma_scale, used.data()); });
-  return as_numpy<int8_t, 1>(std::move(used), {count});
+  const LivingPoints living{alive.data(), due.data(), alive.shape(0)};
+  const std::vector<int8_t>* const used = unlocked([&] { return &filter.update(living, first_depth_m, iterations, hint, sigma_scale); });
+  return as_numpy<int8_t, 1>(std::vector<int8_t>(*used), {used->size()});
 }
 
 double correct_by_wheels(SharedFilter& filter, const Vector& velocity_base_mps, double yaw_rate_radps, double sigma_mps, double sigma_radps,
@@ -228,9 +213,14 @@ void bind_filter(nb::module_& module) {
              newest(filter);
              return transform({kIdentity, -unlocked([&] { return filter.begin_frame_anew(); })});
            }))
-      .def("update_by_tracks", in_turn(&update_by_tracks), "starts"_a.noconvert(), "clone_ids"_a.noconvert(), "pixels"_a.noconvert(),
-           "anchors"_a.noconvert(), "points_cam"_a.noconvert(), "iterations"_a, "newest_odom_from_body"_a.noconvert().none(),
-           "sigma_scale"_a)
+      .def("observe", in_turn(+[](SharedFilter& filter, int64_t frame_index, const Indices& ids, const Rows3& pixels) {
+             if (ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
+             const CountedStep counted;
+             filter.observe(frame_index, ids.data(), pixels.data(), ids.shape(0));
+           }),
+           "frame_index"_a, "ids"_a.noconvert(), "pixels"_a.noconvert())
+      .def("update", in_turn(&update), "alive"_a.noconvert(), "due"_a.noconvert(), "first_depth_m"_a, "iterations"_a = 1,
+           "newest_odom_from_body"_a.noconvert() = nb::none(), "sigma_scale"_a = 1.0)
       .def("correct_by_wheels", in_turn(&correct_by_wheels), "velocity_base_mps"_a.noconvert(), "yaw_rate_radps"_a, "sigma_mps"_a,
            "sigma_radps"_a, "gyro_radps"_a.noconvert(), "base_from_body"_a.noconvert(), gate)
       .def("correct_by_rest", in_turn(+[](SharedFilter& filter, const Vector& gyro, double sigma, double most) {

@@ -7,7 +7,6 @@
 #include <optional>
 
 #include "in_turn.h"
-#include "observations.h"
 #include "refinement.h"
 #include "tracking.h"
 
@@ -129,18 +128,6 @@ auto common_ways_px_of(const Ids& old_ids, const Points& old_pixels, const Ids& 
   return as_numpy<double, 1>(std::move(ways), {count});
 }
 
-using SharedObservations = Shared<Observations>;
-
-auto take_of(SharedObservations& table, const Ids& alive, const Array<bool, -1>& due, const Ids& held, const Lens& lens, double far_px) {
-  if (due.shape(0) != alive.shape(0)) throw nb::value_error("due: one for each alive");
-  const TrackBatch* batch = nullptr;
-  unlocked([&] { batch = &table.take(alive.data(), due.data(), alive.shape(0), held.data(), held.shape(0), lens_of(lens), far_px); });
-  const size_t tracks = batch->anchors.size(), rows = batch->clones.size();
-  const auto ids = [](const std::vector<int64_t>& of) { return as_numpy<int64_t, 1>(std::vector<int64_t>(of), {of.size()}); };
-  return std::make_tuple(ids(batch->starts), ids(batch->clones), copied<2>(batch->pixels.data(), {rows, 3}), ids(batch->anchors),
-                         copied<2>(batch->points_cam.data(), {tracks, 3}));
-}
-
 }  // namespace
 
 void bind_tracking(nb::module_& module) {
@@ -163,14 +150,4 @@ void bind_tracking(nb::module_& module) {
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),
                    nb::rv_policy::automatic);
   module.def("common_ways_px", &common_ways_px_of, "old_ids"_a.noconvert(), "old_pixels"_a.noconvert(), "ids"_a.noconvert(), pixels);
-  nb::class_<SharedObservations>(module, "Observations")
-      .def(nb::init<>())
-      .def("add", in_turn(+[](SharedObservations& table, int64_t frame_index, const Ids& ids, const Points& seen) {
-             if (ids.shape(0) != seen.shape(0)) throw nb::value_error("pixels: one for each id");
-             const CountedStep counted;
-             table.add(frame_index, ids.data(), seen.data(), ids.shape(0));
-           }),
-           "frame_index"_a, "ids"_a.noconvert(), pixels)
-      .def("clear", in_turn(+[](SharedObservations& table) { table.clear(); }))
-      .def("take", in_turn(&take_of), "alive"_a.noconvert(), "due"_a.noconvert(), "held"_a.noconvert(), lens, "far_px"_a);
 }

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transform_points
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
-from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
@@ -100,21 +100,15 @@ def observe(points_map: Array, time_s: float, rng: np.random.Generator | None) -
     return np.asarray(pixels)
 
 
-def tracks_of(seen: dict[int, Array], chosen: Array) -> TrackBatch:
-    """Tracks of the chosen points through frames (index -> pixels (N, 3)); those in view of two or more."""
-    clones, pixels, guesses = [], [], []
-    for point in chosen.tolist():
-        frames = [k for k, pixels_there in seen.items() if np.isfinite(pixels_there[point, 0])]
-        if len(frames) < 2:
-            continue
-        clones.append(np.array(frames, np.int64))
-        pixels.append(np.array([seen[k][point] for k in frames]))
-        last = pixels[-1][-1:]
-        guesses.append(CAMERA.point_from_pixel(last[:, :2], last[:, 0] - last[:, 2])[0])
-    starts = np.concatenate([[0], np.cumsum([len(frames) for frames in clones])]).astype(np.int64)
-    anchors = np.array([frames[-1] for frames in clones], np.int64)
-    columns = np.concatenate(clones), np.concatenate(pixels)
-    return TrackBatch(starts, *columns, anchors, np.array(guesses).reshape(-1, 3))
+def use(
+    estimate: InvariantFilter, seen: dict[int, Array], chosen: Array, iterations: int = 1, newest: Array | None = None,
+    first_depth_m: float = 5.0,
+) -> NDArray[np.int8]:  # fmt: skip
+    """Updates by what frames (index -> pixels (N, 3)) saw of the chosen points; those in view of two or more."""
+    for frame, pixels in seen.items():
+        visible = chosen[np.isfinite(pixels[chosen, 0])]
+        estimate.observe(frame, visible, pixels[visible])
+    return estimate.update(np.zeros(0, np.int64), np.zeros(0, bool), first_depth_m, iterations, newest)
 
 
 @dataclass(frozen=True)
@@ -153,7 +147,7 @@ def run_filter(
         estimate.add_clone(index, rate)
         seen[index] = observe(points, time_s, rng)
         if index % 5 == 4:
-            used = estimate.update(tracks_of(seen, rng.choice(len(points), 300, replace=False)))
+            used = use(estimate, seen, rng.choice(len(points), 300, replace=False))
             accepted, offered = accepted + int((used == 1).sum()), offered + len(used)
             for old in list(seen)[:-1]:
                 estimate.remove_clone(old)

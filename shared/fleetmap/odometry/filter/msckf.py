@@ -3,7 +3,6 @@
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.geometry import Array
@@ -11,7 +10,6 @@ from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.inertial.preintegration import densities
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
-from fleetmap.odometry.tracking.tracks import TrackBatch
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
@@ -53,22 +51,6 @@ class InvariantFilter(core.Filter):
         """
         judged = densities(noise), densities(true_noise or noise)
         return self.predict_inertial(imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, int(start_ns), int(end_ns), *judged)
-
-    def update(
-        self,
-        tracks: TrackBatch,
-        iterations: int = 1,
-        newest_odom_from_body: Array | None = None,
-        sigma_scale: float = 1.0,
-    ) -> NDArray[np.int8]:
-        """Uses each track once; (T,) 1 taken, 0 not triangulated, -1 rejected by its gate.
-
-        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body is
-        then where the newest clone is linearised first, when vision knows it better than the prediction. It adds no
-        information. sigma_scale widens the measurement noise, for matches that are less exact than flow.
-        """
-        rows = tracks.starts, tracks.clone_ids, tracks.pixels, tracks.anchors, tracks.points_cam
-        return self.update_by_tracks(*rows, iterations, newest_odom_from_body, sigma_scale)
 
     def correct_by_wheel_sample(
         self, sample: WheelSample, gyro_radps: Array, base_from_body: Array, gate: float

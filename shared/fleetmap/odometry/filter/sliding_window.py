@@ -11,11 +11,11 @@ from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.odometry_checks import middle
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.odometry.tracking.tracks import Observations
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 
 _UNKNOWN_DEPTH_M = 5.0
+_FAR_DEPTH_M = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,6 @@ class SlidingWindow:
             true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
             true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
         self.filter = InvariantFilter(state, covariance, settings, rig.camera, rig.body_from_cam, true_error_cov)
-        self._observations = self._no_observations()
         self._stamps_ns: dict[int, int] = {}
         # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
         self._merged: dict[int, tuple[int, Array]] = {}
@@ -118,24 +117,22 @@ class SlidingWindow:
     def seed(self, frame_index: int, tracked: Tracked) -> None:
         """Begins an empty window with one frame; the tracks go on from it alone."""
         self._add_clone(frame_index)
-        self._observations.add(frame_index, tracked.ids, tracked.pixels)
+        self.filter.observe(frame_index, tracked.ids, tracked.pixels)
 
     def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
         """Adds a frame at the state and uses tracks that ended, that are due in their turn, or (after a gap) all.
 
-        Every observation serves exactly once. Returns what `InvariantFilter.update` does.
+        Every observation serves exactly once. Returns what `core.Filter.update` does.
         """
         self._add_clone(frame_index)
         self._observe(frame_index, tracked)
         due = (frame_index + tracked.ids) % chunk_frames == 0
-        held = np.array(self.filter.clone_ids)
-        chosen = self._observations.take(tracked.ids, held, due | tracked.by_descriptors, self.rig.camera)
+        chosen = tracked.ids, due | tracked.by_descriptors, self._first_depth_m
         seen = self.matched_body(tracked)
         if seen is None:
-            used = self.filter.update(chosen, iterations)
+            used = self.filter.update(*chosen, iterations)
         else:
-            scale = self.rig.settings.filter.descriptor_sigma_scale
-            used = self.filter.update(chosen, 4, newest_odom_from_body=seen[1], sigma_scale=scale)
+            used = self.filter.update(*chosen, 4, seen[1], self.rig.settings.filter.descriptor_sigma_scale)
         if (used == 1).any():
             self._refused_frames = 0
         elif self._refused_frames or (used == -1).any():
@@ -148,13 +145,15 @@ class SlidingWindow:
         self.filter.add_clone(frame_index, self.rate_body_radps)
         self._stamps_ns[frame_index] = self.stamp_ns
 
-    def _no_observations(self) -> Observations:
-        return Observations()
+    @property
+    def _first_depth_m(self) -> float:
+        """Where to look for a point without disparity first."""
+        return _FAR_DEPTH_M
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
         for earlier in tracked.earlier:
-            self._observations.add(earlier.frame_index, earlier.ids, earlier.pixels)
-        self._observations.add(frame_index, tracked.ids, tracked.pixels)
+            self.filter.observe(earlier.frame_index, earlier.ids, earlier.pixels)
+        self.filter.observe(frame_index, tracked.ids, tracked.pixels)
         self.scene_depth_m = self._depth_of(tracked.pixels)
 
     def _depth_of(self, pixels: Array) -> float:

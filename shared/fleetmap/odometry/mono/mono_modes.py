@@ -11,7 +11,7 @@ from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.nav_state import InitialState
+from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
@@ -21,7 +21,6 @@ from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
-from fleetmap.odometry.tracking.tracks import Observations, TrackBatch
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
@@ -35,26 +34,12 @@ _NONE_USED = np.zeros(0, np.int8)
 Ids = NDArray[np.int64]
 
 
-class MonocularObservations(Observations):
-    """Observations whose points are looked for from the scene's usual depth, where no disparity tells."""
-
-    def __init__(self, depth_m: Callable[[], float]) -> None:
-        super().__init__()
-        self._depth_m = depth_m
-
-    def take(self, alive: Ids, held: Ids, due: NDArray[np.bool_], camera: StereoCamera) -> TrackBatch:
-        """As Observations'; first guesses of points along the newest ray."""
-        batch = super().take(alive, held, due, camera)
-        last = batch.starts[1:] - 1
-        rays = (batch.pixels[last, :2] - [camera.cx_px, camera.cy_px]) / camera.focal_px
-        points = self._depth_m() * np.column_stack([rays, np.ones(len(last))])
-        return replace(batch, anchors=batch.clone_ids[last], points_cam=points)
-
-
 class MonocularWindow(SlidingWindow):
     """The window of one camera: depth comes from points that several frames triangulate."""
 
-    _sightings: dict[int, list[tuple[int, Array]]]
+    def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
+        super().__init__(rig, state, covariance, stamp_ns)
+        self._sightings: dict[int, list[tuple[int, Array]]] = {}
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) tracked points in the newest frame's camera, NaN where they cannot be triangulated; updates the depth."""
@@ -87,9 +72,9 @@ class MonocularWindow(SlidingWindow):
             self.scene_depth_m = float(np.median(points[known, 2]))
         return points
 
-    def _no_observations(self) -> Observations:
-        self._sightings = {}
-        return MonocularObservations(lambda: self.scene_depth_m)
+    @property
+    def _first_depth_m(self) -> float:
+        return self.scene_depth_m
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
         depth_m = self.scene_depth_m

@@ -23,8 +23,8 @@ from support.worlds.point_world import (
     perturbed,
     room,
     run_filter,
-    tracks_of,
     true_state,
+    use,
 )
 
 START_SIGMAS = np.repeat([0.02, 0.2, 0.05, 0.005, 0.05], 3)
@@ -103,7 +103,7 @@ def test_iterated_update_recovers_from_a_bad_prediction() -> None:
     off = se3_exp(np.array([0.1, -0.2, 0.2, 0.5, -0.6, 0.4]))
     estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng, last_body_from_guess=off)
     truth = se3_inverse(analytic_motion(0.0).map_from_body) @ analytic_motion(0.3).map_from_body
-    estimate.update(tracks_of(seen, np.arange(len(points))), iterations=6)
+    use(estimate, seen, np.arange(len(points)), iterations=6)
     moved = se3_inverse(estimate.odom_from_clone(0)) @ estimate.odom_from_clone(2)
     off = se3_log(se3_inverse(truth) @ moved)
     assert np.linalg.norm(off[:3]) < 0.003
@@ -119,7 +119,7 @@ def test_a_hint_of_the_newest_place_adds_no_information() -> None:
     for hint in (None, se3_exp(np.array([0.02, -0.01, 0.03, 0.05, -0.04, 0.02]))):
         estimate, seen = clones_at([0.0, 0.15, 0.3], points, np.random.default_rng(70))
         newest = None if hint is None else hint @ estimate.odom_from_clone(2)
-        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=6, newest_odom_from_body=newest)
+        use(estimate, seen, np.arange(len(points)), iterations=6, newest=newest)
         ends.append((estimate.state.odom_from_body, estimate.covariance))
     np.testing.assert_allclose(ends[0][0], ends[1][0], atol=1e-5)
     np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=2e-2, atol=1e-5)
@@ -137,22 +137,30 @@ def test_wrong_matches_are_refused() -> None:
             estimate.predict_random_walk(se3_inverse(before) @ analytic_motion(time_s).map_from_body, 0.005, 0.02)
         estimate.add_clone(k, np.zeros(3))
         seen[k] = observe(points, time_s, rng)
-    tracks = tracks_of(seen, np.arange(len(points)))
-    for row in tracks.starts[:-1:4]:
-        tracks.pixels[row, :] += rng.choice([-25.0, 25.0])
-        tracks.pixels[row, 1] += 30.0
-    used = estimate.update(tracks)
+    views = np.isfinite([pixels[:, 0] for pixels in seen.values()])
+    tracks = np.flatnonzero(views.sum(axis=0) > 1)
+    for point in tracks[::4]:
+        seen[int(views[:, point].argmax())][point] += rng.choice([-25.0, 25.0]) + np.array([0.0, 30.0, 0.0])
+    used = use(estimate, seen, tracks)
     wrong = np.zeros(len(tracks), bool)
     wrong[::4] = True
     assert (used[wrong] == 1).mean() < 0.1
     assert (used[~wrong] == 1).mean() > 0.95
 
 
+def test_a_point_is_looked_for_by_its_disparity_or_at_the_first_depth() -> None:
+    for depth_m, columns, is_found in ((5.0, 2, True), (-5.0, 2, False), (-5.0, 3, True)):
+        estimate, seen = clones_at([0.0, 0.15, 0.3], room(np.random.default_rng(1)), None)
+        for pixels in seen.values():
+            pixels[:, columns:] = np.nan
+        assert (use(estimate, seen, np.arange(400), first_depth_m=depth_m) == 1).any() == is_found
+
+
 def test_relative_motion_is_the_composition_and_its_covariance_the_scatter() -> None:
     rng = np.random.default_rng(10)
     points = room(rng)
     estimate, seen = clones_at([0.0, 0.15, 0.3], points, rng)
-    estimate.update(tracks_of(seen, np.arange(len(points))))
+    use(estimate, seen, np.arange(len(points)))
     earlier_from_now, covariance = estimate.motion_since(1)
     np.testing.assert_allclose(
         earlier_from_now, se3_inverse(estimate.odom_from_clone(1)) @ estimate.odom_from_clone(2), atol=1e-12
@@ -373,7 +381,7 @@ def test_an_update_that_would_not_be_finite_is_refused() -> None:
     estimate.add_clone(2, np.zeros(3))
     seen[2] = observe(points, 0.15, np.random.default_rng(8))
     before = everything(estimate)
-    used = estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+    used = use(estimate, seen, np.arange(len(points)), iterations=4)
     assert_unchanged(estimate, before)
     assert (used == -1).any()
     assert not (used == 1).any()
@@ -396,7 +404,7 @@ def test_a_frame_that_begins_anew_changes_nothing_between_clones() -> None:
             for (motion, cov), k in zip(known, (0, 1), strict=True):
                 np.testing.assert_allclose(estimate.motion_since(k)[0], motion, atol=1e-12)
                 np.testing.assert_allclose(estimate.motion_since(k)[1], cov, atol=1e-9)
-        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+        use(estimate, seen, np.arange(len(points)), iterations=4)
         found.append([estimate.motion_since(k) for k in (0, 1)])
     for (motion, cov), (anew, anew_cov) in zip(*found, strict=True):
         np.testing.assert_allclose(anew, motion, atol=1e-6)
@@ -416,7 +424,7 @@ def test_gaps_and_distance_leave_a_covariance(away_m: float, unseen_steps: int) 
             estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
             estimate.add_clone(k, np.zeros(3))
         seen = {k: observe(points, 0.0, rng) for k in (2 * pair, 2 * pair + 1)}
-        estimate.update(tracks_of(seen, np.arange(len(points))), iterations=4)
+        use(estimate, seen, np.arange(len(points)), iterations=4)
         for k in range(2 * pair + 1):
             least, *_, largest = np.linalg.eigvalsh(estimate.motion_since(k)[1])
             assert least > 0.0, (pair, k)
@@ -430,9 +438,8 @@ def test_threads_may_share_a_filter() -> None:
     rng = np.random.default_rng(3)
     points = room(rng)
     held, seen = clones_at([0.0, 0.1, 0.2, 0.3], points, rng)
-    tracks = tracks_of(seen, np.arange(len(points)))
     with ThreadPoolExecutor(1) as pool:
-        updated = pool.submit(lambda: [held.update(tracks, iterations=4) for _ in range(20)])
+        updated = pool.submit(lambda: [use(held, seen, np.arange(len(points)), iterations=4) for _ in range(20)])
         while not updated.done():
             held.add_clone(100, np.zeros(3))
             assert len(held.covariance) == 16 + 6 * 5

@@ -1,45 +1,47 @@
-"""Observations kept as one table, against a dictionary of lists; samples that cannot be."""
+"""Observations that a filter keeps, against a dictionary of lists; samples that cannot be."""
 
 import numpy as np
 
 from fleetmap.core import longest_gap_ns
+from fleetmap.geometry import Array
+from fleetmap.odometry.filter.msckf import InvariantFilter
+from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.sensor_buffer import SensorBuffer
-from fleetmap.odometry.tracking.tracks import Observations
 from fleetmap.sensors.samples import ImuSamples
-from support.worlds.point_world import CAMERA
+from support.worlds.point_world import BODY_FROM_CAM, CAMERA, SETTINGS, observe, room
 
 
-def test_the_table_gives_what_lists_would() -> None:
+def test_a_filter_keeps_observations_as_lists_would() -> None:
+    """Against a filter that is shown only what serves at once."""
     rng = np.random.default_rng(1)
-    table, lists = Observations(), dict[int, list[tuple[int, tuple[float, ...]]]]()
+    kept, shown = (InvariantFilter(NavState(), 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM) for _ in range(2))
+    points, lists = room(rng), dict[int, list[tuple[int, Array]]]()
+    counts, visible = np.zeros(3), np.flatnonzero(np.isfinite(observe(points, 0.0, None)[:, 0]))
     for frame in range(30):
         ids = np.sort(rng.choice(np.arange(frame, frame + 20), 12, replace=False))
-        pixels = rng.uniform(100, 300, (12, 3))
-        pixels[:, 2] = np.where(rng.random(12) < 0.3, np.nan, pixels[:, 0] - rng.uniform(2, 30, 12))
-        table.add(frame, ids, pixels)
+        pixels = observe(points, 0.0, rng)[visible[ids]]
+        pixels[rng.random(12) < 0.3, 2] = np.nan
+        for estimate in (kept, shown):
+            estimate.predict_random_walk(np.eye(4), 0.3, 1.5)
+            estimate.add_clone(frame, np.zeros(3))
+            if frame > 5:
+                estimate.remove_clone(frame - 6)
+        kept.observe(frame, ids, pixels)
         for number, pixel in zip(ids.tolist(), pixels, strict=True):
-            lists.setdefault(number, []).append((frame, tuple(pixel)))
-        due, held = (frame + ids) % 4 == 0, np.arange(max(frame - 5, 0), frame + 1)
-        batch = table.take(ids, held, due, CAMERA)
-        expected = {}
+            lists.setdefault(number, []).append((frame, pixel))
+        due = (frame + ids) % 4 == 0
         for number in sorted(lists):
-            seen = [o for o in lists[number] if o[0] in held]
-            is_due = number not in ids or number in ids[due]
-            if is_due and len(seen) >= 2:
-                expected[number] = seen
-            if number not in ids or number in expected:
+            seen = [(clone, pixel) for clone, pixel in lists[number] if clone > frame - 6]
+            serves = len(seen) >= 2 and (number not in ids or number in ids[due])
+            for clone, pixel in seen if serves else []:
+                shown.observe(clone, np.array([number]), pixel[None])
+            if number not in ids or serves:
                 del lists[number]
-        assert len(batch) == len(expected)
-        for k, seen in enumerate(expected.values()):
-            rows = slice(batch.starts[k], batch.starts[k + 1])
-            assert batch.clone_ids[rows].tolist() == [o[0] for o in seen]
-            np.testing.assert_array_equal(batch.pixels[rows], [o[1] for o in seen])
-            disparities = [o[1][0] - o[1][2] for o in seen]
-            finite = [d for d in disparities if np.isfinite(d)]
-            best = disparities.index(max(finite)) if finite else len(seen) - 1
-            assert batch.anchors[k] == seen[best][0]
-            depth = CAMERA.focal_px * CAMERA.baseline_m / max(finite) if finite else 20.0
-            np.testing.assert_allclose(batch.points_cam[k, 2], depth)
+        used = kept.update(ids, due, 20.0)
+        np.testing.assert_array_equal(used, shown.update(ids[:0], due[:0], 20.0))
+        counts += np.bincount(used + 1, minlength=3)
+    np.testing.assert_array_equal(kept.covariance, shown.covariance)
+    assert counts[2] > 0.8 * counts.sum() > 80
 
 
 def samples(values: list[float], step_ns: int = 5_000_000) -> ImuSamples:
