@@ -35,7 +35,7 @@ class MapOptions:
     store: Annotated[Path | None, typer.Option(help="Folder of a map store, instead of a server.")] = None
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
     robot: Annotated[
-        str | None, typer.Option(help="Name under which the robot reports; default: its identity's, or replay.")
+        str | None, typer.Option(help="Name by which the map is asked for; default: the identity's, or replay.")
     ] = None
     cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
     root: Annotated[

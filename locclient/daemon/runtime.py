@@ -113,6 +113,8 @@ class Runtime:
 
     def _finish(self, threads: list[threading.Thread]) -> None:
         self._manager.stopping()
+        if self._server is not None:
+            self._server.health.append(self._health(is_silent=False))  # of all frames
         self.stop()
         for thread in threads:
             thread.join(_DRAIN_S)

@@ -21,16 +21,11 @@ _PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; on
 
 @dataclass(frozen=True)
 class MapConnection:
-    """What a robot reads its map from, and the client that it reports with; None where it reads a store's folder.
-
-    outbox: the file in which reports of failures wait for the server.
-    """
+    """What a recording is localized in, and for which robot."""
 
     source: MapSource
-    client: MapClient | None
     site: str
     robot: str
-    outbox: Path | None = None
 
 
 def open_bus(address: MapAddress) -> Bus:
@@ -59,7 +54,7 @@ def connected(
     """A connection to a map's address, by a cache of at most so many bytes; closed afterwards."""
     site, robot = address.site, address.robot
     if address.store is not None:
-        yield MapConnection(LocalMapSource(Path(address.store), site, address.version), None, site, robot)
+        yield MapConnection(LocalMapSource(Path(address.store), site, address.version), site, robot)
         return
     folder = cache_folder(cache_setting)
     cache = TileCache(folder, max_bytes=cache_bytes)
@@ -67,8 +62,7 @@ def connected(
     try:
         client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
         client.require(trusted_map(bus, address, folder))
-        client.announce_presence()
-        yield MapConnection(client, client, site, robot, outbox_path(site, robot, cache_setting))
+        yield MapConnection(client, site, robot)
         for fault in cache.take_faults():
             _log.warning("tile cache: %s", fault)
     finally:

@@ -1,5 +1,5 @@
-"""Replay of a recording by the robot that `locclient run` runs: map loaded, frames handled one by one, reports sent. `localize` is all
-of it as one call."""
+"""Replay of a recording by the robot that `locclient run` runs: map loaded, frames handled one by one. `localize` is all of it as one
+call."""
 
 import re
 import time
@@ -28,7 +28,6 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import FetchedTiles, MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.run_metrics import FrameRecord
-from locclient.replay.run_reporter import RunReporter
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen
@@ -81,21 +80,18 @@ def replay(
     cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
     loaded, tiles, note = load_map(connection.source)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
-    keeps_replay = connection.outbox is not None
-    settings = (options.settings, TrialSettings(), time.process_time)
-    robot = Robot(source.calibration, rectifier, *settings, keeps_replay=keeps_replay)
+    robot = Robot(source.calibration, rectifier, options.settings, TrialSettings(), time.process_time)
     robot.use(loaded)
     give_back_free_memory()
     if prior is not None:
         robot.localizer.handle_prior(prior)
     truth_in_map = bool(loaded.manifest.configuration.get(TRUTH_FLAG))
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [], truth_in_map=truth_in_map)
-    mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
-    clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
-    profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
-    reporter = RunReporter(connection, result, profile)
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     if options.export is not None:
+        mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
+        clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
+        profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
         options.export.begin(first_ns, loaded, profile, rectifier)
     unread: list[str] = []
     for number, imu in enumerate(source.imu_before_each()):
@@ -119,20 +115,18 @@ def replay(
         result.frames.append(frame_record(outcome, truth if truth_in_map else None, wall_s, decode_s))
         result.estimates.append(outcome.estimate)
         result.truths.append(truth)
-        reporter.handle(outcome)
+        result.search.handle(outcome.estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
+        result.failures += outcome.failure is not None
+        result.notes.extend(words for words in outcome.left_out.values() if words not in result.notes)
         if options.export is not None:
             options.export.handle(raw, outcome)
         options.progress(number)
-    if robot.ring is not None:
-        robot.ring.finish()
     if 2 * len(unread) > number + 1:
         raise RecordingError(f"{len(unread)} of {number + 1} frames cannot be read; the first: {unread[0]}")
     if unread:
         result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
-    result.search = reporter.figures.search
     if words := result.search.words:
         result.notes += [words, *_lens_note(source.recording)]
-    reporter.finish()
     if not truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())
     return result

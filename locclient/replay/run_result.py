@@ -25,9 +25,8 @@ class ReplayResult:
 
     truth_in_map: whether the truth is of the frame `map`; else it is of a frame of its own, and errors are known after a fit alone.
 
-    manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failure_reports: how many failures the
-    robot detected, and of their reports how many the server has and how many still wait for it. search: how far the robot had driven at the
-    end without finding itself.
+    manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failures: how many the robot
+    detected. search: how far the robot had driven at the end without finding itself.
     """
 
     frames: list[FrameRecord]
@@ -36,7 +35,7 @@ class ReplayResult:
     manifest: Manifest
     tiles: FetchedTiles
     notes: list[str] = field(default_factory=list)
-    failure_reports: dict[str, int] = field(default_factory=lambda: {"detected": 0, "delivered": 0, "waiting": 0})
+    failures: int = 0
     truth_in_map: bool = True
     search: SearchWay = field(default_factory=SearchWay)
 
@@ -101,7 +100,7 @@ class ReplayResult:
         built["tiles"] = len(self.tiles.tiles)
         built["tiles_refused"] = {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())}
         built["not_localised_m"] = self.search.metres
-        built["failure_reports"] = self.failure_reports
+        built["failures_detected"] = self.failures
         built["notes"] = self.notes
         return built
 

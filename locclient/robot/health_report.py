@@ -176,9 +176,7 @@ class HealthFigures:
     def count_failure(self) -> None:
         self._failures += 1
 
-    def report(
-        self, site: str, robot: str, wall_ns: int | None, more: Mapping[str, Figure], silent: bool
-    ) -> RobotHealth:
+    def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
         """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
         last = None if self.last is None else self.last.estimate
         flags: list[Flag | Cause] = [Cause.NO_FRAMES] if silent else []

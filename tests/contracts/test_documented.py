@@ -82,7 +82,7 @@ EVIDENCE = (
     figures.Evidence, figures.Compared, figures.ProbeFigures, figures.Aliasing, figures.TrajectoryBreaks,
     figures.TileDirections, figures.Starts, figures.LookAlike, figures.RigEvidence,
 )  # fmt: skip
-RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failure_reports"}
+RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failures_detected"}
 
 
 @pytest.mark.parametrize(

@@ -3,22 +3,15 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from fleetmap.geometry import se3_inverse
-from fleetmap.messages import HEALTH_FIGURES, RobotHealth, Status
+from fleetmap.messages import HEALTH_FIGURES, Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
-from locclient.maps.connection import MapConnection
-from locclient.maps.map_source import FetchedTiles
-from locclient.replay.replay import frame_record
-from locclient.replay.run_reporter import RunReporter
-from locclient.replay.run_result import ReplayResult
 from locclient.robot.continuous_odom import ContinuousOdom
-from locclient.robot.failure_report import RobotProfile
 from locclient.robot.health_report import FixFigures, HealthFigures
 from locclient.robot.robot import Outcome
 from mapserver.fleet_statistics.health_stream import HealthStream
@@ -98,47 +91,18 @@ def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:
     assert 0 < metrics["landmarks_seen"] < metrics["landmarks_expected"]
 
 
-class _Link:
-    """Keeps what a replay tells."""
-
-    def __init__(self) -> None:
-        self.told: list[RobotHealth] = []
-
-    word_hours = 0.5
-
-    def publish_health(self, health: RobotHealth) -> None:
-        self.told.append(health)
-
-    def ack(self, *_: object, **__: object) -> None: ...
-    def publish_pose(self, _: object) -> None: ...
-
-
-def test_a_replay_tells_the_server_what_it_counts_with(store: MapStore) -> None:
-    link, manifest = _Link(), store.manifest(robot_world.SITE, 1)
-    result = ReplayResult([], [], [], manifest, FetchedTiles({}, {}))
-    to: Any = link
-    connection, rig = MapConnection(to, to, robot_world.SITE, "r1"), robot_world.rectifier()
-    profile = RobotProfile(robot_world.SITE, "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
-    reporter, watch, sums = RunReporter(connection, result, profile), HealthStream(), []
+def test_the_server_counts_what_a_robot_tells() -> None:
+    figures, watch, sums = HealthFigures(), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
         dock_error_m = 0.5 if number == 25 else None
-        outcome = Outcome(said, ContinuousOdom(np.eye(4)).handle(said), 0.01, {}, None, dock_error_m)
-        result.frames.append(frame_record(outcome, None, 0.01, 0.0))
-        result.estimates.append(said)
-        reporter.handle(outcome)
-    for health in link.told:
-        added = watch.take_health(health)
-        assert added is not None
-        sums.append(added)
-    assert len(link.told) == 5
-    assert [round(health.metrics["fix_innovation_m"] or 0.0, 2) for health in link.told[1:]] == [0.02, 0.02, 0.02, 0.4]
+        figures.handle(Outcome(said, ContinuousOdom(np.eye(4)).handle(said), 0.01, {}, None, dock_error_m))
+        if number % 10 == 0 or number == 49:
+            health = figures.report(robot_world.SITE, "r1", said.stamp_ns, {}, silent=False)
+            added = watch.take_health(health)
+            assert added is not None
+            sums.append(added)
     assert (sum(s.docks for s in sums), sum(s.docks_wrong for s in sums), sum(s.jumps for s in sums)) == (1, 1, 1)
-    assert sum(s.landmarks_expected for s in sums) == 40 * 50
-    assert sum(s.landmarks_seen for s in sums) == 40 * 40
-    own = HealthFigures()
-    own.handle(outcome)
-    as_run, last = own.report(robot_world.SITE, "r1", 5, {}, False), link.told[-1]
-    assert last.flags == as_run.flags
-    assert set(as_run.metrics) <= set(last.metrics), "what `run` tells, a replay tells"
-    assert (last.metrics["exposure"], last.metrics["sharpness"]) == (said.image.exposure, said.image.sharpness)
+    assert sum(s.landmarks_expected for s in sums) == 49 * 50, "since the first report"
+    assert sum(s.landmarks_seen for s in sums) == 49 * 40
+    assert (health.metrics["exposure"], health.metrics["sharpness"]) == (said.image.exposure, said.image.sharpness)
