@@ -13,6 +13,12 @@ struct StereoLens {
   double focal, cx, cy, focal_baseline;
 };
 
+// A camera on its body.
+struct RigCamera {
+  StereoLens lens;
+  SE3 body_from_cam;
+};
+
 struct StereoImage {
   StereoLens lens;
   double width, height;

@@ -307,7 +307,7 @@ void Filter::apply(const double* error) {
 
 const std::vector<int8_t>& Filter::update(const LivingPoints& living, double first_depth_m, int iterations,
                                           const std::optional<SE3>& newest_odom_from_body, double sigma_scale) {
-  const Tracks& tracks = observations_.take(living, clone_ids_, model_.pixels.lens, first_depth_m);
+  const Tracks& tracks = observations_.take(living, clone_ids_, model_.cameras, first_depth_m);
   used_.assign(tracks.count(), 0);
   if (used_.empty()) return used_;
   const NavState state_before = state;
@@ -331,9 +331,10 @@ const std::vector<int8_t>& Filter::update(const LivingPoints& living, double fir
     store(off.translation, moved_.data() + size - 3);
     clones_.back() = hint;
   }
-  cameras_.resize(clones_.size());
   for (int iteration = 0; iteration < iterations; ++iteration) {
-    for (size_t m = 0; m < clones_.size(); ++m) cameras_[m] = clones_[m] * model_.body_from_cam;
+    cameras_.clear();
+    for (const SE3& clone : clones_)
+      for (const auto& [lens, body_from_cam] : model_.cameras) cameras_.push_back({lens, clone * body_from_cam});
     constraints_.accumulate(cameras_, tracks, pixels, inner_, moved_, used_.data());
     // K^T = (1 + P_cc I^T)^-1 P_c, for the information I and the clones' rows P_c of the covariance.
     const NormalEquations& equations = constraints_.equations;

@@ -28,10 +28,10 @@ struct NavState {
 // Sigmas are those of FilterSettings in Python.
 struct FilterModel {
   PixelModel pixels;
-  SE3 body_from_cam;
+  std::vector<RigCamera> cameras;
   double gravity;  // m/s^2, downwards
   double time_offset_sigma_s;
-  double disparity_offset_sigma_px, depth_scale_sigma, pair_memory_s;  // the pair's errors, and for how long they stay
+  double disparity_offset_sigma_px, depth_scale_sigma, pair_memory_s;  // errors of all pairs, and for how long they stay
   double wheel_speed_scale_sigma, wheel_yaw_scale_sigma;               // of one robot's wheels
   double wheel_slip_mps, wheel_sigma_scale;                            // sideways and upwards; factor on sigmas, for weighing
   double still_sigma_mps;
@@ -72,8 +72,10 @@ class Filter {
   // numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
   Vec3 begin_frame_anew();
 
-  // What one frame saw: ids (count,), pixels (count, 3) u left, v, u right, NaN where that is unknown.
-  void observe(int64_t frame, const int64_t* ids, const double* pixels, size_t count) { observations_.add(frame, ids, pixels, count); }
+  // What one camera saw in a frame: ids (count,), pixels (count, 3) u left, v, u right, NaN where that is unknown.
+  void observe(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count) {
+    observations_.add(frame, camera, ids, pixels, count);
+  }
   // Uses what was observed of tracks that ended or are due, each observation once; used (T,) as of TrackConstraints, by rising ids, good
   // until the next. For first_depth_m see Observations. More than one iteration relinearises (iterated Kalman filter), for large
   // corrections; newest_odom_from_body is then where the newest clone is linearised first, when vision knows it better than the
@@ -106,7 +108,7 @@ class Filter {
 
   const std::vector<int64_t>& clone_ids() const { return clone_ids_; }
   const SE3& clone(size_t index) const { return clones_[index]; }
-  const SE3& body_from_cam() const { return model_.body_from_cam; }
+  const std::vector<RigCamera>& cameras() const { return model_.cameras; }
 
   NavState state;
   double imu_minus_cam_s = 0.0;
@@ -138,7 +140,8 @@ class Filter {
   Observations observations_;
   TrackConstraints constraints_;
   // Kept so that nothing is allocated in a frame.
-  std::vector<SE3> cameras_, prior_clones_, clones_before_;
+  std::vector<PlacedCamera> cameras_;
+  std::vector<SE3> prior_clones_, clones_before_;
   std::vector<ImuInterval> intervals_;
   std::vector<int8_t> used_;
   std::vector<double> moved_, correction_;

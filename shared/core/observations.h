@@ -18,16 +18,18 @@ struct LivingPoints {
 
 class Observations {
  public:
-  void add(int64_t frame, const int64_t* ids, const double* pixels, size_t count);
+  void add(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count);
 
   // Removes the tracks that ended, or are due, with two observations or more in the clones, frames in the window's order. What is due but
-  // seen once stays; what ended so is forgotten. The first guess of a point is the stereo point of the nearest view, or first_depth_m along
-  // the last ray where no view has a disparity. The result is good until the next.
-  const Tracks& take(const LivingPoints& living, const std::vector<int64_t>& clones, const StereoLens& lens, double first_depth_m);
+  // seen once stays; what ended so is forgotten. View clone * C + camera is one of C cameras. The first guess of a point is the stereo
+  // point of the nearest view, or first_depth_m along the last ray where no view has a disparity. The result is good until the next.
+  const Tracks& take(const LivingPoints& living, const std::vector<int64_t>& clones, const std::vector<RigCamera>& cameras,
+                     double first_depth_m);
 
  private:
   struct Observation {
     int64_t id, frame;
+    size_t camera;
     double pixels[3];
   };
   std::vector<Observation> seen_;  // in order of arrival

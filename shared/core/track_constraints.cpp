@@ -17,7 +17,8 @@ struct View {
   bool is_in_front() const { return !(at[2] < kNearest); }
 };
 
-View view_of(Vec3 point, const SE3& odom_from_cam, const StereoLens& lens) {
+View view_of(Vec3 point, const PlacedCamera& camera) {
+  const auto& [lens, odom_from_cam] = camera;
   View view{transposed(odom_from_cam.rotation), {}, 0.0, 0.0, 0.0};
   view.at = view.cam_from_odom * (point - odom_from_cam.translation);
   view.u = lens.focal * view.at[0] / view.at[2] + lens.cx;
@@ -85,18 +86,17 @@ void project_out_point(TrackRows& track, std::vector<double>& v, std::vector<dou
 
 }  // namespace
 
-bool triangulate(const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens, const PixelWeights& weights,
-                 Vec3& point) {
+bool triangulate(const PlacedCamera* cameras, const Sighting* track, size_t count, const PixelWeights& weights, Vec3& point) {
   for (int iteration = 0; iteration < 8; ++iteration) {
     Mat3 hessian{};
     Vec3 step{};
     double depth = 0.0;
     for (size_t k = 0; k < count; ++k) {
-      const View view = view_of(point, odom_from_cam[track[k].clone], lens);
+      const View view = view_of(point, cameras[track[k].view]);
       if (!view.is_in_front()) return false;
       depth = view.at[2];
       Row rows[3];
-      const int used = rows_of(view, track[k], lens, weights, rows);
+      const int used = rows_of(view, track[k], cameras[track[k].view].lens, weights, rows);
       for (int row = 0; row < used; ++row) {
         const double size = std::abs(rows[row].residual), huber = size < 3.0 ? 1.0 : 3.0 / size;
         for (int a = 0; a < 3; ++a) {
@@ -112,7 +112,7 @@ bool triangulate(const SE3* odom_from_cam, const Sighting* track, size_t count, 
     if (std::max({std::abs(step[0]), std::abs(step[1]), std::abs(step[2])}) < 1e-4 * (1.0 + depth)) break;
   }
   for (size_t k = 0; k < count; ++k)
-    if (!view_of(point, odom_from_cam[track[k].clone], lens).is_in_front()) return false;
+    if (!view_of(point, cameras[track[k].view]).is_in_front()) return false;
   return std::isfinite(point[0]) && std::isfinite(point[1]) && std::isfinite(point[2]);
 }
 
@@ -124,15 +124,15 @@ double share_that_passes(double limit, double mean_square) {
   return 1.0 - 2.0 * edge * density / std::erf(edge / std::sqrt(2.0));
 }
 
-void linearise_track(Vec3 point, const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens,
-                     const PixelWeights& weights, TrackRows& out) {
+void linearise_track(Vec3 point, const PlacedCamera* cameras, const Sighting* track, size_t count, const PixelWeights& weights,
+                     TrackRows& out) {
   out.clone_columns = 6 * count;
   out.values.resize(3 * count, out.residual_column() + 1);
   out.rows = 0;
   for (size_t k = 0; k < count; ++k) {
-    const View view = view_of(point, odom_from_cam[track[k].clone], lens);
+    const View view = view_of(point, cameras[track[k].view]);
     Row rows[3];
-    const int used = rows_of(view, track[k], lens, weights, rows);
+    const int used = rows_of(view, track[k], cameras[track[k].view].lens, weights, rows);
     // Errors that outlive one image: a track slips along its way in the image, and across it, by shares of it.
     const double way_u = track[k].u - track[0].u, way_v = track[k].v - track[0].v;
     for (int row = 0; row < used; ++row, ++out.rows) {
@@ -155,24 +155,24 @@ void linearise_track(Vec3 point, const SE3* odom_from_cam, const Sighting* track
   }
 }
 
-void TrackConstraints::accumulate(const std::vector<SE3>& odom_from_cam, const Tracks& tracks, const PixelModel& model,
+void TrackConstraints::accumulate(const std::vector<PlacedCamera>& cameras, const Tracks& tracks, const PixelModel& model,
                                   const Matrix& covariance, const std::vector<double>& moved, int8_t* used) {
-  const size_t size = 6 * odom_from_cam.size();
+  const size_t size = covariance.rows;
   equations.information.resize(size, 2 + size);
   equations.scatter.resize(size, size);
   equations.vector.assign(size, 0.0);
   for (size_t t = 0; t < tracks.count(); ++t) {
     const Sighting* const track = tracks.sightings.data() + tracks.starts[t];
     const size_t count = tracks.starts[t + 1] - tracks.starts[t];
-    Vec3 point = odom_from_cam[tracks.anchors[t]] * tracks.first_points[t];
-    const bool is_point = triangulate(odom_from_cam.data(), track, count, model.lens, model.weights, point);
-    used[t] = is_point ? add(odom_from_cam, track, count, point, model, covariance, moved) : 0;
+    Vec3 point = cameras[tracks.anchors[t]].odom_from_cam * tracks.first_points[t];
+    const bool is_point = triangulate(cameras.data(), track, count, model.weights, point);
+    used[t] = is_point ? add(cameras, track, count, point, model, covariance, moved) : 0;
   }
 }
 
-int8_t TrackConstraints::add(const std::vector<SE3>& odom_from_cam, const Sighting* track, size_t count, Vec3 point,
+int8_t TrackConstraints::add(const std::vector<PlacedCamera>& cameras, const Sighting* track, size_t count, Vec3 point,
                              const PixelModel& model, const Matrix& covariance, const std::vector<double>& moved) {
-  linearise_track(point, odom_from_cam.data(), track, count, model.lens, model.weights, rows_);
+  linearise_track(point, cameras.data(), track, count, model.weights, rows_);
   if (rows_.rows < 4) return 0;
   project_out_point(rows_, left_, whitened_);
   const size_t dof = rows_.rows - 3, size = rows_.clone_columns;

@@ -14,9 +14,16 @@
 
 namespace fleetmap {
 
-// A row of a track: the clone that saw the point, and where: left pixel, and column in the right image, NaN where that is unknown.
+// A camera of a clone.
+struct PlacedCamera {
+  StereoLens lens;
+  SE3 odom_from_cam;
+};
+
+// A row of a track: the clone whose camera saw the point, that camera's number among those of all clones, and where: left pixel, and
+// column in the right image, NaN where that is unknown.
 struct Sighting {
-  size_t clone;
+  size_t clone, view;
   double u, v, u_right;
   bool has_disparity() const { return u_right == u_right; }
 };
@@ -28,15 +35,13 @@ struct PixelWeights {
 
 // The point (in place, `odom`) of one track, by least squares; false where it does not settle in front of every camera. point must
 // hold a start.
-bool triangulate(const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens, const PixelWeights& weights,
-                 Vec3& point);
+bool triangulate(const PlacedCamera* cameras, const Sighting* track, size_t count, const PixelWeights& weights, Vec3& point);
 
 // Of a normal error's variance, what is left among those whose square stays below the limit: of a truncated normal.
 double share_that_passes(double limit, double mean_square);
 
 // How large errors of pixels are. The weights are wide and treat all as white noise; the rest says what the errors really are.
 struct PixelModel {
-  StereoLens lens;
   PixelWeights weights;
   double noise_variance;           // that the weighted rows really have
   double slip_along, slip_across;  // sigmas of what one track keeps for itself: the shares of its way by which it slips along it
@@ -54,11 +59,11 @@ struct TrackRows {
   size_t residual_column() const { return own_column() + 3; }
 };
 
-void linearise_track(Vec3 point, const SE3* odom_from_cam, const Sighting* track, size_t count, const StereoLens& lens,
-                     const PixelWeights& weights, TrackRows& out);
+void linearise_track(Vec3 point, const PlacedCamera* cameras, const Sighting* track, size_t count, const PixelWeights& weights,
+                     TrackRows& out);
 
 // T tracks, one after the other; where each begins among the sightings, (T + 1,). first_points: where triangulation starts, in the
-// camera of the anchors' clones.
+// cameras that are the anchors.
 struct Tracks {
   std::vector<size_t> starts;
   std::vector<Sighting> sightings;
@@ -76,17 +81,17 @@ struct NormalEquations {
 // Adds up tracks that pass their gates. It keeps its memory.
 class TrackConstraints {
  public:
-  // From the tracks and M cameras; covariance (6 M, 6 M) of the clones' errors, rotation then position. moved (6 M,): how far the clones
-  // stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track that was taken, 0 for one that
-  // could not be triangulated and -1 for one that failed its gate.
-  // Source: Mourikis and Roumeliotis 2007, equations 23 to 26 (null space of the point).
-  void accumulate(const std::vector<SE3>& odom_from_cam, const Tracks& tracks, const PixelModel& model, const Matrix& covariance,
+  // From the tracks and the cameras of M clones; covariance (6 M, 6 M) of the clones' errors, rotation then position. moved (6 M,): how far
+  // the clones stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track that was taken, 0 for one
+  // that could not be triangulated and -1 for one that failed its gate. Source: Mourikis and Roumeliotis 2007, equations 23 to 26 (null
+  // space of the point).
+  void accumulate(const std::vector<PlacedCamera>& cameras, const Tracks& tracks, const PixelModel& model, const Matrix& covariance,
                   const std::vector<double>& moved, int8_t* used);
 
   NormalEquations equations;
 
  private:
-  int8_t add(const std::vector<SE3>& odom_from_cam, const Sighting* track, size_t count, Vec3 point, const PixelModel& model,
+  int8_t add(const std::vector<PlacedCamera>& cameras, const Sighting* track, size_t count, Vec3 point, const PixelModel& model,
              const Matrix& covariance, const std::vector<double>& moved);
 
   TrackRows rows_;

@@ -752,23 +752,29 @@ def triangulate(
     odom_from_cam: _Reals,
     views: _Indices,
     pixels: _Reals,
-    lens: _Reals,
+    lenses: _Reals,
     pixel_weight: float,
     disparity_weight: float,
     start: _Reals,
 ) -> _Reals:
-    """The point (3,) of one track by least squares from a start (3,); NaN where it does not settle in front of every camera."""
+    """The point (3,) of one track by least squares from a start (3,); NaN where it does not settle in front of every camera.
+
+    views (n,): which of the cameras odom_from_cam (V, 4, 4) with lenses (V, 4) saw the pixels (n, 3).
+    """
 
 def linearise_track(
     point: _Reals,
     odom_from_cam: _Reals,
     views: _Indices,
     pixels: _Reals,
-    lens: _Reals,
+    lenses: _Reals,
     pixel_weight: float,
     disparity_weight: float,
 ) -> _Reals:
-    """(R, 3 + 6 n + 6) weighted rows of one track: derivatives by point, bodies, disparity's errors and slips; last the residual."""
+    """(R, 3 + 6 n + 6) weighted rows of one track, given as to `triangulate`.
+
+    Derivatives by point, bodies, disparity's errors and slips; last the residual.
+    """
 
 def share_that_passes(limit: float, mean_square: float) -> float:
     """Of a normal error's variance, what is left among those whose square stays below the limit."""
@@ -789,13 +795,16 @@ class Filter:
         accel_bias: _Reals,
         nav_covariance: _Reals,
         nav_true_error: _Reals,
-        lens: _Reals,
-        body_from_cam: _Reals,
+        lenses: _Reals,
+        body_from_cams: _Reals,
         settings: object,
         gate_quantile: float,
         gravity_mps2: float,
     ) -> None:
-        """Covariances (15, 15). settings has the fields of FilterSettings; gate_quantile: the normal distribution's, at the gate."""
+        """Covariances (15, 15); lenses (C, 4) and body_from_cams (C, 4, 4) of the rig's cameras.
+
+        settings has the fields of FilterSettings; gate_quantile: the normal distribution's, at the gate.
+        """
 
     def predict_inertial(
         self,
@@ -837,8 +846,11 @@ class Filter:
         Motions between clones, and what is known of them, stay. Velocity and biases must be idle.
         """
 
-    def observe(self, frame_index: int, ids: _Indices, pixels: _Reals) -> None:
-        """What one frame saw: ids (N,), pixels (N, 3) u_left v u_right, NaN where that is unknown. Of use once a clone has its index."""
+    def observe(self, frame_index: int, camera: int, ids: _Indices, pixels: _Reals) -> None:
+        """What one camera, counted from 0, saw in a frame: ids (N,), pixels (N, 3) u_left v u_right, NaN where that is unknown.
+
+        Of use once a clone has the frame's index.
+        """
 
     def update(
         self,
@@ -897,7 +909,7 @@ class Filter:
         """As body_since, and its covariance (6, 6), of a left perturbation in axes of the earlier body."""
 
     def cam_from_earlier(self, clone_id: int, cam_from_body: _Reals) -> _Reals:
-        """(4, 4) from a clone's camera to that of the state."""
+        """(4, 4) from a clone's first camera to that of the state."""
 
     def odom_from_clone(self, clone_id: int) -> _Reals:
         """(4, 4) odom_from_body of a clone."""

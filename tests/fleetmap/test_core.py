@@ -140,7 +140,7 @@ GUIDANCE = np.ones(4), (30.0, 20.0), 1.5, (4.0, 11.0, (10, 5)), 60
 CHOSEN = (*PATCHES, np.zeros(4, np.float32), np.arange(4))
 POSES, ONE = np.tile(np.eye(4), (2, 1, 1)), np.zeros(1, np.int64)
 FILTER = InvariantFilter(
-    NavState(), np.eye(15), FilterSettings(), StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4)
+    NavState(), np.eye(15), FilterSettings(), [(StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4))]
 )
 
 
@@ -290,14 +290,18 @@ def unmeasured(count: int) -> tuple[Array, Array, Array, Array]:
         (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 9, 3, (1.0,) * 5), "window_ns"),
         (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 2**40, 9, (1.0,) * 5), "window_ns"),
         (lambda: core.latest_steady(STAMPS, SAMPLES, SAMPLES, 0, 2**62, 9, (1.0,) * 5), "until_ns"),
-        (lambda: core.triangulate(POSES, np.arange(3), SAMPLES, np.ones(4), 1.0, 1.0, ZERO), "views"),
-        (lambda: core.triangulate(POSES, np.arange(2), SAMPLES, np.ones(4), 1.0, 1.0, ZERO), "pixels"),
+        (lambda: core.triangulate(POSES, np.arange(3), SAMPLES, np.ones((2, 4)), 1.0, 1.0, ZERO), "views"),
+        (lambda: core.triangulate(POSES, np.arange(2), SAMPLES, np.ones((2, 4)), 1.0, 1.0, ZERO), "pixels"),
+        (lambda: core.triangulate(POSES, np.arange(2), SAMPLES[:2], np.ones((1, 4)), 1.0, 1.0, ZERO), "lenses"),
         (lambda: core.adjust_window(POSES, 1, SAMPLES, STAMPS, STAMPS, PLACES[:3], np.ones(4), 1.0, 2.5, 8), "starts"),
         (lambda: core.adjust_window(POSES, 1, SAMPLES[:1], np.array([0, 3]), STAMPS, PLACES[:3], np.ones(4), 1.0, 2.5, 8), "views"),
         (lambda: core.adjust_window(POSES, 1, SAMPLES[:1], np.array([0, 3]), ONE, PLACES[:3], np.ones(4), 1.0, 2.5, 8), "pixels"),
         (lambda: FILTER.odom_from_clone(1), "clone_id"),
         (FILTER.begin_frame_anew, "a clone is needed"),
-        (lambda: FILTER.observe(0, STAMPS, SAMPLES[:2]), "pixels"),
+        (lambda: FILTER.observe(0, 0, STAMPS, SAMPLES[:2]), "pixels"),
+        (lambda: FILTER.observe(0, 1, STAMPS, SAMPLES), "camera: 1, but the rig has 1"),
+        (lambda: FILTER.observe(0, -1, STAMPS, SAMPLES), "camera: -1"),
+        (lambda: core.Filter(*NavState().arrays, *[np.eye(15)] * 2, np.ones((1, 4)), POSES, FilterSettings(), 1.0, 9.8), "body_from_cams"),
         (lambda: FILTER.update(STAMPS, UNSET[:2], 1.0), "due"),
         (lambda: FILTER.update(STAMPS, UNSET, 1.0, 0), "iterations"),
         (lambda: core.preintegrate(STAMPS, SAMPLES, SAMPLES, 9, 0, ZERO, ZERO, (1.0, 1.0, 1.0, 1.0)), "end_ns"),
@@ -408,13 +412,13 @@ HOSTILE_NUMBERS = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e300, np.inf, np.nan
 @given(arrays(np.float64, (6, 3), elements=HOSTILE_NUMBERS), st.lists(st.integers(0, 2), min_size=6, max_size=6))
 def test_no_number_of_a_track_or_sample_harms_the_filter(numbers: Array, seen: list[int]) -> None:
     window = InvariantFilter(
-        NavState(), np.eye(15), FilterSettings(), StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4)
+        NavState(), np.eye(15), FilterSettings(), [(StereoCamera(300.0, 9.0, 9.0, 0.1, 20, 20), np.eye(4))]
     )
     for clone in range(3):
         window.add_clone(clone, numbers[clone])
         window.predict_random_walk(np.eye(4), *numbers[0])
     for number, frame, pixel in zip([0, 1, 1, 2, 2, 2], seen, numbers, strict=True):
-        window.observe(frame, np.array([number]), pixel[None])
+        window.observe(frame, 0, np.array([number]), pixel[None])
     assert len(window.update(ONE[:0], UNSET[:0], numbers[0, 0], 2, np.eye(4), 1.0)) == 2
     window.predict_inertial(np.arange(6), numbers, numbers, -(2**63), 2**63 - 1, (0.0,) * 4, (0.0,) * 4)
     window.predict_inertial(np.arange(6), numbers, numbers, 0, 9, (1.0, np.nan, np.inf, 0.0), (0.0,) * 4)

@@ -27,7 +27,7 @@ CALLS_AT_MOST = 3000
 
 
 def window() -> InvariantFilter:
-    window = InvariantFilter(NavState(), np.eye(15), FilterSettings(), CAMERA, np.eye(4))
+    window = InvariantFilter(NavState(), np.eye(15), FilterSettings(), [(CAMERA, np.eye(4))])
     for clone in range(12):
         window.add_clone(clone, ZERO)
     return window
@@ -43,7 +43,7 @@ def tracking() -> Callable[[], object]:
 def updating() -> Callable[[], object]:
     held = window()
     for frame in range(12):
-        held.observe(frame, IDS, PIXELS)
+        held.observe(frame, 0, IDS, PIXELS)
     return lambda: held.update(IDS, np.zeros(200, bool), 1.0)
 
 

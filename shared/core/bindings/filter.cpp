@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
+#include <string>
 
 #include "filter.h"
 #include "in_turn.h"
@@ -16,6 +17,8 @@ namespace {
 
 using Vector = Array<double, 3>;
 using Transform = Array<double, 4, 4>;
+using Transforms = Array<double, -1, 4, 4>;
+using Lenses = Array<double, -1, 4>;
 using Indices = Array<int64_t, -1>;
 using Noise = std::tuple<double, double, double, double>;
 
@@ -23,7 +26,7 @@ using SharedFilter = Shared<Filter>;
 
 constexpr size_t kMostClones = 1000;
 
-StereoLens lens_of(const Array<double, 4>& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
+StereoLens lens_of(const Lenses& lenses, size_t n) { return {lenses(n, 0), lenses(n, 1), lenses(n, 2), lenses(n, 3)}; }
 
 auto transform(const SE3& target_from_source) {
   double matrix[16];
@@ -43,19 +46,22 @@ size_t newest(const Filter& filter) {
   return filter.clone_ids().size() - 1;
 }
 
-FilterModel model_of(const Array<double, 4>& lens, const Transform& body_from_cam, const nb::object& settings, double gate_quantile,
+FilterModel model_of(const Lenses& lenses, const Transforms& body_from_cams, const nb::object& settings, double gate_quantile,
                      double gravity_mps2) {
+  if (lenses.shape(0) == 0 || body_from_cams.shape(0) != lenses.shape(0))
+    throw nb::value_error("lenses, body_from_cams: of the same cameras, at least one");
   const auto set = [&](const char* name) { return nb::cast<double>(settings.attr(name)); };
   const double noise_share = set("noise_share");
-  const PixelModel pixels{lens_of(lens),
-                          {1.0 / set("pixel_sigma_px"), 1.0 / set("disparity_sigma_px")},
+  const PixelModel pixels{{1.0 / set("pixel_sigma_px"), 1.0 / set("disparity_sigma_px")},
                           noise_share * noise_share,
                           set("slip_along_share"),
                           set("slip_across_share"),
                           set("track_disparity_sigma_px"),
                           gate_quantile};
+  std::vector<RigCamera> cameras;
+  for (size_t c = 0; c < lenses.shape(0); ++c) cameras.push_back({lens_of(lenses, c), se3(body_from_cams.data() + 16 * c)});
   return {pixels,
-          se3(body_from_cam.data()),
+          std::move(cameras),
           gravity_mps2,
           set("time_offset_sigma_s"),
           set("disparity_offset_sigma_px"),
@@ -70,11 +76,11 @@ FilterModel model_of(const Array<double, 4>& lens, const Transform& body_from_ca
 
 void make(SharedFilter* filter, const Array<double, 3, 3>& rotation, const Vector& velocity, const Vector& position,
           const Vector& gyro_bias, const Vector& accel_bias, const Array<double, 15, 15>& nav_covariance,
-          const Array<double, 15, 15>& nav_true_error, const Array<double, 4>& lens, const Transform& body_from_cam,
-          const nb::object& settings, double gate_quantile, double gravity_mps2) {
+          const Array<double, 15, 15>& nav_true_error, const Lenses& lenses, const Transforms& body_from_cams, const nb::object& settings,
+          double gate_quantile, double gravity_mps2) {
   const NavState start{mat3(rotation.data()), vec3(velocity.data()), vec3(position.data()), vec3(gyro_bias.data()),
                        vec3(accel_bias.data())};
-  const FilterModel model = model_of(lens, body_from_cam, settings, gate_quantile, gravity_mps2);
+  const FilterModel model = model_of(lenses, body_from_cams, settings, gate_quantile, gravity_mps2);
   new (filter) SharedFilter(start, nav_covariance.data(), nav_true_error.data(), model);
 }
 
@@ -128,7 +134,7 @@ auto motion_since(SharedFilter& filter, int64_t clone_id) {
 
 auto cam_from_earlier(SharedFilter& filter, int64_t clone_id, const Transform& cam_from_body) {
   const SE3 body_from_earlier = inverse(filter.state.body()) * filter.clone(index_of(filter, clone_id));
-  return transform(se3(cam_from_body.data()) * body_from_earlier * filter.body_from_cam());
+  return transform(se3(cam_from_body.data()) * body_from_earlier * filter.cameras().front().body_from_cam);
 }
 
 auto body_covariance(SharedFilter& filter) {
@@ -145,40 +151,38 @@ auto state_of(SharedFilter& filter) {
 
 auto matrix(const Matrix& values) { return copied<2>(values[0], {values.rows, values.columns}); }
 
-using Cameras = Array<double, -1, 4, 4>;
-
-std::vector<SE3> poses_of(const Cameras& odom_from_cam) {
-  std::vector<SE3> poses(odom_from_cam.shape(0));
-  for (size_t m = 0; m < poses.size(); ++m) poses[m] = se3(odom_from_cam.data() + 16 * m);
-  return poses;
+std::vector<PlacedCamera> placed(const Transforms& odom_from_cam, const Lenses& lenses) {
+  if (lenses.shape(0) != odom_from_cam.shape(0)) throw nb::value_error("lenses: one for each of odom_from_cam");
+  std::vector<PlacedCamera> cameras;
+  for (size_t m = 0; m < lenses.shape(0); ++m) cameras.push_back({lens_of(lenses, m), se3(odom_from_cam.data() + 16 * m)});
+  return cameras;
 }
 
 std::vector<Sighting> track_of(size_t cameras, const Indices& views, const Rows3& pixels) {
   if (pixels.shape(0) != views.shape(0)) throw nb::value_error("pixels: one for each of views");
   std::vector<Sighting> track;
   for (size_t n = 0; n < views.shape(0); ++n) {
-    if (views(n) < 0 || views(n) >= int64_t(cameras)) throw nb::value_error("views: numbers of cameras");
-    track.push_back({size_t(views(n)), pixels(n, 0), pixels(n, 1), pixels(n, 2)});
+    if (size_t(views(n)) >= cameras) throw nb::value_error("views: numbers of cameras");
+    track.push_back({0, size_t(views(n)), pixels(n, 0), pixels(n, 1), pixels(n, 2)});
   }
   return track;
 }
 
-auto triangulate_of(const Cameras& odom_from_cam, const Indices& views, const Rows3& pixels, const Array<double, 4>& lens,
-                    double pixel_weight, double disparity_weight, const Vector& start) {
-  const std::vector<SE3> poses = poses_of(odom_from_cam);
-  const std::vector<Sighting> track = track_of(poses.size(), views, pixels);
+auto triangulate_of(const Transforms& odom_from_cam, const Indices& views, const Rows3& pixels, const Lenses& lenses, double pixel_weight,
+                    double disparity_weight, const Vector& start) {
+  const std::vector<PlacedCamera> cameras = placed(odom_from_cam, lenses);
+  const std::vector<Sighting> track = track_of(cameras.size(), views, pixels);
   Vec3 point = vec3(start.data());
-  if (!triangulate(poses.data(), track.data(), track.size(), lens_of(lens), {pixel_weight, disparity_weight}, point))
-    point = {NAN, NAN, NAN};
+  if (!triangulate(cameras.data(), track.data(), track.size(), {pixel_weight, disparity_weight}, point)) point = {NAN, NAN, NAN};
   return copied<1>(point.at, {3});
 }
 
-auto linearise_track_of(const Vector& point, const Cameras& odom_from_cam, const Indices& views, const Rows3& pixels,
-                        const Array<double, 4>& lens, double pixel_weight, double disparity_weight) {
-  const std::vector<SE3> poses = poses_of(odom_from_cam);
-  const std::vector<Sighting> track = track_of(poses.size(), views, pixels);
+auto linearise_track_of(const Vector& point, const Transforms& odom_from_cam, const Indices& views, const Rows3& pixels,
+                        const Lenses& lenses, double pixel_weight, double disparity_weight) {
+  const std::vector<PlacedCamera> cameras = placed(odom_from_cam, lenses);
+  const std::vector<Sighting> track = track_of(cameras.size(), views, pixels);
   TrackRows rows;
-  linearise_track(vec3(point.data()), poses.data(), track.data(), track.size(), lens_of(lens), {pixel_weight, disparity_weight}, rows);
+  linearise_track(vec3(point.data()), cameras.data(), track.data(), track.size(), {pixel_weight, disparity_weight}, rows);
   return copied<2>(rows.values.values.data(), {rows.rows, rows.values.columns});
 }
 
@@ -196,8 +200,8 @@ void bind_filter(nb::module_& module) {
   const auto clone_id = "clone_id"_a, gate = "gate"_a;
   nb::class_<SharedFilter>(module, "Filter")
       .def("__init__", &make, "rotation"_a.noconvert(), "velocity"_a.noconvert(), "position"_a.noconvert(), "gyro_bias"_a.noconvert(),
-           "accel_bias"_a.noconvert(), "nav_covariance"_a.noconvert(), "nav_true_error"_a.noconvert(), "lens"_a.noconvert(),
-           "body_from_cam"_a.noconvert(), "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
+           "accel_bias"_a.noconvert(), "nav_covariance"_a.noconvert(), "nav_true_error"_a.noconvert(), "lenses"_a.noconvert(),
+           "body_from_cams"_a.noconvert(), "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
       .def("predict_inertial", in_turn(&predict_inertial), "stamps_ns"_a.noconvert(), "gyro_radps"_a.noconvert(),
            "accel_mps2"_a.noconvert(), "start_ns"_a, "end_ns"_a, "noise"_a, "true_noise"_a)
       .def("predict_random_walk", in_turn(&predict_random_walk), "body_from_next"_a.noconvert(), "rotation_sigma_rad"_a,
@@ -213,12 +217,16 @@ void bind_filter(nb::module_& module) {
              newest(filter);
              return transform({kIdentity, -unlocked([&] { return filter.begin_frame_anew(); })});
            }))
-      .def("observe", in_turn(+[](SharedFilter& filter, int64_t frame_index, const Indices& ids, const Rows3& pixels) {
+      .def("observe", in_turn(+[](SharedFilter& filter, int64_t frame_index, int64_t camera, const Indices& ids, const Rows3& pixels) {
+             const size_t cameras = filter.cameras().size();
+             if (size_t(camera) >= cameras)
+               throw nb::value_error(
+                   ("camera: " + std::to_string(camera) + ", but the rig has " + std::to_string(cameras) + ", counted from 0").c_str());
              if (ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
              const CountedStep counted;
-             filter.observe(frame_index, ids.data(), pixels.data(), ids.shape(0));
+             filter.observe(frame_index, size_t(camera), ids.data(), pixels.data(), ids.shape(0));
            }),
-           "frame_index"_a, "ids"_a.noconvert(), "pixels"_a.noconvert())
+           "frame_index"_a, "camera"_a, "ids"_a.noconvert(), "pixels"_a.noconvert())
       .def("update", in_turn(&update), "alive"_a.noconvert(), "due"_a.noconvert(), "first_depth_m"_a, "iterations"_a = 1,
            "newest_odom_from_body"_a.noconvert() = nb::none(), "sigma_scale"_a = 1.0)
       .def("correct_by_wheels", in_turn(&correct_by_wheels), "velocity_base_mps"_a.noconvert(), "yaw_rate_radps"_a, "sigma_mps"_a,
@@ -260,7 +268,7 @@ void bind_filter(nb::module_& module) {
              "cov_step"_a.noconvert());
   module.def("share_that_passes", &share_that_passes, "limit"_a, "mean_square"_a);
   module.def("linearise_track", &linearise_track_of, "point"_a.noconvert(), "odom_from_cam"_a.noconvert(), "views"_a.noconvert(),
-             "pixels"_a.noconvert(), "lens"_a.noconvert(), "pixel_weight"_a, "disparity_weight"_a);
+             "pixels"_a.noconvert(), "lenses"_a.noconvert(), "pixel_weight"_a, "disparity_weight"_a);
   module.def("triangulate", &triangulate_of, "odom_from_cam"_a.noconvert(), "views"_a.noconvert(), "pixels"_a.noconvert(),
-             "lens"_a.noconvert(), "pixel_weight"_a, "disparity_weight"_a, "start"_a.noconvert());
+             "lenses"_a.noconvert(), "pixel_weight"_a, "disparity_weight"_a, "start"_a.noconvert());
 }

@@ -16,6 +16,9 @@ from support.worlds.inertial_motion import analytic_motion, sample_motion
 
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.05, 0.03, 0.02]))
+SECOND = StereoCamera(260.0, 300.0, 250.0, 0.08, 640, 480)  # of another lens, that looks aside
+BODY_FROM_SECOND = se3(so3_exp(np.array([0.1, 0.05, 0.7])) @ BODY_FROM_CAM[:3, :3], np.array([0.02, 0.2, -0.1]))
+CAMERAS = [(CAMERA, BODY_FROM_CAM), (SECOND, BODY_FROM_SECOND)]
 NOISE = ImuNoise(2e-3, 1e-4, 2e-2, 1e-3)
 # white noise of the size that measurements are weighed by, and nothing else
 SETTINGS = FilterSettings(
@@ -85,10 +88,11 @@ def noisy_imu(
     )
 
 
-def observe(points_map: Array, time_s: float, rng: np.random.Generator | None) -> Array:
-    """(N, 3) u_left v u_right with the filter's noise (none without a generator); NaN where not in view."""
-    cam_from_map = se3_inverse(analytic_motion(time_s).map_from_body @ BODY_FROM_CAM)
-    pixels = CAMERA.pixel_from_point(transform_points(cam_from_map, points_map))
+def observe(points_map: Array, time_s: float, rng: np.random.Generator | None, number: int = 0) -> Array:
+    """(N, 3) u_left v u_right with the filter's noise (none without a generator) in a camera; NaN where not in view."""
+    camera, body_from_cam = CAMERAS[number]
+    cam_from_map = se3_inverse(analytic_motion(time_s).map_from_body @ body_from_cam)
+    pixels = camera.pixel_from_point(transform_points(cam_from_map, points_map))
     disparity = pixels[:, 0] - pixels[:, 2]
     if rng is not None:
         pixels[:, :2] += SETTINGS.pixel_sigma_px * rng.normal(size=(len(pixels), 2))
@@ -107,7 +111,7 @@ def use(
     """Updates by what frames (index -> pixels (N, 3)) saw of the chosen points; those in view of two or more."""
     for frame, pixels in seen.items():
         visible = chosen[np.isfinite(pixels[chosen, 0])]
-        estimate.observe(frame, visible, pixels[visible])
+        estimate.observe(frame, 0, visible, pixels[visible])
     return estimate.update(np.zeros(0, np.int64), np.zeros(0, bool), first_depth_m, iterations, newest)
 
 
@@ -134,7 +138,7 @@ def run_filter(
     begin_s = 0.05  # so that no picture is stamped before the state begins
     truth = true_state(begin_s, gyro_bias, accel_bias)
     start = perturbed(truth, so3_exp(start_error[:3]), start_error)
-    estimate = InvariantFilter(start, nav_covariance, settings, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(start, nav_covariance, settings, CAMERAS)
     points = room(rng)
     seen: dict[int, Array] = {}
     state_ns, accepted, offered = round(begin_s * 1e9), 0, 0

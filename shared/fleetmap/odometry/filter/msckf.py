@@ -1,5 +1,6 @@
 """The right-invariant multi-state constraint filter, `core.Filter`, with the settings and records of Python."""
 
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -27,15 +28,21 @@ class InvariantFilter(core.Filter):
         state: NavState,
         nav_covariance: Array,
         settings: FilterSettings,
-        camera: StereoCamera,
-        body_from_cam: Array,
+        cameras: Sequence[tuple[StereoCamera, Array]],
         true_error_cov: Array | None = None,
     ) -> None:
-        """nav_covariance (15, 15) in the filter's error; true_error_cov: that of the true error, where it differs."""
+        """nav_covariance (15, 15) in the filter's error; true_error_cov: that of the true error, where it differs.
+
+        cameras: each with its body_from_cam (4, 4).
+        """
         true_error_cov = nav_covariance if true_error_cov is None else true_error_cov
         quantile = NormalDist().inv_cdf(settings.chi_square_share)
-        model = camera.lens, np.ascontiguousarray(body_from_cam), settings, quantile, GRAVITY_MPS2
-        super().__init__(*state.copy().arrays, nav_covariance, true_error_cov, *model)
+        rig = (
+            np.array([camera.lens for camera, _ in cameras]),
+            np.array([body_from_cam for _, body_from_cam in cameras]),
+        )
+        covariances = nav_covariance, true_error_cov
+        super().__init__(*state.copy().arrays, *covariances, *rig, settings, quantile, GRAVITY_MPS2)
 
     @property
     def state(self) -> NavState:

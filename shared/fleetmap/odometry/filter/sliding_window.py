@@ -16,6 +16,7 @@ from fleetmap.sensors.rectification import StereoCamera
 
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
+_CAMERA = 0  # the only one of a rig yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ class SlidingWindow:
         if rig.imu is not None:  # the mean of a steady gyro is far better than what it is weighed by
             true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
             true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
-        self.filter = InvariantFilter(state, covariance, settings, rig.camera, rig.body_from_cam, true_error_cov)
+        self.filter = InvariantFilter(state, covariance, settings, [(rig.camera, rig.body_from_cam)], true_error_cov)
         self._stamps_ns: dict[int, int] = {}
         # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
         self._merged: dict[int, tuple[int, Array]] = {}
@@ -117,7 +118,7 @@ class SlidingWindow:
     def seed(self, frame_index: int, tracked: Tracked) -> None:
         """Begins an empty window with one frame; the tracks go on from it alone."""
         self._add_clone(frame_index)
-        self.filter.observe(frame_index, tracked.ids, tracked.pixels)
+        self.filter.observe(frame_index, _CAMERA, tracked.ids, tracked.pixels)
 
     def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
         """Adds a frame at the state and uses tracks that ended, that are due in their turn, or (after a gap) all.
@@ -152,8 +153,8 @@ class SlidingWindow:
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
         for earlier in tracked.earlier:
-            self.filter.observe(earlier.frame_index, earlier.ids, earlier.pixels)
-        self.filter.observe(frame_index, tracked.ids, tracked.pixels)
+            self.filter.observe(earlier.frame_index, _CAMERA, earlier.ids, earlier.pixels)
+        self.filter.observe(frame_index, _CAMERA, tracked.ids, tracked.pixels)
         self.scene_depth_m = self._depth_of(tracked.pixels)
 
     def _depth_of(self, pixels: Array) -> float:

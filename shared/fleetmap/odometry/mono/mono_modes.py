@@ -50,6 +50,7 @@ class MonocularWindow(SlidingWindow):
         camera, settings = self.rig.camera, self.rig.settings
         lens = camera.lens
         odom_from_cam = np.array([self.filter.odom_from_clone(c) for c in held]) @ self.rig.body_from_cam
+        lenses = np.tile(lens, (len(held), 1))
         rotations, positions = odom_from_cam[:, :3, :3], odom_from_cam[:, :3, 3]
         max_cosine = np.cos(np.radians(settings.monocular.point_angle_deg))
         for n, track_id in enumerate(ids.tolist()):
@@ -63,7 +64,7 @@ class MonocularWindow(SlidingWindow):
                 continue
             point = positions[views[-1]] + self.scene_depth_m * rotations[views[-1]] @ rays[1]
             out[n] = core.triangulate(
-                odom_from_cam, views, pixels, lens, 1.0 / settings.filter.pixel_sigma_px, 1.0, point
+                odom_from_cam, views, pixels, lenses, 1.0 / settings.filter.pixel_sigma_px, 1.0, point
             )
         points = transform_points(se3_inverse(odom_from_cam[-1]), out)
         with np.errstate(invalid="ignore"):

@@ -11,7 +11,7 @@ from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, sample_motion
-from support.worlds.point_world import BODY_FROM_CAM, CAMERA, NOISE, SETTINGS, error_of, perturbed, true_state
+from support.worlds.point_world import BODY_FROM_CAM, CAMERA, CAMERAS, NOISE, SETTINGS, error_of, perturbed, true_state
 
 WEIGHTS = 1 / 0.6, 1 / 0.35
 EXACT = ImuNoise(0.0, 0.0, 0.0, 0.0)
@@ -20,7 +20,7 @@ SPAN = 3_000_000, 503_000_000
 
 def moved(state: NavState, covariance: Array, imu: ImuSamples, noise: ImuNoise) -> InvariantFilter:
     """A filter after half a second."""
-    estimate = InvariantFilter(state, covariance, SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, covariance, SETTINGS, CAMERAS)
     estimate.propagate(imu, *SPAN, noise)
     return estimate
 
@@ -66,14 +66,15 @@ def test_track_jacobians_are_numeric_derivatives(with_mono: bool) -> None:
     times_s = np.array([0.0, 0.2, 0.5])
     bodies = np.array([analytic_motion(t).map_from_body for t in times_s])
     point = bodies[1, :3, 3] + bodies[1, :3, :3] @ np.array([3.0, 0.4, -0.3])
-    clones = np.array([2, 0, 1])
+    clones, views = np.array([2, 0, 1]), np.array([4, 1, 3])  # by the first camera, and twice by the second
+    lenses = np.tile([camera.lens for camera, _ in CAMERAS], (3, 1))
 
     def residuals(odom_from_bodies: Array, at: Array) -> tuple[Array, Array, Array]:
-        cams = odom_from_bodies @ BODY_FROM_CAM
+        cams = (odom_from_bodies[:, None] @ np.array([body_from_cam for _, body_from_cam in CAMERAS])).reshape(-1, 4, 4)
         pixels = np.tile([300.0, 200.0, 280.0], (3, 1))
         if with_mono:
             pixels[1, 2] = np.nan
-        rows = core.linearise_track(at, cams, clones, pixels, CAMERA.lens, *WEIGHTS)
+        rows = core.linearise_track(at, cams, views, pixels, lenses, *WEIGHTS)
         assert len(rows) == (8 if with_mono else 9)
         return rows[:, -1], rows[:, 3:21], rows[:, :3]
 
@@ -99,7 +100,7 @@ def test_error_sources_are_what_they_do_to_pixels() -> None:
     exact = np.array([[300.0, 200.0, 280.0], [310.0, 204.0, np.nan], [330.0, 190.0, 306.0]])
     cams, point = np.tile(np.eye(4), (3, 1, 1)), np.array([0.1, 0.2, 1.5])
     cams[:, 2, 3] = 0.0, 0.1, 0.2
-    rows = core.linearise_track(point, cams, np.arange(3), exact, CAMERA.lens, *WEIGHTS)
+    rows = core.linearise_track(point, cams, np.arange(3), exact, np.tile(CAMERA.lens, (3, 1)), *WEIGHTS)
     errors, expected = np.array([0.3, 0.02, 0.05, -0.03, -0.4]), []
     for pixel, disparity in zip(exact, CAMERA.lens[3] / (point[2] - cams[:, 2, 3]), strict=True):
         way = pixel[:2] - exact[0, :2]
@@ -120,7 +121,7 @@ def test_triangulation_finds_the_point_from_a_poor_start() -> None:
         if mono:
             given[:, 2] = np.nan
         found = cams[0, :3, 3] + cams[0, :3, :3] @ np.array([0.25, -0.15, 2.5])
-        found = core.triangulate(cams, np.arange(3), given, CAMERA.lens, *WEIGHTS, found)
+        found = core.triangulate(cams, np.arange(3), given, np.tile(CAMERA.lens, (3, 1)), *WEIGHTS, found)
         np.testing.assert_allclose(found, target, atol=1e-3)
 
 

@@ -14,8 +14,7 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from support.worlds.inertial_motion import analytic_motion, sample_motion
 from support.worlds.point_world import (
-    BODY_FROM_CAM,
-    CAMERA,
+    CAMERAS,
     NOISE,
     SETTINGS,
     error_of,
@@ -38,7 +37,7 @@ def clones_at(
     last_body_from_guess (4, 4) is how far off the last clone is predicted.
     """
     state = true_state(times_s[0])
-    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERAS)
     seen = {}
     for k, time_s in enumerate(times_s):
         if k:
@@ -129,7 +128,7 @@ def test_wrong_matches_are_refused() -> None:
     rng = np.random.default_rng(9)
     points = room(rng)
     state = true_state(0.0)
-    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERAS)
     seen = {}
     for k, time_s in enumerate([0.0, 0.15, 0.3]):
         if k:
@@ -154,6 +153,29 @@ def test_a_point_is_looked_for_by_its_disparity_or_at_the_first_depth() -> None:
         for pixels in seen.values():
             pixels[:, columns:] = np.nan
         assert (use(estimate, seen, np.arange(400), first_depth_m=depth_m) == 1).any() == is_found
+
+
+def test_two_cameras_know_the_motion_better_and_as_well_as_they_say() -> None:
+    """Of other lenses and directions; what one sees after the other, or both at once, is one track. Normalised error squared per dof."""
+    points, squares, times_s = room(np.random.default_rng(3)), [], [0.0, 0.15, 0.3]
+    earlier_from_now = se3_inverse(true_state(times_s[0]).odom_from_body) @ true_state(times_s[2]).odom_from_body
+    for seed in range(20):
+        covariances = []
+        for cameras in (1, 2):
+            rng = np.random.default_rng(seed)
+            estimate, seen = clones_at(times_s, points, rng)
+            for frame, time_s in enumerate(times_s[: 3 * (cameras - 1)]):
+                pixels = observe(points, time_s, rng, number=1)
+                visible = np.flatnonzero(np.isfinite(pixels[:, 0]))
+                estimate.observe(frame, 1, visible, pixels[visible])
+            used = use(estimate, seen, np.arange(len(points)), iterations=4)
+            assert (used == 1).mean() > 0.98
+            found, covariance = estimate.motion_since(0)
+            covariances.append(covariance)
+        error = se3_log(earlier_from_now @ se3_inverse(found))
+        squares.append(error @ np.linalg.solve(covariance, error) / 6)
+        assert np.linalg.eigvalsh(covariances[0] - covariances[1]).min() > 0.0
+    assert 0.7 < np.mean(squares) < 1.4
 
 
 def test_relative_motion_is_the_composition_and_its_covariance_the_scatter() -> None:
@@ -202,7 +224,7 @@ def test_displacement_noise_is_relative_to_the_body() -> None:
     rng = np.random.default_rng(12)
     state = true_state(1.0)
     step = se3_exp(np.array([0.1, 0.0, 0.2, 0.3, 0.1, 0.0]))
-    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERAS)
     start = estimate.state.odom_from_body
     estimate.predict_random_walk(step, 0.01, 0.02)
     errors = []
@@ -230,7 +252,7 @@ def test_vision_that_contradicts_widens_and_vision_that_agrees_does_not() -> Non
 
 
 def test_propagation_without_samples_stays_put() -> None:
-    estimate = InvariantFilter(true_state(0.0), np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(true_state(0.0), np.eye(15), SETTINGS, CAMERAS)
     before = estimate.state.odom_from_body
     assert (estimate.propagate(ImuSamples.empty(), 0, 100, NOISE) == 0).all()
     np.testing.assert_array_equal(estimate.state.odom_from_body, before)
@@ -239,7 +261,7 @@ def test_propagation_without_samples_stays_put() -> None:
 def test_a_clone_follows_the_time_offset_as_the_motion_does() -> None:
     """Its covariance with the offset, against the invariant error between the motion a little later and now."""
     state, motion, step_s = true_state(1.3), analytic_motion(1.3), 1e-6
-    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, np.zeros((15, 15)), SETTINGS, CAMERAS)
     estimate.add_clone(0, motion.gyro_radps)
     by_offset = estimate.covariance[16:22, 15] / SETTINGS.time_offset_sigma_s**2
     numeric = (error_of(state, true_state(1.3 + step_s)) - error_of(state, true_state(1.3 - step_s))) / (2 * step_s)
@@ -257,7 +279,7 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     settings = replace(SETTINGS, wheel_slip_mps=1e-4, wheel_sigma_scale=1.0, wheel_speed_scale_sigma=0.0)
     error = np.concatenate([np.zeros(3), 0.02 * np.array([1.0, -2.0, 1.5]), np.zeros(9)])
     covariance = np.diag(np.repeat([1e-9, 0.05, 1e-9, 1e-9, 1e-9], 3) ** 2)
-    estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(perturbed(truth, np.eye(3), error), covariance, settings, CAMERAS)
     assert estimate.correct_by_wheel_sample(sample, motion.gyro_radps, base_from_body, 100.0) < 100.0
     np.testing.assert_allclose(estimate.state.velocity_mps, truth.velocity_mps, atol=1e-4)
     slipped = WheelSample(0, 1.6 * sample.velocity_base_mps, sample.yaw_rate_radps, 1e-4, 1e-4)
@@ -265,7 +287,7 @@ def test_wheels_and_standing_measure_what_they_say() -> None:
     assert estimate.correct_by_wheel_sample(slipped, motion.gyro_radps, base_from_body, 100.0) > 100.0
     np.testing.assert_array_equal(estimate.covariance, before)
     standing = NavState(velocity_mps=np.array([0.02, -0.01, 0.03]))
-    estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(standing, np.diag(START_SIGMAS**2), SETTINGS, CAMERAS)
     assert estimate.correct_by_rest(np.array([0.004, 0.0, -0.003]), 1e-5, 22.0) < 22.0
     assert np.linalg.norm(estimate.state.velocity_mps) < 1e-3
     np.testing.assert_allclose(estimate.state.gyro_bias_radps, [0.004, 0.0, -0.003], atol=1e-5)
@@ -275,7 +297,7 @@ def some_filter(rng: np.random.Generator, settings: FilterSettings = SETTINGS) -
     """With covariances that have no zeros, and three clones of which one is gone."""
     roots = START_SIGMAS[:, None] * rng.normal(size=(2, 15, 15))
     covariance, true_error_cov = (np.asarray(root @ root.T) for root in roots)
-    estimate = InvariantFilter(true_state(0.5), covariance, settings, CAMERA, BODY_FROM_CAM, true_error_cov)
+    estimate = InvariantFilter(true_state(0.5), covariance, settings, CAMERAS, true_error_cov)
     imu = sample_motion(rate_hz=100.0, duration_s=2.0)
     for k in range(4):
         rate = estimate.propagate(imu, 500_000_000 + k * 10**8, 600_000_000 + k * 10**8, NOISE)
@@ -418,7 +440,7 @@ def test_gaps_and_distance_leave_a_covariance(away_m: float, unseen_steps: int) 
     points, rng = room(np.random.default_rng(3)), np.random.default_rng(4)
     state = true_state(0.0)
     state.velocity_mps, state.position_m = np.zeros(3), state.position_m + np.array([0.8, 0.6, 0.0]) * away_m
-    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM)
+    estimate = InvariantFilter(state, 1e-12 * np.eye(15), SETTINGS, CAMERAS)
     for pair in range(4):
         for k in (2 * pair, 2 * pair + 1):
             estimate.predict_random_walk(np.eye(4), 0.3, 1.5)

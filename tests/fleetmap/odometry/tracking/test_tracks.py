@@ -8,13 +8,13 @@ from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.sensors.samples import ImuSamples
-from support.worlds.point_world import BODY_FROM_CAM, CAMERA, SETTINGS, observe, room
+from support.worlds.point_world import CAMERAS, SETTINGS, observe, room
 
 
 def test_a_filter_keeps_observations_as_lists_would() -> None:
     """Against a filter that is shown only what serves at once."""
     rng = np.random.default_rng(1)
-    kept, shown = (InvariantFilter(NavState(), 1e-12 * np.eye(15), SETTINGS, CAMERA, BODY_FROM_CAM) for _ in range(2))
+    kept, shown = (InvariantFilter(NavState(), 1e-12 * np.eye(15), SETTINGS, CAMERAS) for _ in range(2))
     points, lists = room(rng), dict[int, list[tuple[int, Array]]]()
     counts, visible = np.zeros(3), np.flatnonzero(np.isfinite(observe(points, 0.0, None)[:, 0]))
     for frame in range(30):
@@ -26,7 +26,7 @@ def test_a_filter_keeps_observations_as_lists_would() -> None:
             estimate.add_clone(frame, np.zeros(3))
             if frame > 5:
                 estimate.remove_clone(frame - 6)
-        kept.observe(frame, ids, pixels)
+        kept.observe(frame, 0, ids, pixels)
         for number, pixel in zip(ids.tolist(), pixels, strict=True):
             lists.setdefault(number, []).append((frame, pixel))
         due = (frame + ids) % 4 == 0
@@ -34,7 +34,7 @@ def test_a_filter_keeps_observations_as_lists_would() -> None:
             seen = [(clone, pixel) for clone, pixel in lists[number] if clone > frame - 6]
             serves = len(seen) >= 2 and (number not in ids or number in ids[due])
             for clone, pixel in seen if serves else []:
-                shown.observe(clone, np.array([number]), pixel[None])
+                shown.observe(clone, 0, np.array([number]), pixel[None])
             if number not in ids or serves:
                 del lists[number]
         used = kept.update(ids, due, 20.0)
