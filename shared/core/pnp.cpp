@@ -14,6 +14,8 @@ constexpr double kUnseen = 1e12;   // the squared residual of what lies nearer, 
 constexpr int kTrials = 5;         // of larger and larger damping in an iteration
 constexpr double kEnough = 1e-6;   // share of the cost by which an iteration must lower it to be followed by another
 constexpr size_t kLeastInliers = 4;
+// A pivot of the information below this share of its diagonal is rounding: that motion is not seen, as of two points or three in a line.
+constexpr double kUnseenShare = 1e-9;
 
 // Robust cost, and the normal equations of a step.
 struct Normal {
@@ -104,7 +106,10 @@ bool refine(const Sightings& seen, const StereoLens& lens, double width, const d
   double information[36];
   for (int a = 0; a < 6; ++a)
     for (int b = 0; b < 6; ++b) information[6 * a + b] = normal.hessian[a][b] + prior[6 * a + b];
-  return cholesky_in_place(information, 6, 6);
+  if (!cholesky_in_place(information, 6, 6)) return false;
+  for (int a = 0; a < 6; ++a)
+    if (information[7 * a] * information[7 * a] < kUnseenShare * (normal.hessian[a][a] + prior[7 * a])) return false;
+  return true;
 }
 
 }  // namespace

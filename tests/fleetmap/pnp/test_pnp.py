@@ -135,6 +135,19 @@ def test_points_in_a_line_propose_nothing() -> None:
     assert ransac_pnp(matches, threshold_px=2.0, min_inliers=0, seed=1) is None
 
 
+@pytest.mark.parametrize("line", [[[0.4, 0.1, 3.0]] * 2, [[0.0, 0.0, 3.0], [0.1, 0.1, 3.1], [0.3, 0.3, 3.3]]])
+def test_points_about_which_the_camera_may_turn_are_no_pose(line: list[list[float]]) -> None:
+    """Two points or three in a line, with depth: a turn about them is not seen. A point beside them decides it."""
+    points = np.array([*line, [-0.3, 0.2, 2.5]])
+    points[1] += [0.1, 0.0, 0.0] if len(line) == 2 else 0.0
+    matches = Correspondences(CAMERA, points, CAMERA.pixel_from_point(points), np.tile(SIGMAS_PX, (len(points), 1)))
+    start = se3_exp(np.full(6, 0.01))
+    assert refine_pnp(matches.take(np.arange(len(line))), start) is None
+    found = refine_pnp(matches, start)
+    assert found is not None
+    np.testing.assert_allclose(found.cam_from_source, np.eye(4), atol=1e-6)
+
+
 @pytest.mark.parametrize("wrong", [0.0, 0.5, 0.75])
 def test_the_camera_is_found_among_wrong_matches(wrong: float) -> None:
     rng = np.random.default_rng(3)
