@@ -41,6 +41,13 @@ def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
     return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
 
 
+def bounded_turn(covariance: Array) -> Array:
+    """A covariance (6, 6) whose turns are not said to be less certain than any turn is: each sigma is at most pi. It stays one."""
+    scale = np.ones(6)
+    scale[:3] = np.pi / np.maximum(np.sqrt(np.diag(covariance)[:3]), np.pi)
+    return scale[:, None] * covariance * scale
+
+
 def compose_cov(map_from_body: Array, covariance: Array, body_from_next: Array, cov_step: Array) -> tuple[Array, Array]:
     """map_from_next and its covariance. cov_step: of the step, a left perturbation in the body's axes about the body."""
     a, b, c, d = map(np.ascontiguousarray, (map_from_body, covariance, body_from_next, cov_step))

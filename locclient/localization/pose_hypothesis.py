@@ -9,7 +9,7 @@ import numpy as np
 from fleetmap.geometry import Array, length
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
-from locclient.localization.pose_covariance import compose_cov, compose_end_cov
+from locclient.localization.pose_covariance import bounded_turn, compose_cov, compose_end_cov
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
@@ -137,7 +137,7 @@ class PoseHypothesis:
             self.now_map_from_body, self.now_cov = now
         if motion is None or motion.is_last:
             self.frame_index = odometry.frame_index
-            self.map_from_body, self.cov_rot_trans = self.now_map_from_body, self.now_cov
+            self.map_from_body, self.cov_rot_trans = self.now_map_from_body, bounded_turn(self.now_cov)
 
 
 def _step_cov(sigmas: tuple[float, float, float], distance_m: float) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.core import longest_gap_ns
-from fleetmap.geometry import Array, interpolate_se3, rotation_angle_rad, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, length, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
@@ -26,6 +26,9 @@ _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of f
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _FOLLOWED_SHARE = 0.5  # of the tracks
 _NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
+_STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # how far a step by images may lie from the predicted one
+_MAX_ELSEWHERE = 2  # frames in a row whose descriptor matches contradict the IMU, before these are believed
+_EXTRAPOLATED_NS = 1_000_000_000  # for which a robot that sees nothing goes on at its last speed
 
 
 class ImuInputs:
@@ -59,13 +62,14 @@ class ImuInputs:
 class Step(NamedTuple):
     """What a mode made of one frame: the mode from now on, what its update used (see `InvariantFilter.update`).
 
-    The last two are as in OdometryEstimate.
+    new_odom_from_old_odom and revised are as in OdometryEstimate. is_lost: nothing that was tracked is believed.
     """
 
     mode: "Mode"
     used: NDArray[np.int8]
     new_odom_from_old_odom: Array | None = None
     revised: tuple[tuple[int, Array], ...] = ()
+    is_lost: bool = False
 
 
 class Mode(ABC):
@@ -142,7 +146,7 @@ class WindowMode(Mode):
         window_filter, used = self.window.filter, step.used
         state = window_filter.state
         status = OdometryStatus.INITIALISING if self.waits_for_gravity else OdometryStatus.TRACKING
-        if frame_index > 0 and (tracked.lost or self.window.contradicts_images):
+        if frame_index > 0 and (tracked.lost or step.is_lost or self.window.contradicts_images):
             status = OdometryStatus.DEGRADED
         offset_s = self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0
         return OdometryEstimate(
@@ -175,12 +179,15 @@ class VisualMode(WindowMode):
         """cam_from_previous (4, 4): the last motion where one is known."""
         super().__init__(window)
         self._cam_from_previous = np.eye(4) if cam_from_previous is None else cam_from_previous
-        self._was_lost = False
+        self._seen_ns = window.stamp_ns  # of the last frame whose motion images showed
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; where the state will be is known only when the frame was tracked."""
-        if stamp_ns - self.stamp_ns > PAUSE_NS:
-            self._cam_from_previous = np.eye(4)  # a robot that was off did not go on at its last speed
+        is_dark = self.stamp_ns - self._seen_ns > _EXTRAPOLATED_NS
+        if is_dark or stamp_ns - self.stamp_ns > PAUSE_NS:
+            self._cam_from_previous = np.eye(
+                4
+            )  # a robot that was off, or long in the dark, did not go on at its last speed
         self.window.stamp_ns, self.window.rate_body_radps = stamp_ns, np.zeros(3)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
@@ -191,9 +198,10 @@ class VisualMode(WindowMode):
         """See Mode. `odom` begins anew where the images no longer show the motion: what that may be is said about this place."""
         change = None
         if self.window.filter.clone_ids:
-            if tracked.lost and not self._was_lost:
+            if tracked.lost:
                 change = self.window.filter.begin_frame_anew()
-            self._was_lost = tracked.lost
+            else:
+                self._seen_ns = self.stamp_ns
             self._predict_random_walk(tracked)
             if (
                 tracked.lost
@@ -249,11 +257,11 @@ class GyroMode(VisualMode):
         self._turned = (
             None if is_pause else self._imu.samples.rotation_between(self.stamp_ns, stamp_ns, self._imu.noise)
         )
+        super().predict(stamp_ns)
         if self._turned is not None:
             body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
             body_from_next[:3, :3] = self._turned
             self._cam_from_previous = self._rig.cam_from_body @ se3_inverse(body_from_next) @ self._rig.body_from_cam
-        super().predict(stamp_ns)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; a gyro that contradicts the images is given up."""
@@ -375,6 +383,7 @@ class InertialMode(WindowMode):
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
         self._seen: Array | None = None  # the last motion that images showed
+        self._elsewhere_frames = 0  # in a row, whose descriptor matches contradicted the prediction
         self._is_pause = False
 
     @classmethod
@@ -407,6 +416,7 @@ class InertialMode(WindowMode):
         window, monitor = self.window, self._imu.monitor
         if self._is_pause:
             return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
+        tracked = self._without_lookalikes(tracked)
         self._seen = seen = tracked.cam_from_previous
         if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
@@ -416,14 +426,48 @@ class InertialMode(WindowMode):
         matched = window.matched_body(tracked)
         if matched is not None:
             window.filter.inflate(matched[0], matched[1], window.seconds_since(matched[0]))
+        elif window.contradicts_images and seen is not None:
+            window.filter.inflate_velocity(self._off_mps(frame_index - 1, seen))  # it is locked in a wrong speed
         self._update_zero_velocity(tracked)
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
         if wheel is not None:
             window.filter.correct_by_wheel_sample(*wheel, self._rig.base_from_body, _GATE_4)
         used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
-        if monitor.is_wrong_start(window.filter.imu_minus_cam_s, self.cam_from_earlier(frame_index - 1), seen):
+        off_mps = 0.0 if seen is None else self._off_mps(frame_index - 1, seen)
+        if monitor.is_wrong_start(window.filter.imu_minus_cam_s, off_mps):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
-        return Step(self, used)
+        return Step(self, used, is_lost=tracked.lost)
+
+    def _off_mps(self, frame_index: int, seen: Array) -> float:
+        """The speed by which cam_from_earlier (4, 4), by images since a frame, differs from the state's; 0 for what its covariance admits.
+
+        Source: Bar-Shalom et al. 2001, section 5.4 (test of the innovation).
+        """
+        predicted = self.cam_from_earlier(frame_index)
+        if predicted is None:
+            return 0.0
+        off_m, duration_s = length(seen[:3, 3] - predicted[:3, 3]), self.window.seconds_since(frame_index)
+        sigma_mps = float(np.sqrt(np.trace(self.window.filter.covariance[3:6, 3:6])))
+        admitted_m = _STEP_SIGMAS * sigma_mps * duration_s + 0.5 * _ACCEL_OFF_MPS2 * duration_s**2
+        return off_m / max(duration_s, 1e-3) if off_m > max(_STEP_M, admitted_m) else 0.0
+
+    def _without_lookalikes(self, tracked: Tracked) -> Tracked:
+        """What was tracked, without descriptor matches after a gap that lead where the IMU cannot have moved the body.
+
+        Bays of a rack look alike, and matches may agree on the next one. They are believed once that repeats itself: the IMU is wrong then.
+        """
+        if not tracked.earlier:
+            return tracked
+        possible = tuple(e for e in tracked.earlier if not self._off_mps(e.frame_index, e.cam_from_earlier))
+        self._elsewhere_frames = 0 if possible else self._elsewhere_frames + 1
+        if self._elsewhere_frames > _MAX_ELSEWHERE:
+            return tracked
+        motion = (
+            tracked.cam_from_previous
+            if any(e.cam_from_earlier is tracked.cam_from_previous for e in possible)
+            else None
+        )
+        return replace(tracked, earlier=possible, cam_from_previous=motion)
 
     def _bridge_gap(self, end_ns: int) -> None:
         """Without samples: as all points of the last two frames moved, as uncertain as without an IMU.

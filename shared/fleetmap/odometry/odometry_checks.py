@@ -4,12 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, length, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is given up
 MAX_OFFSET_SIGMAS = 3.0  # a larger time offset cannot be one
-_DIVERGED_M, _MAX_DIVERGED_FRAMES = 0.5, 3  # from the motion of one step by images, for so many frames in a row
+_DIVERGED_MPS, _MAX_DIVERGED_FRAMES = 5.0, 3  # from the speed that images show, for so many frames in a row
 
 
 class DivergenceMonitor:
@@ -32,18 +32,15 @@ class DivergenceMonitor:
         self._disagreements = max(self._disagreements + (1 if is_off else -1), 0)
         return self._disagreements >= _MAX_DISAGREEMENTS
 
-    def is_wrong_start(self, offset_s: float, predicted: Array | None, seen: Array | None) -> bool:
-        """Whether the filter must be initialized again, this frame included.
+    def is_wrong_start(self, offset_s: float, off_mps: float) -> bool:
+        """Whether the filter must be initialized again, this frame included; off_mps: what its speed differs by from that of the images.
 
         A static initialization under constant acceleration is tilted by degrees. The filter then estimates an impossible
-        time offset, or its motion differs from that of the images frame after frame.
+        time offset, or its speed differs from that of the images frame after frame.
         """
         if abs(offset_s) > self._max_offset_s:
             return True
-        if predicted is None or seen is None:
-            return False
-        off_m = length((predicted @ se3_inverse(seen))[:3, 3])
-        self._diverged_frames = 0 if off_m < _DIVERGED_M else self._diverged_frames + 1
+        self._diverged_frames = 0 if off_mps < _DIVERGED_MPS else self._diverged_frames + 1
         return self._diverged_frames >= _MAX_DIVERGED_FRAMES
 
     def begin_again(self) -> None:

@@ -170,12 +170,12 @@ def test_an_imu_is_given_up_when_it_contradicts_more_often_than_it_agrees() -> N
 
 def test_a_start_is_wrong_where_it_strays_three_times_in_a_row_or_the_clocks_are_impossible() -> None:
     doubts = DivergenceMonitor(0.02)
-    strays = [doubts.is_wrong_start(0.0, STILL, stepped(m)) for m in (0.7, 0.7, 0.1, 0.7, 0.7, 0.7)]
+    strays = [doubts.is_wrong_start(0.0, off_mps) for off_mps in (7.0, 7.0, 1.0, 7.0, 7.0, 7.0)]
     assert strays == [False] * 5 + [True]
     doubts.begin_again()
-    assert not doubts.is_wrong_start(0.0, STILL, stepped(0.7))
-    assert not doubts.is_wrong_start(0.059, STILL, None)
-    assert doubts.is_wrong_start(-0.061, STILL, STILL)
+    assert not doubts.is_wrong_start(0.0, 7.0)
+    assert not doubts.is_wrong_start(0.059, 0.0)
+    assert doubts.is_wrong_start(-0.061, 0.0)
 
 
 def test_pictures_stand_still_only_after_a_whole_window_of_it() -> None:

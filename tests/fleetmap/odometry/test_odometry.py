@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3_inverse, se3_log, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, se3_log, so3_exp, transform_points
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, is_away, modes
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
@@ -16,14 +16,16 @@ from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.odometry.settings import FilterSettings, TrackerSettings
-from fleetmap.odometry.tracking.tracker import Tracked, Tracker
+from fleetmap.odometry.tracking.tracker import Earlier, Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
+from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
+from locclient.localization.settings import TrackSettings
 from mapserver.survey.odometry_pass import continued_covariances
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame, view
 
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 FRAME_NS = 50_000_000
@@ -194,6 +196,87 @@ def test_a_filter_that_refuses_every_track_is_not_trusted(imu: ImuNoise | None) 
     _, estimates = run((stereo_frame(k * FRAME_NS) for k in range(1, 41)), imu, FilterSettings(chi_square_share=1e-300))
     assert [e.inertial for e in estimates[-3:]] == [imu is not None] * 3
     assert [e.status for e in estimates[-3:]] == [OdometryStatus.DEGRADED] * 3
+
+
+def test_a_filter_that_is_locked_in_a_wrong_speed_says_so_and_opens_it() -> None:
+    """Carried with its IMU at rest, as it were: the pictures jump, and then move by 2 m/s otherwise than the IMU says."""
+    jump_m, off_mps, at = 0.8, 2.0, 40
+
+    def frame(k: int) -> RectifiedFrame:
+        map_from_body = analytic_motion(k * FRAME_NS * 1e-9).map_from_body.copy()
+        map_from_body[:2, 3] += [jump_m, off_mps * (k - at) * FRAME_NS * 1e-9] if k >= at else [0.0, 0.0]
+        cam = map_from_body @ BODY_FROM_CAM
+        right = cam @ se3(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
+        return RectifiedFrame(k * FRAME_NS, view(cam), view(right), None)
+
+    _, estimates = run((frame(k) for k in range(1, 66)), IMU)
+    after = estimates[at:]
+    contradicted = [e for e in estimates[at + 2 :] if e.inlier_share < 0.1]
+    assert contradicted
+    assert all(e.inertial for e in after)
+    assert all(e.status is OdometryStatus.DEGRADED for e in contradicted)
+    assert min(e.inlier_share for e in after[12:24]) > 0.7
+    assert [e.status for e in after[12:24]] == [OdometryStatus.TRACKING] * 12
+    moved_m, truth = (
+        after[23].odom_from_body[:3, 3] - after[11].odom_from_body[:3, 3],
+        truth_between(52 * FRAME_NS, 64 * FRAME_NS),
+    )
+    world_m = analytic_motion(52 * FRAME_NS * 1e-9).map_from_body[:3, :3] @ truth[:3, 3] + [
+        0.0,
+        off_mps * 12 * FRAME_NS * 1e-9,
+        0.0,
+    ]
+    assert np.linalg.norm(moved_m) == pytest.approx(np.linalg.norm(world_m), abs=0.05)
+
+
+def test_matches_with_the_next_bay_after_a_gap_are_no_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A starved processor drops frames; what is matched across 0.4 s agrees on a place one bay on, where no IMU felt to go."""
+    bay = se3(np.eye(3), np.array([0.0, 0.0, -1.3]))
+    rematch = Tracker._rematch
+
+    def of_next_bay(tracker: Tracker, *inputs: Any) -> tuple[tuple[Earlier, ...], float]:
+        found, share = rematch(tracker, *inputs)
+        pixels = dict(zip(tracker._points.ids.tolist(), tracker._points.pixels, strict=True))
+        moved = []
+        for each in found:
+            now = np.array([pixels[i] for i in each.ids.tolist()])
+            points = CAMERA.point_from_pixel(now[:, :2], now[:, 0] - now[:, 2])
+            motion = bay @ each.cam_from_earlier
+            shown = CAMERA.pixel_from_point(transform_points(se3_inverse(motion), points))
+            moved.append(replace(each, pixels=shown, cam_from_earlier=motion))
+        return tuple(moved), share
+
+    frames = [stereo_frame(k * FRAME_NS) for k in [*range(1, 41), 48, 49, 50]]
+    monkeypatch.setattr(Tracker, "_rematch", of_next_bay)
+    _, estimates = run(frames, IMU)
+    before, after = estimates[39], estimates[40]
+    assert after.after_gap
+    assert np.linalg.norm(relative_error(before, after)[3:]) < 0.05
+    assert after.status is OdometryStatus.DEGRADED
+    assert np.linalg.norm(relative_error(before, estimates[-1])[3:]) < 4 * sigma_m(estimates[-1])
+
+
+def test_darkness_of_any_length_leaves_a_covariance() -> None:
+    """Without an IMU: nobody goes on for minutes at the last speed, and what is seen afterwards is followed as ever."""
+    dark = [black_frame(k * FRAME_NS) for k in range(11, 411)]
+    light = [replace(stereo_frame((k - 400) * FRAME_NS), stamp_ns=k * FRAME_NS) for k in range(411, 431)]
+    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    way_m, pose = 0.0, PoseHypothesis(0, 0, np.eye(4), np.zeros((6, 6)), np.eye(4), np.zeros((6, 6)))
+    for frame in [*(stereo_frame(k * FRAME_NS) for k in range(1, 11)), *dark, *light]:
+        estimate = odometry.handle_stereo(frame)
+        known = odometry.motion_since(pose.frame_index)
+        motions = {} if known is None else {pose.frame_index: Motion(*known, odometry.will_forget(pose.frame_index))}
+        step = np.eye(4) if estimate.previous_from_body is None else estimate.previous_from_body
+        pose.propagate(motions, estimate, step, TrackSettings())
+        if estimate.status is OdometryStatus.DEGRADED:
+            way_m += float(np.linalg.norm(step[:3, 3]))
+        since = odometry.motion_since(estimate.frame_index - 1)
+        assert since is None or np.linalg.eigvalsh(since[1])[0] > 0
+    assert way_m < 2.0, "a second at its last speed"
+    assert np.sqrt(np.diag(pose.cov_rot_trans)[:3]).max() < 1.001 * np.pi
+    assert np.linalg.eigvalsh(pose.now_cov)[0] > 0
+    assert estimate.status is OdometryStatus.TRACKING
+    assert estimate.inlier_share > 0.9
 
 
 def test_tracks_are_where_the_points_went() -> None:

@@ -1,5 +1,6 @@
 """The window of frames that odometry estimates over: the filter, its clones, and the observations that tie them."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,8 @@ from fleetmap.sensors.rectification import StereoCamera
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
 _CAMERA = 0  # the only one of a rig yet
+# The filter contradicts the images where it takes less than that share of so many tracks that were due in so many updates.
+_LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,7 @@ class SlidingWindow:
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
         self.contradicts_images = False
+        self._judged = deque[NDArray[np.int8]](maxlen=_JUDGED_UPDATES)  # tracks that were taken or refused
         self._refused_frames = 0  # in a row, since the filter refused tracks and took none
         settings = rig.settings.filter
         true_error_cov = settings.real_start_share**2 * covariance
@@ -138,7 +142,13 @@ class SlidingWindow:
             self._refused_frames = 0
         elif self._refused_frames or (used == -1).any():
             self._refused_frames += 1
-        self.contradicts_images = self._refused_frames >= chunk_frames  # in which every track was due once
+        self._judged.append(used[used != 0])
+        judged = np.concatenate(self._judged)
+        is_clear = len(self._judged) == _JUDGED_UPDATES and len(judged) >= _JUDGED_TRACKS
+        takes_few = is_clear and (judged == 1).mean() < _LEAST_TAKEN
+        self.contradicts_images = bool(
+            takes_few or self._refused_frames >= chunk_frames
+        )  # or each of few tracks was due once
         self._prune()
         return used
 
