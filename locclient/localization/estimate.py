@@ -89,7 +89,7 @@ def assemble(
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
     status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
-    if ranking:
+    if ranking and (is_open or prior is None or not was_tracking):
         return estimate if is_open else _with_pose(estimate, ranking[0], settings)
     if prior is None or estimate.map_version is None:
         return estimate

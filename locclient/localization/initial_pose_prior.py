@@ -37,7 +37,8 @@ class InitialPosePrior:
     """A prior, and the robot's motion since its moment.
 
     hypothesis: the pose by both, published while the map gives none; None for priors with an unknown direction. contradictions: places
-    that fixes name instead of those within a revisable prior.
+    that fixes name instead of those within a revisable prior. is_told: somebody said so, as of docks and zones; else it is where the robot
+    itself believes to be, by odometry.
     """
 
     def __init__(self, prior: PositionPrior, base_from_body: Array, settings: TrackSettings) -> None:
@@ -46,17 +47,18 @@ class InitialPosePrior:
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
         self.contradictions = HypothesisSet(settings)
-        self.is_revisable = prior.is_revisable
+        self.is_revisable, self.is_told = prior.is_revisable, True
 
     @classmethod
     def at(
-        cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, *, is_revisable: bool
+        cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, *, is_revisable: bool, is_told: bool
     ) -> "InitialPosePrior":
         """A pose at a frame of the odometry as a prior."""
         map_from_base = known.map_from_body @ se3_inverse(base_from_body)
         covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
         made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body, settings)
         identity = np.eye(4), np.zeros((6, 6))
+        made.is_told = is_told
         made.hypothesis, made._since = known, PoseHypothesis(known.frame_index, known.stamp_ns, *identity, *identity)
         return made
 
@@ -119,9 +121,9 @@ class InitialPosePrior:
         return observations
 
     def confirms(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether it is so tight that one fix at its place confirms that; of a person's, at the place that was named."""
+        """Whether it is told, and so tight that one fix at its place confirms that; of a person's, at the place that was named."""
         is_named = not self.is_revisable or hypothesis.told_log_odds > 0.0
-        return is_named and self.is_tight(self._settings.tight_prior_sigma_m)
+        return self.is_told and is_named and self.is_tight(self._settings.tight_prior_sigma_m)
 
     def is_tight(self, sigma_m: float) -> bool:
         """Whether its horizontal sigma is at most that, now."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
@@ -27,8 +28,9 @@ class Start:
     """What a localizer begins with: by default it searches for itself.
 
     map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
-    of which stamp_ns and support are; else by a prior, with its is_revisable and travelled_m, the distance since it came. has_broken:
-    tracks broke since. was_tracking: the robot has known its pose before. failed_queries: the last so many map queries found nothing.
+    of which stamp_ns and support are; else by a prior, with its is_revisable, is_told and travelled_m, the distance since it came.
+    has_broken: tracks broke since. was_tracking: the robot has known its pose before. failed_queries: the last so many map queries found
+    nothing.
     """
 
     frame_index: int = 0
@@ -38,6 +40,7 @@ class Start:
     cov_rot_trans: Array | None = None
     is_confirmed: bool = False
     is_revisable: bool = False
+    is_told: bool = True
     travelled_m: float = 0.0
     has_broken: bool = False
     was_tracking: bool = False
@@ -57,6 +60,8 @@ class PoseTracker:
         | several fixes beyond its gate agree with each other: the robot was carried
         v
     CANDIDATES  at the places of these fixes
+
+    CONFIRMED   --its radius admits the next place that looks alike-->  SEARCHING, with the pose as a prior
     """
 
     def __init__(self, settings: LocalizerSettings, body_from_cam: Array, base_from_body: Array) -> None:
@@ -106,6 +111,7 @@ class PoseTracker:
             cov_rot_trans=known.cov_rot_trans,
             is_confirmed=self.confirmed is not None,
             is_revisable=prior is not None and prior.is_revisable,
+            is_told=prior is None or prior.is_told,
             travelled_m=0.0 if prior is None else prior.travelled_m,
             has_broken=known.has_broken,
         )
@@ -122,8 +128,12 @@ class PoseTracker:
         if start.is_confirmed:
             self.confirmed = known
         else:
-            self.prior = InitialPosePrior.at(known, self._base_from_body, self._track, is_revisable=start.is_revisable)
+            self.prior = self._prior_at(known, is_revisable=start.is_revisable, is_told=start.is_told)
             self.prior.travelled_m = start.travelled_m
+
+    def _prior_at(self, known: PoseHypothesis, *, is_revisable: bool, is_told: bool) -> InitialPosePrior:
+        how = {"is_revisable": is_revisable, "is_told": is_told}
+        return InitialPosePrior.at(known, self._base_from_body, self._track, **how)
 
     # --- propagation --------------------------------------------------------------------------------------------------
 
@@ -163,10 +173,24 @@ class PoseTracker:
 
     def begin_query(self, odometry: OdometryEstimate) -> None:
         """A map query begins with the present frame; its fixes may come some frames later."""
+        self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
             hypothesis.mark_query()
         self._query_frame = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
         self._query_index = odometry.frame_index
+
+    def _doubt_confirmed(self, odometry: OdometryEstimate) -> None:
+        """A pose whose radius exceeds half of the site's smallest repetition becomes a prior: a fix of the next bay or aisle is within
+        the gate of its covariance, and must be confirmed as anywhere else."""
+        confirmed = self.confirmed
+        if confirmed is None or not radius_95_m(confirmed.now_cov) > 0.5 * self._track.alias_step_m:
+            return
+        self.candidates.reset()
+        self.candidates.abandoned, self.confirmed = confirmed, None
+        self.prior = None
+        if np.isfinite(confirmed.now_cov).all() and np.isfinite(confirmed.now_map_from_body).all():
+            at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov)
+            self.prior = self._prior_at(at_present, is_revisable=False, is_told=False)
 
     def end_query(self) -> None:
         self._query_frame = None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, Status
 from locclient.localization.estimate import assemble
@@ -242,6 +243,31 @@ def test_drift_without_fixes_ends_lost_and_the_radius_says_so(tracking: Robot) -
     assert all(later > earlier for earlier, later in pairwise(radii))
     first_lost = ranks.index(2)
     assert radii[first_lost] > TrackSettings().lost_radius_m > 0.95 * radii[first_lost - 1]
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "inliers", "alias_ratio", "places", "said"),
+    [
+        (3.0, 16, 0.9, [off(0, 4.5)], [Status.LOST] * 3),  # once, and in every frame until it has driven a metre
+        (1.4, 16, 0.9, [off(0, 2.0)], [Status.DEGRADED] * 3),
+        (3.0, 40, 0.9, [off(0, 4.5), off(0)], [Status.AMBIGUOUS] * 3),
+        (3.0, 80, 0.1, TRUE, [Status.TRACKING] * 3),  # nothing else of the map can be meant
+        (1.0, 16, 0.9, TRUE, [Status.TRACKING] * 3),  # the next bay is not within its gate
+    ],
+)
+def test_a_pose_that_may_be_at_the_next_bay_is_confirmed_like_any_place(
+    tracking: Robot, radius_m: float, inliers: int, alias_ratio: float, places: list[Array], said: list[Status]
+) -> None:
+    """Driven without a fix until its radius is that; one fix of what looks the same does not decide where it is."""
+    tracking.odometry.drift_share = 0.2
+    while radius_95_m(tracking.go(0.2, NO_FIX, 0.0).cov_rot_trans) < radius_m:
+        pass
+    tracking.inliers, tracking.relocalizer.alias_ratio = inliers, alias_ratio
+    for status in said:
+        estimate = tracking.go(0.2, places, 0.0)
+        assert estimate.status is status
+        assert estimate.cov_rot_trans is not None or status is Status.AMBIGUOUS
+        assert estimate.map_from_body is None or tracking.error_m(estimate) < radius_95_m(estimate.cov_rot_trans)
 
 
 def test_a_new_version_is_taken_over_without_losing_the_place(tracking: Robot) -> None:
