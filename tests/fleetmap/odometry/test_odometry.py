@@ -261,20 +261,20 @@ def test_darkness_of_any_length_leaves_a_covariance() -> None:
     dark = [black_frame(k * FRAME_NS) for k in range(11, 411)]
     light = [replace(stereo_frame((k - 400) * FRAME_NS), stamp_ns=k * FRAME_NS) for k in range(411, 431)]
     odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
-    way_m, pose = 0.0, PoseHypothesis(0, 0, np.eye(4), np.zeros((6, 6)), np.eye(4), np.zeros((6, 6)))
+    way_m, hypothesis = 0.0, PoseHypothesis(0, 0, np.eye(4), np.zeros((6, 6)), np.eye(4), np.zeros((6, 6)))
     for frame in [*(stereo_frame(k * FRAME_NS) for k in range(1, 11)), *dark, *light]:
         estimate = odometry.handle_stereo(frame)
-        known = odometry.motion_since(pose.frame_index)
-        motions = {} if known is None else {pose.frame_index: Motion(*known, odometry.will_forget(pose.frame_index))}
+        motion, is_last = odometry.motion_since(hypothesis.frame_index), odometry.will_forget(hypothesis.frame_index)
+        motions = {} if motion is None else {hypothesis.frame_index: Motion(*motion, is_last)}
         step = np.eye(4) if estimate.previous_from_body is None else estimate.previous_from_body
-        pose.propagate(motions, estimate, step, TrackSettings())
+        hypothesis.propagate(motions, estimate, step, TrackSettings())
         if estimate.status is OdometryStatus.DEGRADED:
             way_m += float(np.linalg.norm(step[:3, 3]))
         since = odometry.motion_since(estimate.frame_index - 1)
         assert since is None or np.linalg.eigvalsh(since[1])[0] > 0
     assert way_m < 2.0, "a second at its last speed"
-    assert np.sqrt(np.diag(pose.cov_rot_trans)[:3]).max() < 1.001 * np.pi
-    assert np.linalg.eigvalsh(pose.now_cov)[0] > 0
+    assert np.sqrt(np.diag(hypothesis.cov_rot_trans)[:3]).max() < 1.001 * np.pi
+    assert np.linalg.eigvalsh(hypothesis.now_cov)[0] > 0
     assert estimate.status is OdometryStatus.TRACKING
     assert estimate.inlier_share > 0.9
 
