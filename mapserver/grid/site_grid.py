@@ -64,11 +64,13 @@ class SessionViews:
         reach = np.arange(-_WIDTH_M / 2, _WIDTH_M / 2 + 1e-9, CELL_M / 2)
         disc = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 1, 2)
         disc = disc[np.linalg.norm(disc[:, 0], axis=1) <= _WIDTH_M / 2]
-        cells = np.unique(np.floor((way.reshape(-1, 2) + disc).reshape(-1, 2) / CELL_M).astype(np.int64), axis=0)
+        keys = np.unique(np.floor((way.reshape(-1, 2) + disc).reshape(-1, 2) / CELL_M).astype(np.int64) @ [1 << 32, 1])
+        x = (keys + (1 << 31)) >> 32  # both halves again: numbers are told apart thirty times faster than rows
+        cells = np.stack([x, keys - (x << 32)], axis=-1)
         levels = int(np.clip(np.ceil((floor_m - FLOOR_M) / SLICE_M), 0, SLICES))
-        for x, y in np.unique(cells // TILE_CELLS, axis=0).tolist():
-            mine = cells[(cells // TILE_CELLS == (x, y)).all(axis=1)] - np.array([x, y]) * TILE_CELLS
-            passes = self._tile(x, y)[1]
+        for tile in np.unique(cells // TILE_CELLS, axis=0):
+            mine = cells[(cells // TILE_CELLS == tile).all(axis=1)] - tile * TILE_CELLS
+            passes = self._tile(*tile.tolist())[1]
             passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], _FREE)
 
     def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts, Counts]:
