@@ -63,11 +63,13 @@ class Survey:
     """The result of a survey.
 
     odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation.
-    components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw error of the pair.
-    seen (F,): frames that points of the map place; the others are where odometry or the IMU carries them.
+    landmarks_in_map: rows of the state's landmarks that the map has. components: the connected components, of which one is the map.
+    stereo_yaw: the extrinsic yaw error of the pair. seen (F,): frames that points of the map place; the others are where odometry or
+    the IMU carries them.
     """
 
     map: SurveyMap
+    landmarks_in_map: NDArray[np.int64]
     vocabulary: Vocabulary
     loops: Loops
     odometry: OdometryPass
@@ -116,11 +118,11 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     frames_of = np.array(odometry.keyframe_frames, np.int64)
     state, odometry, loops, components = keep_largest(state, odometry, loops, settings)
     placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
-    survey_map, culled = assemble(state, odometry, placed, settings)
+    survey_map, rows, culled = assemble(state, odometry, placed, settings)
     between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
-    return Survey(survey_map, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+    return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
 
 
 def keep_largest(

@@ -236,7 +236,7 @@ def test_a_prior_alone_joins_nothing(nights: Nights, tmp_path: Path) -> None:
         inputs = SurveyInputs(frames, 20, recording.imu, recording.calibration, rectifier)
         foreign = survey(inputs, SurveyConfig(settings, default_vocabulary()))
     for docks in (None, np.eye(4), se3(np.eye(3), np.array([30.0, 20.0, 0.0]))):
-        held = extend(base, foreign, settings, anchored=True, map_from_survey=docks)
+        held = extend(base, foreign, settings, map_from_survey=docks)
         assert isinstance(held, Membership)
         assert held.verdict is not MembershipVerdict.JOINED
         assert "drive" in held.reason

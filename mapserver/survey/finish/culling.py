@@ -24,8 +24,8 @@ class Culled:
 
 def cull(
     state: SurveyState, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
-) -> tuple[Landmarks, NDArray[np.bool_], Culled]:
-    """The landmarks that are handed on, which keyframes (K,) are, and what was left out; `state` stays as it is.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Culled]:
+    """Which observations (M,) and keyframes (K,) are handed on, and what was left out; `state` stays as it is.
 
     sigmas_m (N,) of the landmarks.
     """
@@ -36,8 +36,7 @@ def cull(
     lasting = ~(double | weak)
     superfluous = redundant(marks, octaves, lasting, len(keyframes), settings)
     keep = lasting[marks.obs_landmark] & ~superfluous[marks.obs_keyframe]
-    left = marks.keep_observations(keep, 1)
-    return left, ~superfluous, Culled(int(double.sum()), int(weak.sum()), int(superfluous.sum()))
+    return keep, ~superfluous, Culled(int(double.sum()), int(weak.sum()), int(superfluous.sum()))
 
 
 def parallax_rad(state: SurveyState) -> Array:

@@ -23,10 +23,11 @@ _CHUNK = 5000  # landmarks
 
 def assemble(
     state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
-) -> tuple[SurveyMap, Culled]:
-    """The SurveyMap of an adjusted survey, in the survey's own frame, and what was left out of it."""
+) -> tuple[SurveyMap, NDArray[np.int64], Culled]:
+    """The SurveyMap of an adjusted survey, in the survey's own frame, which landmarks of the state it has, and what was left out."""
     every_sigma = point_sigmas_m(state)
-    marks, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
+    seen, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
+    marks, rows = state.landmarks.keep_observations(seen, 1), np.unique(state.landmarks.obs_landmark[seen])
     keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = marks.of_features([k.features.octaves for k in keyframes])
@@ -52,7 +53,7 @@ def assemble(
         patches=cut_patches(marks, keyframes),
         scale_known=odometry.scale_known,
     )
-    return survey_map, culled
+    return survey_map, rows.astype(np.int64), culled
 
 
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:

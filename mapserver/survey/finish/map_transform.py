@@ -20,6 +20,12 @@ def transform_map(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
     )
 
 
+def transform_state(state: SurveyState, new_from_map: Array) -> SurveyState:
+    """The adjusted state as `transform_map` changes its map."""
+    landmarks = replace(state.landmarks, points_map=transform_points(new_from_map, state.landmarks.points_map))
+    return replace(state.moved(new_from_map @ state.map_from_body), landmarks=landmarks)
+
+
 def scaled(survey_map: SurveyMap, scale: float) -> SurveyMap:
     """The same survey `scale` times as large, in metres from now on; cameras keep their mounting, which was in metres before."""
     frames = _grown(survey_map.trajectory.frame_from_body, survey_map.body_from_cam, scale)

@@ -29,7 +29,7 @@ class BaseMap:
         self.points_map, self.descriptors = survey_map.points_map, survey_map.descriptors
         own = survey_map.camera
         self.baseline_ratio = camera.baseline_m / own.baseline_m if own.baseline_m and camera.baseline_m else 1.0
-        self.obs_pixels, self.obs_sigma_px = _with_baseline(
+        self.obs_pixels, self.obs_sigma_px = with_baseline(
             survey_map.obs_pixels, survey_map.obs_sigma_px, self.baseline_ratio
         )
         self.references = np.full(len(self.points_map), -1)
@@ -68,7 +68,7 @@ class BaseMap:
         return np.asarray(self.map_from_cam[self.map.obs_keyframe[self.references[rows]]])
 
 
-def _with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array, Array]:
+def with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array, Array]:
     """Observations as a pair with another baseline would have made them, farther apart by `ratio`: disparities grow with it."""
     disparity = (pixels[:, 0] - pixels[:, 2]) * ratio
     return np.column_stack([pixels[:, :2], pixels[:, 0] - disparity]), np.asarray(sigmas_px * [1.0, abs(ratio)])
@@ -76,4 +76,4 @@ def _with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array
 
 def as_recorded(base: BaseMap, pixels: Array, sigmas_px: Array) -> tuple[Array, Array]:
     """Observations (M, 3), (M, 2) of BaseMap's camera as the camera that made the map would have them."""
-    return _with_baseline(pixels, sigmas_px, 1.0 / base.baseline_ratio)
+    return with_baseline(pixels, sigmas_px, 1.0 / base.baseline_ratio)

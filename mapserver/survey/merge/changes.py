@@ -52,7 +52,8 @@ def what_changes(
     rows = np.r_[judged.rows[alone], np.full(fresh.sum(), -1)]
     places = base.map.map_from_body.copy()
     places[moved_keyframes] = cameras[moved_keyframes] @ se3_inverse(base.map.body_from_cam)
-    change = Change(keep, points, places, added, rows, map_from_cam)
+    numbers = np.r_[np.full(alone.sum(), -1), np.flatnonzero(fresh)]
+    change = Change(keep, points, places, added, rows, numbers, map_from_cam)
     return change, int(moved_keyframes.sum()), int(alone.sum() + (moved & keep).sum())
 
 

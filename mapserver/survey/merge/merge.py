@@ -20,7 +20,7 @@ class Change:
 
     keep (N,): landmarks that stay; points_map (N, 3) and map_from_body (K, 4, 4): where they are from now on. added: landmarks
     that come, their observations by keyframes of the new survey (sorted by landmark); added_rows: which landmark of the map each
-    takes the place of, with its id and descriptor, -1 for a new one.
+    takes the place of, with its id and descriptor, -1 for a new one, which is added_own of the new survey's.
     map_from_cam: of the new survey's keyframes.
     """
 
@@ -29,6 +29,7 @@ class Change:
     map_from_body: Array
     added: Landmarks
     added_rows: Rows
+    added_own: Rows
     map_from_cam: Array
 
 

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.finish.map_transform import transform_map
+from mapserver.survey.finish.frame_adjustment import frame_trajectory
+from mapserver.survey.finish.map_transform import transform_map, transform_state
+from mapserver.survey.merge.joint_adjustment import Measured, begun
 from mapserver.survey.merge.membership import Membership, MembershipEvidence, MembershipVerdict
 from mapserver.survey.merge.pipeline import Counts, Extension, extend
 from mapserver.survey.settings import SurveySettings
@@ -64,11 +66,13 @@ class MapMerger:
     """
 
     def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
-        self._settings, self._anchored, self._current = settings, base is not None, base
+        self._settings, self._current = settings, base
+        self._measured: Measured | None = None  # what holds a map that is not published
         self._sessions: list[Session] = []
         self._waiting: list[int] = []
         self._outcomes: dict[int, Outcome] = {}
         self._found: dict[int, tuple[Trajectory, Mask]] = {}
+        self._first_keyframes: dict[int, int] = {}
         self._has_grown = False
 
     def add(self, session: Session) -> None:
@@ -90,7 +94,7 @@ class MapMerger:
         if self._current is None:
             raise ValueError("no session to begin a map with")
         order = sorted(self._found)
-        trajectories, estimated = tuple(self._found[n][0] for n in order), tuple(self._found[n][1] for n in order)
+        trajectories, estimated = tuple(map(self._trajectory, order)), tuple(self._found[n][1] for n in order)
         joined_map = with_trajectories(self._current, trajectories, estimated) if order else self._current
         outcomes = tuple(self._outcomes[n] for n in sorted(self._outcomes))
         return MergedMap(joined_map, outcomes, trajectories, estimated)
@@ -98,19 +102,34 @@ class MapMerger:
     def _try(self, number: int) -> None:
         session = self._sessions[number]
         if self._current is None:
-            self._current = _begun(session)
+            self._current, self._measured = _begun(session, self._settings)
             outcome = Outcome(number, MembershipVerdict.JOINED, "begins the map")
         else:
-            place, anchored = session.map_from_survey, self._anchored
-            result = extend(self._current, session.survey, self._settings, anchored=anchored, map_from_survey=place)
+            known, place = self._measured, session.map_from_survey
+            result = extend(self._current, session.survey, self._settings, known=known, map_from_survey=place)
             if isinstance(result, Membership):
                 self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
                 return
-            self._current, self._has_grown = result.map, True
+            if known is not None:
+                self._first_keyframes[number] = len(known.problem.map_from_body)
+            self._current, self._measured, self._has_grown = result.map, result.measured, True
             outcome = Outcome(number, MembershipVerdict.JOINED, _words(result), result.counts, result.evidence)
         self._outcomes[number] = outcome
         self._found[number] = (self._current.trajectory, self._current.trajectory_estimated)
         self._waiting.remove(number)
+
+    def _trajectory(self, number: int) -> Trajectory:
+        """That of a joined session: its frames follow its keyframes, which later sessions may have moved in a map that is being made."""
+        found, survey = self._found[number][0], self._sessions[number].survey
+        if self._measured is None or number == next(reversed(self._found)):
+            return found
+        first = self._first_keyframes.get(number, 0)
+        problem, frames = self._measured.problem, survey.odometry.keyframe_frames
+        map_from_rig = problem.map_from_body[first : first + len(frames)] @ problem.body_from_cam
+        map_from_body = map_from_rig @ se3_inverse(survey.state.body_from_cam)
+        return replace(
+            found, frame_from_body=frame_trajectory(found.stamps_ns, found.frame_from_body, frames, map_from_body)
+        )
 
 
 def _words(result: Extension) -> str:
@@ -118,9 +137,12 @@ def _words(result: Extension) -> str:
     return f"found in the map: {found.fixes} fixes at {found.places} places, {found.cells_seen} of {found.cells_expected} parts of it seen"
 
 
-def _begun(session: Session) -> SurveyMap:
-    survey_map = session.survey.map
-    return survey_map if session.map_from_survey is None else transform_map(survey_map, session.map_from_survey)
+def _begun(session: Session, settings: SurveySettings) -> tuple[SurveyMap, Measured]:
+    survey_map, state = session.survey.map, session.survey.state
+    if session.map_from_survey is not None:
+        survey_map = transform_map(survey_map, session.map_from_survey)
+        state = transform_state(state, session.map_from_survey)
+    return survey_map, begun(state, survey_map, session.survey.landmarks_in_map, settings)
 
 
 def with_trajectories(

@@ -12,7 +12,7 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import keyframe_features, match_keyframe, session_relocalizer
-from mapserver.survey.merge.joint_adjustment import adjust_jointly
+from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly, grown
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.membership import (
     Membership,
@@ -47,9 +47,10 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """The next map (its trajectory is the new survey's), what changed, and the evidence for joining it."""
+    """The next map (its trajectory is the new survey's), what holds it, what changed, and the evidence for joining it."""
 
     map: SurveyMap
+    measured: Measured | None
     counts: Counts
     evidence: MembershipEvidence
 
@@ -59,12 +60,13 @@ def extend(
     survey: Survey,
     settings: SurveySettings,
     *,
-    anchored: bool,
+    known: Measured | None = None,
     map_from_survey: Array | None = None,
 ) -> Extension | Membership:
     """The map with a survey joined to it, if it passes the test of `membership`: at the place that fixes say, and once more adjusted.
 
-    anchored: base_map is published: what did not move significantly stays to the bit; else all of it takes its best place.
+    known: what holds base_map, all of which takes its best place; None for a published one: what did not move significantly stays to the
+    bit.
     map_from_survey: where position priors put the survey, if they do.
     """
     state, guess = survey.state, survey.odometry
@@ -96,13 +98,15 @@ def extend(
             match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
             for keyframe, place in zip(guess.keyframes, map_from_body, strict=True)
         ]
-        joint = adjust_jointly(base, state, map_from_body, sightings, settings, anchored=anchored)
+        finely = radius_px == settings.sessions.guided_px
+        joint = adjust_jointly(base, known, state, map_from_body, sightings, settings, finely=finely)
         map_from_body = joint.map_from_body
     seen = test.confirmation(map_from_body)
     refused = test.judged(located, seen)
     if refused is not None:
         return refused
     found = count_landmarks(base, guess.keyframes, map_from_body @ state.body_from_cam, joint.sightings)
+    anchored = known is None
     gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
     # Between keyframes the survey's own frames were placed by what they saw; they follow the keyframes that moved.
@@ -128,4 +132,6 @@ def extend(
         landmarks_added=fresh,
         seen_rate=round(found.rate, 4),
     )
-    return Extension(result, counts, test.evidence(located, seen))
+    return Extension(
+        result, None if known is None else grown(joint, change, base, result), counts, test.evidence(located, seen)
+    )

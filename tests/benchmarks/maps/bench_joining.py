@@ -182,7 +182,7 @@ def off_in_map_m(here: Surveyed, placed: Trajectory, truth: Trajectory) -> Array
 
 def joined(here: Surveyed, other: Surveyed, docks: Array | None) -> dict[str, Any]:
     """A rendered session in a rendered map, adjusted jointly and merged as a build does."""
-    result = extend(here.survey.map, other.survey, SETTINGS, anchored=True, map_from_survey=docks)
+    result = extend(here.survey.map, other.survey, SETTINGS, map_from_survey=docks)
     if isinstance(result, Membership):
         seen = result.evidence
         return {

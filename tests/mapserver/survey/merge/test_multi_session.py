@@ -106,7 +106,7 @@ class Sites:
             return Membership(f"{survey.name} needs {self.needs[survey.name]}")
         evidence = SimpleNamespace(fixes=3, places=3, cells_seen=9, cells_expected=9)
         grown = made_up_map(current.letters + survey.name)
-        return SimpleNamespace(map=grown, counts=None, evidence=evidence)
+        return SimpleNamespace(map=grown, measured=None, counts=None, evidence=evidence)
 
 
 def made_up_map(letters: str) -> Any:
@@ -128,7 +128,7 @@ def test_sessions_join_when_what_they_need_is_there(
     """Small letters have position priors: they are tried as they come, the others behind them, what failed until nothing grows."""
     sites = Sites(needs)
     monkeypatch.setattr(multi_session, "extend", sites.extend)
-    monkeypatch.setattr(multi_session, "_begun", lambda session: session.survey.map)
+    monkeypatch.setattr(multi_session, "_begun", lambda session, _: (session.survey.map, None))
     monkeypatch.setattr(multi_session, "with_trajectories", lambda found, *_: found)
     joining = MapMerger(None, SurveySettings())
     for letter in sessions:
