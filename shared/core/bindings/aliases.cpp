@@ -29,10 +29,10 @@ auto camera_votes_of(const Array<int32_t, -1, 2>& pairs, const Array<double, -1,
                      const Array<double, 2>& low_m, double cell_m, int columns, int rows) {
   constexpr int64_t kMostCells = 1 << 26;
   if (columns < 0 || rows < 0 || int64_t(columns) * rows > kMostCells) throw nb::value_error("columns, rows: up to 2^26 cells");
-  for (size_t k = 0; k < pairs.shape(0); ++k)
-    if (pairs(k, 0) < 0 || pairs(k, 1) < 0 || size_t(pairs(k, 0)) >= offsets_m.shape(0) || size_t(pairs(k, 1)) >= points_map.shape(0))
-      throw nb::value_error("pairs: rows of offsets_m and of points_map");
   auto counts = unlocked([&] {
+    for (size_t k = 0; k < pairs.shape(0); ++k)
+      if (pairs(k, 0) < 0 || pairs(k, 1) < 0 || size_t(pairs(k, 0)) >= offsets_m.shape(0) || size_t(pairs(k, 1)) >= points_map.shape(0))
+        throw nb::value_error("pairs: rows of offsets_m and of points_map");
     return camera_votes(reinterpret_cast<const Lookalike*>(pairs.data()), pairs.shape(0), offsets_m.data(), points_map.data(),
                         {low_m(0), low_m(1), cell_m, columns, rows});
   });

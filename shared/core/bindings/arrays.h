@@ -36,10 +36,16 @@ nb::ndarray<nb::numpy, double, nb::ndim<kDimensions>> copied(const double* from,
   return as_numpy<double, kDimensions>(std::vector<double>(from, from + count), shape);
 }
 
-// The result of a computation that needs no Python, done without its lock.
+// The result of a computation that needs no Python, done without its lock. Checks of whole arrays belong in it, too.
 template <typename Compute>
 auto unlocked(Compute&& compute) {
   nb::gil_scoped_release release;
   const fleetmap::CountedStep counted;
   return compute();
+}
+
+// So many zeros: those of pictures and maps are handed out page by page.
+template <typename T>
+std::vector<T> zeros(size_t count) {
+  return unlocked([&] { return std::vector<T>(count); });
 }

@@ -44,6 +44,8 @@ using Indices = Array<int64_t, -1>;
 void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>& pairs, const Indices& order) {
   constexpr int64_t kMostEach = 1 << 12, kMost = 1 << 24;
   const int64_t count = int64_t(sizes.shape(0));
+  find_lapack();
+  const nb::gil_scoped_release others_run;
   int64_t total = 0;
   for (int64_t n = 0; n < count; ++n) {
     if (sizes(n) < 1 || sizes(n) > kMostEach || (total += sizes(n)) > kMost) throw nb::value_error("sizes: 1 to 4096, at most 2^24 in all");
@@ -55,8 +57,7 @@ void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>
     coupled.emplace_back(a, b);
   }
   check_order(order, size_t(count));
-  find_lapack();
-  unlocked([&] { new (self) BlockCholesky({sizes.data(), sizes.data() + count}, coupled, {order.data(), order.data() + count}); });
+  new (self) BlockCholesky({sizes.data(), sizes.data() + count}, coupled, {order.data(), order.data() + count});
 }
 
 auto places_of(const BlockCholesky& pattern, const Indices& rows, const Indices& cols) {
@@ -64,11 +65,13 @@ auto places_of(const BlockCholesky& pattern, const Indices& rows, const Indices&
   const int64_t nodes = int64_t(pattern.nodes());
   if (cols.shape(0) != count) throw nb::value_error("cols: one for each row");
   std::vector<BlockPlace> places;
-  for (size_t n = 0; n < count; ++n) {
-    if (rows(n) < 0 || cols(n) < 0 || rows(n) >= nodes || cols(n) >= nodes) throw nb::value_error("rows, cols: nodes");
-    places.push_back(pattern.place(rows(n), cols(n)));
-    if (places.back().first < 0) throw nb::value_error("rows, cols: nodes that are coupled");
-  }
+  unlocked([&] {
+    for (size_t n = 0; n < count; ++n) {
+      if (rows(n) < 0 || cols(n) < 0 || rows(n) >= nodes || cols(n) >= nodes) throw nb::value_error("rows, cols: nodes");
+      places.push_back(pattern.place(rows(n), cols(n)));
+      if (places.back().first < 0) throw nb::value_error("rows, cols: nodes that are coupled");
+    }
+  });
   return as_numpy<int64_t, 2>(std::move(places), {count, 3});
 }
 
@@ -80,8 +83,11 @@ bool factorise(const BlockCholesky& pattern, const MutableArray<double, -1>& val
 auto solve(const BlockCholesky& pattern, const Array<double, -1>& values, const Array<double, -1>& rhs) {
   if (values.size() != pattern.size()) throw nb::value_error("values: as many as size says");
   if (rhs.size() != pattern.unknowns()) throw nb::value_error("rhs: one for each unknown");
-  std::vector<double> x(rhs.data(), rhs.data() + rhs.size());
-  unlocked([&] { pattern.solve(values.data(), x.data()); });
+  std::vector<double> x;
+  unlocked([&] {
+    x.assign(rhs.data(), rhs.data() + rhs.size());
+    pattern.solve(values.data(), x.data());
+  });
   const size_t count = x.size();
   return as_numpy<double, 1>(std::move(x), {count});
 }
@@ -94,7 +100,9 @@ void bind_block_cholesky(nb::module_& module) {
       .def("__init__", &make, "sizes"_a.noconvert(), "pairs"_a.noconvert(), "order"_a.noconvert())
       .def_prop_ro("size", &BlockCholesky::size)
       .def("order",
-           [](const BlockCholesky& pattern) { return as_numpy<int64_t, 1>(std::vector<int64_t>(pattern.order()), {pattern.unknowns()}); })
+           [](const BlockCholesky& pattern) {
+             return as_numpy<int64_t, 1>(unlocked([&] { return std::vector<int64_t>(pattern.order()); }), {pattern.unknowns()});
+           })
       .def("places", &places_of, "rows"_a.noconvert(), "cols"_a.noconvert())
       .def("factorise", &factorise, values)
       .def("solve", &solve, values, "rhs"_a.noconvert());

@@ -39,6 +39,8 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
           const Reals<-1, 6, 6>& prior_information, const Indices<-1, 2>& edge_ends, const Reals<-1, 67>& increments,
           const Reals<-1, 15, 15>& edge_information, const Reals<-1, -1>& motion_mean, const Reals<-1, -1>& motion_weight,
           const Reals<3>& gravity, double huber, double cutoff) {
+  find_lapack();
+  const nb::gil_scoped_release others_run;
   constexpr size_t kMost = size_t(1) << 31;
   const size_t keyframes = map_from_body.shape(0), landmarks = points_map.shape(0), observations = obs_keyframe.shape(0);
   const bool inertial = free.shape(1) == 15;
@@ -86,43 +88,46 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
   problem.motion_weight = copied(motion_weight.data(), motion_weight.size());
   BundleState start = {{}, copied(motions.data(), motions.size()), points_of(points_map)};
   for (size_t k = 0; k < keyframes; ++k) start.map_from_body.push_back(se3(&map_from_body(k, 0, 0)));
-  find_lapack();
-  unlocked([&] { new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff); });
+  new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff);
 }
 
 auto poses_of(const BundleSolver& solver) {
   const auto& poses = solver.state().map_from_body;
-  std::vector<double> matrices(16 * poses.size());
-  for (size_t k = 0; k < poses.size(); ++k) store(poses[k], &matrices[16 * k]);
+  auto matrices = zeros<double>(16 * poses.size());
+  unlocked([&] {
+    for (size_t k = 0; k < poses.size(); ++k) store(poses[k], &matrices[16 * k]);
+  });
   return as_numpy<double, 3>(std::move(matrices), {poses.size(), 4, 4});
 }
 
 auto motions_of(const BundleSolver& solver) {
   const size_t count = solver.state().map_from_body.size();
-  return as_numpy<double, 2>(std::vector<double>(solver.state().motions), {count, count ? solver.state().motions.size() / count : 0});
+  return as_numpy<double, 2>(unlocked([&] { return solver.state().motions; }), {count, count ? solver.state().motions.size() / count : 0});
 }
 
 auto points_map_of(const BundleSolver& solver) {
-  return as_numpy<double, 2>(std::vector<Vec3>(solver.state().points), {solver.state().points.size(), 3});
+  return as_numpy<double, 2>(unlocked([&] { return solver.state().points; }), {solver.state().points.size(), 3});
 }
 
 auto squared_sigmas_of(const BundleSolver& solver) {
-  auto squared = solver.squared_sigmas();
+  auto squared = unlocked([&] { return solver.squared_sigmas(); });
   const size_t count = squared.size();
   return as_numpy<double, 1>(std::move(squared), {count});
 }
 
 auto nodes_of(const BundleSolver& solver) {
-  auto sizes = solver.node_sizes();
-  auto pairs = solver.node_pairs();
+  auto sizes = unlocked([&] { return solver.node_sizes(); });
+  auto pairs = unlocked([&] { return solver.node_pairs(); });
   const size_t count = sizes.size(), coupled = pairs.size();
   return std::make_tuple(as_numpy<int64_t, 1>(std::move(sizes), {count}), as_numpy<int64_t, 2>(std::move(pairs), {coupled, 2}));
 }
 
 void factorise_sparsely(BundleSolver& solver, const Indices<-1>& order) {
-  const size_t count = solver.node_sizes().size();
-  check_order(order, count);
-  unlocked([&] { solver.factorise_sparsely({order.data(), order.data() + count}); });
+  unlocked([&] {
+    const size_t count = solver.node_sizes().size();
+    check_order(order, count);
+    solver.factorise_sparsely({order.data(), order.data() + count});
+  });
 }
 
 auto optimize(BundleSolver& solver, double lambda_start, int max_iterations, double relative_cost_tolerance) {

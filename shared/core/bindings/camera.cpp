@@ -26,7 +26,7 @@ auto register_depth_of(const Array<float, -1, -1>& depth, const Array<double, -1
   if (lens.shape(0) != 8 && lens.shape(0) != 4) throw nb::value_error("lens: 8 coefficients, radial-tangential, or 4, equidistant");
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
   const LensCamera camera{intrinsics(0), intrinsics(1), intrinsics(2), intrinsics(3), reach, width, height};
-  std::vector<float> colour(size_t(width) * size_t(height));
+  auto colour = zeros<float>(size_t(width) * size_t(height));
   const auto fill = [&](const auto& coefficients) {
     unlocked([&] { register_depth(depth.data(), rays.data(), count, se3(colour_from_depth.data()), camera, coefficients, colour.data()); });
   };

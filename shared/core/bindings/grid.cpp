@@ -14,8 +14,8 @@ auto cast_view_of(const Image32& disparity_px, const Image32& nearest_px, double
   if (nearest_px.shape(0) != disparity_px.shape(0) || nearest_px.shape(1) != disparity_px.shape(1))
     throw nb::value_error("nearest_px: of the size of disparity_px");
   const size_t rows = was_free.shape(0), columns = was_free.shape(1), slices = kSlices;
-  std::vector<uint16_t> points(rows * columns * slices);
-  std::vector<uint8_t> looks(rows * columns * slices), heights(2 * rows * columns);
+  auto points = zeros<uint16_t>(rows * columns * slices);
+  auto looks = zeros<uint8_t>(rows * columns * slices), heights = zeros<uint8_t>(2 * rows * columns);
   const ptrdiff_t height = ptrdiff_t(disparity_px.shape(0)), width = ptrdiff_t(disparity_px.shape(1));
   unlocked([&] {
     cast_view({disparity_px.data(), height, width}, {nearest_px.data(), height, width}, sigma_px, {lens(0), lens(1), lens(2), lens(3)},

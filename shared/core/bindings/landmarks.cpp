@@ -18,7 +18,7 @@ using Counts = MutableArray<int64_t, -1>;
 template <typename Column>
 void check_indices(const Column& column, size_t size, const char* refusal) {
   const auto is_inside = [&](auto index) { return index >= 0 && size_t(index) < size; };
-  if (!std::all_of(column.data(), column.data() + column.size(), is_inside)) throw nb::value_error(refusal);
+  if (!unlocked([&] { return std::all_of(column.data(), column.data() + column.size(), is_inside); })) throw nb::value_error(refusal);
 }
 
 void check_size(size_t size, size_t wanted, const char* refusal) {
@@ -28,7 +28,7 @@ void check_size(size_t size, size_t wanted, const char* refusal) {
 // Lists of values of which there are so many.
 Lists lists_of(const Indices& starts, size_t size, const char* refusal) {
   if (starts.shape(0) < 1 || starts(0) < 0 || starts(starts.shape(0) - 1) > int64_t(size) ||
-      !std::is_sorted(starts.data(), starts.data() + starts.shape(0)))
+      !unlocked([&] { return std::is_sorted(starts.data(), starts.data() + starts.shape(0)); }))
     throw nb::value_error(refusal);
   return {starts.data(), starts.shape(0) - 1};
 }
@@ -67,7 +67,7 @@ auto duplicate_landmarks_of(const Array<int64_t, -1, 2>& near, const Points& poi
   const Lists landmarks = lists_of(starts, obs_keyframe.shape(0), "starts: rising, of obs_keyframe");
   check_size(landmarks.count, count, "starts: one more than landmarks");
   check_indices(near, count, "near: of landmarks");
-  std::vector<uint8_t> duplicate(count);
+  auto duplicate = zeros<uint8_t>(count);
   unlocked([&] {
     mark_duplicates(reinterpret_cast<const std::pair<int64_t, int64_t>*>(near.data()), near.shape(0), points_map.data(), sigmas_m.data(),
                     {landmarks, obs_keyframe.data()}, {descriptors.data(), count}, most_bits, duplicate.data());
@@ -96,7 +96,7 @@ auto redundant_keyframes_of(const Indices& order, const Indices& rows, const Ind
 
 auto medoids_of(const Packed& descriptors, const Indices& starts) {
   const Lists landmarks = lists_of(starts, descriptors.shape(0), "starts: rising, of descriptors");
-  std::vector<int64_t> chosen(landmarks.count);
+  auto chosen = zeros<int64_t>(landmarks.count);
   unlocked([&] { medoids({descriptors.data(), descriptors.shape(0)}, landmarks, chosen.data()); });
   return as_numpy<int64_t, 1>(std::move(chosen), {landmarks.count});
 }
@@ -112,7 +112,8 @@ size_t choose_landmarks_of(const Indices& candidates, const Indices& starts, con
   constexpr int64_t kFarthest = int64_t(1) << 62;
   const auto is_far = [](int64_t number) { return number < -kFarthest || number > kFarthest; };
   for (const Counts* each : {&counts, &needs})
-    if (std::any_of(each->data(), each->data() + each->size(), is_far)) throw nb::value_error("counts, needs: within 2^62");
+    if (unlocked([&] { return std::any_of(each->data(), each->data() + each->size(), is_far); }))
+      throw nb::value_error("counts, needs: within 2^62");
   check_indices(candidates, landmarks.count, "candidates: of landmarks");
   check_indices(cells, room.shape(0), "cells: of room");
   check_indices(bins, std::min(counts.shape(0), needs.shape(0) * size_t(bins_per_view)), "bins: of counts and needs");
@@ -126,7 +127,7 @@ auto twins_of(const Packed& descriptors, const Points& points_map, int reach, in
   const size_t count = descriptors.shape(0);
   check_size(points_map.shape(0), count, "points_map: one for each descriptor");
   if (reach < 0 || most < 1) throw nb::value_error("reach: not negative; most: at least 1");
-  std::vector<uint8_t> repeated(count);
+  auto repeated = zeros<uint8_t>(count);
   unlocked([&] {
     mark_twins({descriptors.data(), count}, points_map.data(), size_t(reach), size_t(most), {max_bits, height_m, own_m}, repeated.data());
   });

@@ -41,8 +41,10 @@ auto match_guided_of(const Features& a, const Features& b, const Array<double, 4
 double share_in_view_of(const Array<double, 4, 4>& b_from_a, const Points& points_a, const Array<double, -1, 2>& disparities_a,
                         const Lens& lens, const Size& size_px) {
   if (points_a.shape(0) != disparities_a.shape(0)) throw nb::value_error("disparities_a: one for each point");
-  return share_in_view(se3(b_from_a.data()), points_a.data(), disparities_a.data(), points_a.shape(0), stereo_lens(lens),
-                       std::get<0>(size_px), std::get<1>(size_px));
+  return unlocked([&] {
+    return share_in_view(se3(b_from_a.data()), points_a.data(), disparities_a.data(), points_a.shape(0), stereo_lens(lens),
+                         std::get<0>(size_px), std::get<1>(size_px));
+  });
 }
 
 }  // namespace

@@ -53,17 +53,19 @@ class FixFinder {
         sigmas_m_(sigmas_m),
         descriptors_(descriptors),
         map_from_cam_(map_from_cam),
-        shown_(shown.data(), shown.data() + shown.size()),
-        shown_from_(shown_from.data(), shown_from.data() + shown_from.size()),
         camera_{{pinhole(0), pinhole(1), pinhole(2), pinhole(3)}, pinhole(4), pinhole(5)} {
     const size_t count = landmarks().count, places = map_from_cam.shape(0);
     if (sigmas_m.shape(0) != count || descriptors.shape(0) != count)
       throw nb::value_error("sigmas_m, descriptors: a row for each landmark");
-    if (shown_from_.size() != places + 1 || shown_from_[0] != 0 || shown_from_[places] != int64_t(shown_.size()) ||
-        !std::is_sorted(shown_from_.begin(), shown_from_.end()))
-      throw nb::value_error("shown_from: one more than places, rising from 0 to all of shown");
-    for (const int64_t row : shown_)
-      if (row < 0 || row >= int64_t(count)) throw nb::value_error("shown: rows of landmarks");
+    unlocked([&] {
+      shown_.assign(shown.data(), shown.data() + shown.size());
+      shown_from_.assign(shown_from.data(), shown_from.data() + shown_from.size());
+      if (shown_from_.size() != places + 1 || shown_from_[0] != 0 || shown_from_[places] != int64_t(shown_.size()) ||
+          !std::is_sorted(shown_from_.begin(), shown_from_.end()))
+        throw nb::value_error("shown_from: one more than places, rising from 0 to all of shown");
+      for (const int64_t row : shown_)
+        if (row < 0 || row >= int64_t(count)) throw nb::value_error("shown: rows of landmarks");
+    });
     auto real = [](const nb::object& from, const char* name) { return nb::cast<double>(from.attr(name)); };
     auto whole = [](const nb::object& from, const char* name) { return nb::cast<int>(from.attr(name)); };
     limits_.min_inliers = size_t(std::max(whole(fix, "min_inliers"), 0)), limits_.min_cells = whole(fix, "min_cells");
@@ -148,7 +150,7 @@ size_t checked_cells(int cells) {
 
 auto nearest_cells_of(const Packed& descriptors, const Packed& centres, int cells) {
   const size_t count = descriptors.shape(0), wanted = checked_cells(cells);
-  std::vector<int32_t> found(count * wanted);
+  auto found = zeros<int32_t>(count * wanted);
   unlocked([&] { nearest_cells({descriptors.data(), count}, {centres.data(), centres.shape(0)}, wanted, found.data()); });
   return as_numpy<int32_t, 2>(std::move(found), {count, wanted});
 }
@@ -159,7 +161,7 @@ auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int c
   if (starts.shape(0) != centres.shape(0) + 1) throw nb::value_error("starts: one more than centres");
   for (size_t c = 0; c < starts.shape(0); ++c)
     if (starts(c) < (c ? starts(c - 1) : 0) || starts(c) > int64_t(count)) throw nb::value_error("starts: rising, of held");
-  std::vector<uint8_t> is_near(count);
+  auto is_near = zeros<uint8_t>(count);
   unlocked([&] {
     mark_near({descriptors.data(), descriptors.shape(0)}, {centres.data(), centres.shape(0)}, asked, {held.data(), count}, starts.data(),
               max_bits, is_near.data());

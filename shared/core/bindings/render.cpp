@@ -109,7 +109,7 @@ auto develop_of(const Array<double, -1, -1>& radiance, double gain, double shot,
   const size_t rows = radiance.shape(0), columns = radiance.shape(1);
   if (!std::has_single_bit(normals.shape(0))) throw nb::value_error("normals: as many as a power of two");
   if (vignetting.shape(0) != rows || vignetting.shape(1) != columns) throw nb::value_error("vignetting: of the picture's size");
-  std::vector<uint8_t> image(rows * columns);
+  auto image = zeros<uint8_t>(rows * columns);
   unlocked([&] {
     develop({radiance.data(), ptrdiff_t(rows), ptrdiff_t(columns)}, gain, shot, read, normals.data(), normals.shape(0), uint64_t(key),
             vignetting.data(), image.data());
@@ -150,14 +150,14 @@ void bake_of(const BoxGrid& grid, const Quads& quads, const Numbers& numbers, co
   const size_t count = quads.shape(0);
   if (numbers.shape(0) != count || owners.shape(0) != count) throw nb::value_error("numbers, owners: one for each of quads");
   if (std::abs(double(owner_shift)) > double(1u << 31)) throw nb::value_error("owner_shift: within 2^31");
-  for (size_t f = 0; f < count; ++f) {
-    const int64_t first = numbers(f, 3), columns = numbers(f, 4), rows = numbers(f, 5);
-    if (first < 0 || columns < 0 || rows < 0 || first + columns * rows > int64_t(light.shape(1)))
-      throw nb::value_error("numbers: light samples of light");
-  }
-  for (size_t n = 0; n < lamps.shape(0); ++n)
-    if (!(lamps(n, 4) >= 0.0 && lamps(n, 4) < double(light.shape(0)))) throw nb::value_error("lamps: groups of light");
   unlocked([&] {
+    for (size_t f = 0; f < count; ++f) {
+      const int64_t first = numbers(f, 3), columns = numbers(f, 4), rows = numbers(f, 5);
+      if (first < 0 || columns < 0 || rows < 0 || first + columns * rows > int64_t(light.shape(1)))
+        throw nb::value_error("numbers: light samples of light");
+    }
+    for (size_t n = 0; n < lamps.shape(0); ++n)
+      if (!(lamps(n, 4) >= 0.0 && lamps(n, 4) < double(light.shape(0)))) throw nb::value_error("lamps: groups of light");
     bake_light({quads.data(), numbers.data(), owners.data(), count, owner_shift}, grid, lamps.data(), lamps.shape(0), reach_m, has_shadows,
                light.data(), light.shape(1));
   });

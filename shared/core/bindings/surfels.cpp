@@ -30,14 +30,14 @@ Picture<const typename Numbers::Scalar> picture(const Numbers& image) {
 
 void check_levels(const Levels& levels, size_t count) {
   if (levels.shape(0) != count) throw nb::value_error("levels: one for each point");
-  if (std::any_of(levels.data(), levels.data() + count, [](uint8_t level) { return level >= kLevels; }))
+  if (unlocked([&] { return std::any_of(levels.data(), levels.data() + count, [](uint8_t level) { return level >= kLevels; }); }))
     throw nb::value_error("levels: numbers from 0 to 4");
 }
 
 auto voxel_keys_of(const Points& points_map, const Levels& levels) {
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
-  std::vector<int64_t> keys(count);
+  auto keys = zeros<int64_t>(count);
   unlocked([&] {
     for (size_t i = 0; i < count; ++i) keys[i] = voxel_key(points_map(i, 0), points_map(i, 1), points_map(i, 2), levels(i));
   });
@@ -77,8 +77,8 @@ auto look_at_of(const Points& points_map, const Levels& levels, const Image32& n
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
   if (step_px < 1) throw nb::value_error("step_px: at least 1");
-  std::vector<uint8_t> marks(count);
-  std::vector<float> weights(count), pixels(2 * count);
+  auto marks = zeros<uint8_t>(count);
+  auto weights = zeros<float>(count), pixels = zeros<float>(2 * count);
   unlocked([&] {
     look_at(points_map.data(), levels.data(), count, picture(nearest_px), step_px, sigma_px, stereo(lens), cam_from_map.data(),
             clear_sigmas, clear_m, marks.data(), weights.data(), pixels.data());
@@ -107,10 +107,11 @@ auto draw_discs_of(const Array<int32_t, -1>& numbers, const Triples& points_cam,
   if (points_cam.shape(0) != count || pixels.shape(0) != count) throw nb::value_error("points_cam, pixels: one for each of numbers");
   check_levels(levels, surfels);
   if (colours.shape(0) != surfels) throw nb::value_error("colours: one for each normal");
-  if (std::any_of(numbers.data(), numbers.data() + count, [&](int32_t n) { return n < 0 || size_t(n) >= surfels; }))
+  const auto is_other = [&](int32_t n) { return n < 0 || size_t(n) >= surfels; };
+  if (unlocked([&] { return std::any_of(numbers.data(), numbers.data() + count, is_other); }))
     throw nb::value_error("numbers: of normals_map's rows");
   if (pixels_per_rad.shape(0) != rows || pixels_per_rad.shape(1) != columns) throw nb::value_error("pixels_per_rad: one for each ray");
-  std::vector<float> weight(rows * columns), colour(rows * columns), depth(rows * columns);
+  auto weight = zeros<float>(rows * columns), colour = zeros<float>(rows * columns), depth = zeros<float>(rows * columns);
   unlocked([&] {
     draw_discs(numbers.data(), points_cam.data(), pixels.data(), count, cam_from_map.data(), normals_map.data(), levels.data(),
                colours.data(), far_m, radius_edges, {rays.data(), pixels_per_rad.data(), ptrdiff_t(rows), ptrdiff_t(columns)},
@@ -132,8 +133,11 @@ auto blend_of(const Pairs& pixels, const Triples& conics, const Pairs& reaches_p
   const Gaussians gaussians = gaussians_of(pixels, conics, reaches_px, peaks, greys);
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^25 pixels");
   const size_t rows = size_t(height), columns = size_t(width);
-  std::vector<double> through(rows * columns, 1.0), blended(rows * columns);
-  unlocked([&] { blend(gaussians, {through.data(), height, width}, blended.data()); });
+  std::vector<double> through, blended;
+  unlocked([&] {
+    through.assign(rows * columns, 1.0), blended.resize(rows * columns);
+    blend(gaussians, {through.data(), height, width}, blended.data());
+  });
   return std::tuple(as_numpy<double, 2>(std::move(through), {rows, columns}), as_numpy<double, 2>(std::move(blended), {rows, columns}));
 }
 
@@ -142,7 +146,7 @@ auto blend_backward_of(const Pairs& pixels, const Triples& conics, const Pairs& 
   const Gaussians gaussians = gaussians_of(pixels, conics, reaches_px, peaks, greys);
   if (opacities.shape(0) != gaussians.count) throw nb::value_error("opacities: one for each of pixels");
   if (slopes.shape(0) != whole.shape(0) || slopes.shape(1) != whole.shape(1)) throw nb::value_error("slopes: of the picture's size");
-  std::vector<double> gradients(3 * gaussians.count);
+  auto gradients = zeros<double>(3 * gaussians.count);
   unlocked([&] {
     blend_backward(gaussians, opacities.data(), blur_px2, slopes.data(), whole.data(), ptrdiff_t(whole.shape(0)), ptrdiff_t(whole.shape(1)),
                    gradients.data());

@@ -137,7 +137,11 @@ void bind_tracking(nb::module_& module) {
              "levels"_a, "within_px"_a, "margin_px"_a);
   nb::class_<SharedTracker>(module, "Tracker")
       .def("__init__", &make_tracker, lens, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
-      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) { tracker.begin(pictured(left)); }), "left"_a.noconvert())
+      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) {
+             const GreyImage image = pictured(left);
+             unlocked([&] { tracker.begin(image); });
+           }),
+           "left"_a.noconvert())
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
       .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),
            "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none())

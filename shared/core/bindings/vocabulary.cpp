@@ -1,4 +1,4 @@
-#include "arrays.h"  // first: Python's header comes before the system's
+#include "in_turn.h"  // first: Python's header comes before the system's
 
 #include "vocabulary.h"
 
@@ -23,11 +23,13 @@ void check_tree(const Packed& centres, const Numbers& first_child, const Numbers
 
 auto descend_of(const Packed& descriptors, const Packed& centres, const Numbers& first_child, const Numbers& child_count,
                 const Numbers& word_of_node) {
-  check_tree(centres, first_child, child_count, word_of_node);
   const size_t count = descriptors.shape(0);
   std::vector<int32_t> words(count);
   const Tree tree{{centres.data(), centres.shape(0)}, first_child.data(), child_count.data(), word_of_node.data()};
-  unlocked([&] { descend({descriptors.data(), count}, tree, words.data()); });
+  unlocked([&] {
+    check_tree(centres, first_child, child_count, word_of_node);
+    descend({descriptors.data(), count}, tree, words.data());
+  });
   return as_numpy<int32_t, 1>(std::move(words), {count});
 }
 
@@ -39,6 +41,7 @@ auto two_nearest_of(const Packed& descriptors, const Packed& centres) {
 }
 
 using Weights = Array<float, -1>;
+using SharedFile = Shared<InvertedFile>;
 
 void check_words(const InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
   if (weights.shape(0) != word_ids.shape(0)) throw nb::value_error("weights: one for each word");
@@ -46,12 +49,14 @@ void check_words(const InvertedFile& index, const Numbers& word_ids, const Weigh
     if (word_ids(w) < 0 || size_t(word_ids(w)) >= index.words()) throw nb::value_error("word_ids: of the vocabulary");
 }
 
-void add_place(InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
-  check_words(index, word_ids, weights);
-  index.add(word_ids.data(), weights.data(), word_ids.shape(0));
+void add_place(SharedFile& index, const Numbers& word_ids, const Weights& weights) {
+  unlocked([&] {
+    check_words(index, word_ids, weights);
+    index.add(word_ids.data(), weights.data(), word_ids.shape(0));
+  });
 }
 
-auto scores_of(const InvertedFile& index, const Numbers& word_ids, const Weights& weights) {
+auto scores_of(SharedFile& index, const Numbers& word_ids, const Weights& weights) {
   check_words(index, word_ids, weights);
   const size_t count = index.places();
   std::vector<double> scores(count);
@@ -67,14 +72,14 @@ void bind_vocabulary(nb::module_& module) {
              "word_of_node"_a.noconvert());
   module.def("two_nearest", &two_nearest_of, descriptors, centres);
   const auto word_ids = "word_ids"_a.noconvert(), weights = "weights"_a.noconvert();
-  nb::class_<InvertedFile>(module, "InvertedFile")
+  nb::class_<SharedFile>(module, "InvertedFile")
       .def(
           "__init__",
-          [](InvertedFile* index, int words) {
+          [](SharedFile* index, int words) {
             if (words < 1 || words > 1 << 24) throw nb::value_error("words: 1 to 2^24");
-            new (index) InvertedFile(size_t(words));
+            unlocked([&] { new (index) SharedFile(size_t(words)); });
           },
           "words"_a)
-      .def("add", &add_place, word_ids, weights)
-      .def("scores", &scores_of, word_ids, weights);
+      .def("add", in_turn(&add_place), word_ids, weights)
+      .def("scores", in_turn(&scores_of), word_ids, weights);
 }
