@@ -40,6 +40,9 @@ def test_what_moves_otherwise_ends() -> None:
     np.testing.assert_allclose(
         FOCAL_PX * seen[:, :2] / seen[:, 2:] + LENS[1:3] - pixels[:, :2] - [2.0, 0.0], 0.0, atol=0.3
     )
+    sigmas = np.sqrt(np.diag(np.linalg.inv(motion[1])))  # of a turn, and of a shift at 2.5 m and 250 px
+    assert (np.linalg.eigvalsh(motion[1]) > 0.0).all()
+    assert (sigmas < [0.005] * 3 + [0.02] * 3).all()
     ids, moved = tracker.ids, tracker.pixels - pixels[tracker.ids]
     around = (pixels[:, :2] > [80, 40]) & (pixels[:, :2] < [220, 160])
     outside, inside = ~around.all(axis=1), ((pixels[:, :2] > [115, 75]) & (pixels[:, :2] < [185, 125])).all(axis=1)

@@ -1,0 +1,77 @@
+"""The fix of a frame in a map, against numeric derivatives of the pixels."""
+
+import numpy as np
+
+from fleetmap import core
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import Array, se3_exp, se3_inverse, so3_log, transform_points
+from fleetmap.pnp.pnp import REFINEMENT
+from fleetmap.relocalization.settings import FixSettings
+from fleetmap.sensors.rectification import StereoCamera
+
+CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
+COUNT, OCTAVE_SCALE, STEP = 120, 1.2, 1e-6
+
+
+def test_a_fix_is_the_robust_minimum_and_its_covariance_that_of_the_minimum() -> None:
+    """Some features are without depth, some show their landmark pixels away."""
+    rng, settings = np.random.default_rng(6), FixSettings()
+    truth = se3_exp(np.array([0.4, -1.1, 0.6, 2.0, -3.0, 1.0]))
+    points_cam = np.column_stack([rng.uniform([-0.7, -0.5], [0.7, 0.5], (COUNT, 2)), np.ones(COUNT)])
+    points_cam *= rng.uniform(1.5, 8.0, (COUNT, 1))
+    points_map, octaves = transform_points(truth, points_cam), rng.integers(0, 4, COUNT)
+    distances = np.linalg.norm(points_cam, axis=1)
+    seen_from = ((truth[:3, 3] - points_map) / distances[:, None]).astype(np.float32)
+    reach = (distances * OCTAVE_SCALE**octaves).astype(np.float32)
+    descriptors = rng.integers(0, 2**63, (COUNT, 4)).astype(np.uint64)
+    pixels = CAMERA.pixel_from_point(points_cam)
+    pixels[:, 2] += settings.disparity_sigma_px * rng.normal(size=COUNT)
+    pixels += settings.feature_sigma_px * OCTAVE_SCALE ** octaves[:, None] * rng.normal(size=(COUNT, 2))[:, [0, 1, 0]]
+    pixels[::5, 2], pixels[::8, 1] = np.nan, pixels[::8, 1] + 9.0
+    finder = core.FixFinder(
+        *((points_map, seen_from, np.full(COUNT, 0.3, np.float32), reach), np.full(COUNT, 0.01, np.float32), descriptors),
+        *(truth[None], np.arange(COUNT), np.array([0, COUNT]), np.array([*CAMERA.lens, 640.0, 480.0]), 1.0, OCTAVE_SCALE),
+        *(settings, StereoSettings(), 0.35, REFINEMENT),
+    )  # fmt: skip
+    features = pixels, pixels[:, :2].copy(), octaves.astype(np.int8), descriptors
+    found = finder.by_projection(
+        features, None, truth @ se3_exp(np.array([0.01, -0.01, 0.01, 0.04, 0.03, -0.04])), 30.0
+    )
+    assert found is not None
+    map_from_cam, covariance, _, seen, rows, inliers, (points, measured, sigmas), covisible, is_found, is_passed = found
+    np.testing.assert_array_equal(seen, rows)
+    assert inliers.mean() > 0.8
+    assert not inliers[rows % 8 == 0].any()
+    assert is_passed
+    np.testing.assert_array_equal(np.sort(covisible[is_found]), np.sort(rows[inliers]))
+    points, measured, sigmas = points[inliers], measured[inliers], sigmas[inliers]
+
+    def placed(step: Array) -> Array:
+        return se3_inverse(se3_exp(step) @ se3_inverse(map_from_cam))
+
+    def residuals(step: Array) -> Array:
+        """(P, 3) of u, v and disparity, in sigmas."""
+        off = CAMERA.pixel_from_point(transform_points(se3_inverse(placed(step)), points)) - measured
+        off[:, 2] = np.nan_to_num(off[:, 0] - off[:, 2])
+        return np.asarray(off / sigmas[:, [0, 0, 1]])
+
+    def errors(step: Array) -> Array:
+        """Rotation in map axes, and position."""
+        there = placed(step)
+        return np.concatenate([so3_log(there[:3, :3] @ map_from_cam[:3, :3].T), there[:3, 3] - map_from_cam[:3, 3]])
+
+    by_step, moved = (
+        np.stack([(of(step) - of(-step)) / (2 * STEP) for step in STEP * np.eye(6)], axis=-1)
+        for of in (residuals, errors)
+    )
+    left, width = residuals(np.zeros(6)), REFINEMENT[0]
+    # of Geman and McClure's cost w^2 e^2 / (w^2 + e^2) / 2
+    weights = (width**2 / (width**2 + (left**2).sum(axis=1))) ** 2
+    information = np.einsum("p,pri,prj->ij", weights, by_step, by_step)
+    step = np.linalg.solve(information, np.einsum("p,pri,pr->i", weights, by_step, left))
+    assert step @ information @ step < 1e-4
+    floors = np.repeat([settings.floor_rad, settings.floor_m], 3) ** 2
+    expected = settings.covariance_scale * moved @ np.linalg.inv(information) @ moved.T + np.diag(floors)
+    off = np.concatenate([so3_log(truth[:3, :3] @ map_from_cam[:3, :3].T), truth[:3, 3] - map_from_cam[:3, 3]])
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-4 * floors.min())
+    assert off @ np.linalg.solve(covariance, off) < 22.0
