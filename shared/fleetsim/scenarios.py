@@ -102,7 +102,11 @@ def _clip() -> Scenario:
     y = layout.aisle_y_m(0)
     straight = Route(((5.0, y), (8.0, y)), rest_s=0.5)
     turn = Route(((3.0, y - 0.2), (5.0, y - 0.2), (9.0, y + 0.2)), rest_s=0.5)
-    runs = {"survey": Run("surveyor", (straight,), is_sharp=True), "tote-1": Run("tote", (turn,))}
+    runs = {
+        "survey": Run("surveyor", (straight,), is_sharp=True),
+        "tote-1": Run("tote", (turn,)),
+        "carried": Run("tote", (turn, straight)),
+    }
     return Scenario("three metres of one aisle, for tests and first looks", layout, runs)
 
 

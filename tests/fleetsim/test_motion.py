@@ -7,7 +7,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import UsageError
-from fleetsim.motion.body_motion import CarriedMotion, RouteMotion, Shake, UniformSpline
+from fleetsim.motion.body_motion import GRAVITY_MPS2, LIFT_M, LIFT_S, CarriedMotion, RouteMotion, Shake, UniformSpline
 from fleetsim.motion.routes import Limits, Route, check_clear, time_path
 from fleetsim.recorder import drive
 from fleetsim.scenarios import SCENARIOS
@@ -100,12 +100,21 @@ def test_limits_stops_and_rest_are_kept() -> None:
     assert 1.5 < middle < 3.0  # the stop of two seconds
 
 
-def test_carried_motion_jumps_between_rests() -> None:
+def test_a_carried_robot_is_lifted_between_its_rests_and_feels_it() -> None:
     first, second = _motion(), _motion(Route(((5.0, 5.0), (9.0, 5.0))))
     carried = CarriedMotion([first, second])
-    times = np.array([first.duration_s - 0.01, first.duration_s + 0.01])
-    places = carried.map_from_body(times)[:, :3, 3]
-    assert np.linalg.norm(places[1] - places[0]) > 1.0
+    times = first.duration_s + np.arange(0.0, 2.0 * LIFT_S, 0.001)
+    places, (_, force) = carried.map_from_body(times), carried.rates(times)
+    jumps_m = np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1)
+    assert np.argmax(jumps_m) == LIFT_S * 1000 - 1
+    assert jumps_m.max() > 1.0
+    assert np.sort(jumps_m)[-2] < 0.002
+    heights_m = places[:, 2, 3] - places[0, 2, 3]
+    np.testing.assert_allclose(heights_m[[0, -1]], 0.0, atol=1e-3)
+    assert heights_m.max() == pytest.approx(LIFT_M, abs=1e-3)
+    by_differences = np.gradient(np.gradient(heights_m, 0.001), 0.001)
+    felt = np.einsum("ni,ni->n", places[:, 2, :3], force) - GRAVITY_MPS2
+    np.testing.assert_allclose(felt[2:-2], by_differences[2:-2], atol=0.05)
     np.testing.assert_allclose(carried.velocity_body(times), 0.0, atol=0.01)
 
 

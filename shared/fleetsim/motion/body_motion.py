@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetsim.motion.routes import Limits, Route, TimedPath, time_path
@@ -143,12 +144,18 @@ class RouteMotion:
         return np.asarray(np.einsum("nji,nj->ni", rotation, self._spline.at(times_s, 1)[:, :3]))
 
 
+LIFT_M, LIFT_S = 0.5, 1.0
+
+
 class CarriedMotion:
-    """Several motions one after another; between them the robot is carried while it stands, and feels nothing."""
+    """Several motions one after another. Between two of them hands lift the robot by LIFT_M within LIFT_S, and set it down as fast at the
+    start of the next: it sees and feels that, and nothing of the way between. Its wheels stand."""
 
     def __init__(self, motions: Sequence[RouteMotion]) -> None:
         self._motions = list(motions)
-        self._ends_s = np.cumsum([motion.duration_s for motion in motions])
+        last = len(motions) - 1
+        lifts_s = [LIFT_S * ((number > 0) + (number < last)) for number in range(len(motions))]
+        self._ends_s = np.cumsum([m.duration_s + lift_s for m, lift_s in zip(motions, lifts_s, strict=True)])
 
     @property
     def duration_s(self) -> float:
@@ -157,22 +164,43 @@ class CarriedMotion:
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4); jumps where one piece ends."""
-        return self._pick(times_s, lambda motion, local_s: motion.map_from_body(local_s))
+        placed = self._pick(times_s, lambda motion, local_s: motion.map_from_body(local_s))
+        placed[:, 2, 3] += self._height(times_s, 0)
+        return placed
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
         """As RouteMotion.rates of the piece in force."""
         gyro = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[0])
-        return gyro, self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[1])
+        force = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[1])
+        up_body = self.map_from_body(times_s)[:, 2, :3]
+        return gyro, force + self._height(times_s, 2)[:, None] * up_body
 
     def velocity_body(self, times_s: Array) -> Array:
-        """As RouteMotion.velocity_body of the piece in force."""
+        """As RouteMotion.velocity_body of the piece in force, as the wheels know it: they do not feel the lift."""
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
-    def _pick(self, times_s: Array, ask: Callable[[RouteMotion, Array], Array]) -> Array:
+    def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:
+        """(N,) the piece in force, and the time since the robot stood on its floor, which is negative before."""
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
-        starts = np.concatenate([[0.0], self._ends_s[:-1]])
+        starts_s = np.concatenate([[0.0], self._ends_s[:-1] + LIFT_S])
+        return piece, times_s - starts_s[piece]
+
+    def _height(self, times_s: Array, derivative: int) -> Array:
+        """(N,) above the floor, or a derivative; the fifth-order curve that begins and ends at rest."""
+        piece, local_s = self._local(times_s)
+        ends_s = np.array([motion.duration_s for motion in self._motions])[piece]
+        before, after = -local_s / LIFT_S, (local_s - ends_s) / LIFT_S
+        after = np.where(piece < len(self._motions) - 1, after, 0.0)
+        share = np.clip(np.maximum(before, after), 0.0, 1.0)
+        curve = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv(derivative)
+        sign = np.where(before > after, -1.0, 1.0) ** derivative
+        return np.asarray(LIFT_M / LIFT_S**derivative * sign * curve(share))
+
+    def _pick(self, times_s: Array, ask: Callable[[RouteMotion, Array], Array]) -> Array:
+        piece, local_s = self._local(times_s)
         answers = [
-            ask(motion, times_s[piece == number] - starts[number]) for number, motion in enumerate(self._motions)
+            ask(motion, np.clip(local_s[piece == number], 0.0, motion.duration_s))
+            for number, motion in enumerate(self._motions)
         ]
         merged = np.zeros((len(times_s), *answers[0].shape[1:]))
         for number, answer in enumerate(answers):
