@@ -133,8 +133,8 @@ class Localizer:
     def localize(self, percept: Percept, frame: RectifiedFrame | None = None) -> Estimate:
         """The estimate by what was perceived, newer than any before. frame: without it, all that the frame showed is in `percept`."""
         odometry, tracker = percept.odometry, self._tracker
-        if self._last_ns is not None and is_away(self._last_ns, odometry):
-            tracker.forget(keeps_new_prior=True)
+        if odometry.is_lifted or (self._last_ns is not None and is_away(self._last_ns, odometry)):
+            tracker.forget(keeps_new_prior=True, is_carried=odometry.is_lifted)
             self._query.forget()
             self._calibration.give_up()
         self._last_ns = odometry.stamp_ns
@@ -156,7 +156,7 @@ class Localizer:
             hypotheses=(),
             odometry=odometry,
             stage_s={},
-            cause=percept.image.cause,
+            cause=Cause.CARRIED if tracker.is_carried else percept.image.cause,
             image=percept.image,
             **result._asdict(),
         )

@@ -29,8 +29,8 @@ class Start:
 
     map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
     of which stamp_ns and support are; else by a prior, with its is_revisable, is_told and travelled_m, the distance since it came.
-    has_broken: tracks broke since. was_tracking: the robot has known its pose before. failed_queries: the last so many map queries found
-    nothing.
+    has_broken: tracks broke since. was_tracking: the robot has known its pose before; is_carried: hands have moved it since.
+    failed_queries: the last so many map queries found nothing.
     """
 
     frame_index: int = 0
@@ -44,6 +44,7 @@ class Start:
     travelled_m: float = 0.0
     has_broken: bool = False
     was_tracking: bool = False
+    is_carried: bool = False
     failed_queries: int = 0
 
 
@@ -72,6 +73,7 @@ class PoseTracker:
         self.candidates = HypothesisSet(settings.track)
         self.confirmed: PoseHypothesis | None = None
         self.was_tracking = False
+        self.is_carried = False  # hands have moved it since it knew its pose
         self.lookalikes: LookAlikes | None = None
         self.odom_from_body: Array | None = None  # of the last frame
         self._query_frame: PoseHypothesis | None = None  # of the map query that goes on, as the identity
@@ -87,19 +89,21 @@ class PoseTracker:
         """Whether a confirmed pose lies outside the bound of a prior."""
         return self.confirmed is not None and not agrees(prior, self.confirmed, self._base_from_body)
 
-    def forget(self, *, keeps_new_prior: bool = False) -> None:
-        """Searches for itself from now on. keeps_new_prior: one that came since the last frame says where the robot is now."""
+    def forget(self, *, keeps_new_prior: bool = False, is_carried: bool = False) -> None:
+        """Searches for itself from now on. keeps_new_prior: one that came since the last frame says where the robot is now. is_carried: it
+        knows that it is lifted, and is LOST if it had known its pose."""
         if not (keeps_new_prior and self.prior is not None and self.prior.is_new):
             self.prior = None
         self.confirmed = self._query_frame = None
         self.candidates.reset()
-        self.was_tracking = False
+        self.is_carried = is_carried
+        self.was_tracking &= is_carried
 
     def start(self, failed_queries: int) -> Start:
         """What another tracker, with the same odometry, goes on with."""
         prior = self.prior
         known = self.confirmed or (None if prior is None else prior.hypothesis)
-        start = Start(was_tracking=self.was_tracking, failed_queries=failed_queries)
+        start = Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
         if known is None:
             return start
         return replace(
@@ -119,7 +123,7 @@ class PoseTracker:
     def begin(self, start: Start) -> None:
         """Goes on from `start` with the next frame."""
         self.forget()
-        self.was_tracking = start.was_tracking
+        self.was_tracking, self.is_carried = start.was_tracking, start.is_carried
         if start.map_from_body is None or start.cov_rot_trans is None:
             return
         at_frame = start.map_from_body, start.cov_rot_trans
@@ -284,7 +288,7 @@ class PoseTracker:
             moved_m = candidates.moved_m(best)
             candidates.reset()
             self.confirmed, self.prior = best, None
-            self.was_tracking = True
+            self.was_tracking, self.is_carried = True, False
         best_m = best.now_map_from_body[:3, 3]
         for fix, hypothesis in self.observations(fixes):
             if np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m) < _OWN_FIX_M:

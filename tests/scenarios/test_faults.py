@@ -12,6 +12,7 @@ import pytest
 from benchmarks.common import estimator_loop
 from fleetmap.messages import Cause, Status
 from fleetmap.relocalization.map_view import MapView
+from fleetsim.motion.body_motion import LIFT_S
 from fleetsim.recorder import Order, Session, prepare
 from fleetsim.sensors.faults import Fault, FaultPlan
 from locclient.localization.estimate import Estimate
@@ -80,3 +81,20 @@ def test_a_gap_is_bridged_by_the_other_sensor(fault: str, duration_s: float) -> 
     assert {e.status for t, e in by_time.items() if t > 0.0} <= {Status.TRACKING, Status.DEGRADED}
     assert all(e.status is Status.TRACKING for t, e in by_time.items() if t > duration_s + 1.0)
     assert any(t > duration_s + 1.0 for t in by_time)
+
+
+def test_a_robot_that_is_carried_is_lost_when_it_is_lifted() -> None:
+    """Within half a second of the first pull, with that cause; on the floor of another place it finds itself. No drive is a lift."""
+    _, field, view = _site()
+    carried = prepare(Order("clip", robot="carried", frames=130))
+    carried.renderer.close()
+    session = EstimatorSession(carried, field=field)
+    by_time = said(session, estimator_loop.run_localizer(session, view, has_wheels=True))
+    heights_m, times_s = session.map_from_body[:, 2, 3], np.array(list(by_time))
+    in_air_s = times_s[heights_m > heights_m[0] + 0.005]
+    for time_s, estimate in by_time.items():
+        assert not estimate.odometry.is_lifted or in_air_s[0] < time_s < in_air_s[-1] + 0.5
+        assert (estimate.status is Status.LOST) == (estimate.cause is Cause.CARRIED)
+        if in_air_s[0] + 0.4 < time_s < in_air_s[0] + LIFT_S:
+            assert estimate.status is Status.LOST
+    assert next(e for t, e in by_time.items() if t > in_air_s[-1] + 0.7).status is Status.TRACKING

@@ -30,7 +30,7 @@ class OdometryEstimate:
     estimates differ by: gravity that becomes better known turns all of `odom` about its origin, far from where the body is.
     imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
     scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
-    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)).
+    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)). is_lifted: a robot with wheels leaves its floor.
     """
 
     stamp_ns: int
@@ -53,6 +53,7 @@ class OdometryEstimate:
     imu_minus_cam_sigma_s: float = np.inf
     track_pixels: Array | None = None
     previous_from_body: Array | None = None
+    is_lifted: bool = False
 
 
 def is_away(last_ns: int, estimate: OdometryEstimate) -> bool:

@@ -16,6 +16,7 @@ from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
+from fleetmap.odometry.lift_check import LiftCheck
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause
 from fleetmap.odometry.tracking.tracker import Tracked
@@ -62,7 +63,7 @@ class ImuInputs:
 class Step(NamedTuple):
     """What a mode made of one frame: the mode from now on, what its update used (see `InvariantFilter.update`).
 
-    new_odom_from_old_odom and revised are as in OdometryEstimate. is_lost: nothing that was tracked is believed.
+    new_odom_from_old_odom, revised and is_lifted are as in OdometryEstimate. is_lost: nothing that was tracked is believed.
     """
 
     mode: "Mode"
@@ -70,6 +71,7 @@ class Step(NamedTuple):
     new_odom_from_old_odom: Array | None = None
     revised: tuple[tuple[int, Array], ...] = ()
     is_lost: bool = False
+    is_lifted: bool = False
 
 
 class Mode(ABC):
@@ -169,6 +171,7 @@ class WindowMode(Mode):
             imu_minus_cam_sigma_s=window_filter.offset_sigma_s if self.inertial else np.inf,
             track_pixels=tracked.pixels,
             previous_from_body=self.window.body_since(frame_index - 1) if frame_index else None,
+            is_lifted=step.is_lifted,
         )
 
 
@@ -383,6 +386,7 @@ class InertialMode(WindowMode):
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
         self._seen: Array | None = None  # the last motion that images showed
+        self._lift = LiftCheck(self._rig.base_from_body)
         self._elsewhere_frames = 0  # in a row, whose descriptor matches contradicted the prediction
         self._is_pause = False
 
@@ -429,6 +433,7 @@ class InertialMode(WindowMode):
         elif window.contradicts_images and seen is not None:
             window.filter.inflate_velocity(self._off_mps(frame_index - 1, seen))  # it is locked in a wrong speed
         self._update_zero_velocity(tracked)
+        rolled = self._imu.samples.wheel_between(0, window.stamp_ns)
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
         if wheel is not None:
             window.filter.correct_by_wheel_sample(*wheel, self._rig.base_from_body, _GATE_4)
@@ -436,7 +441,13 @@ class InertialMode(WindowMode):
         off_mps = 0.0 if seen is None else self._off_mps(frame_index - 1, seen)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, off_mps):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
-        return Step(self, used, is_lost=tracked.lost)
+        moved = (
+            window.filter.odom_from_body(),
+            window.body_since(frame_index - 1),
+            float(np.sqrt(window.filter.covariance[5, 5])),
+        )
+        is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)
+        return Step(self, used, is_lost=tracked.lost, is_lifted=is_lifted)
 
     def _off_mps(self, frame_index: int, seen: Array) -> float:
         """The speed by which cam_from_earlier (4, 4), by images since a frame, differs from the state's; 0 for what its covariance admits.

@@ -10,10 +10,11 @@ import pytest
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.messages import Cause, Status
+from fleetmap.messages import Cause, FailureKind, Status
 from locclient.localization.estimate import assemble
 from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.settings import TrackSettings
+from locclient.robot.failure_monitor import FailureMonitor
 from support.fleet.estimates import estimate as estimate_at
 from support.fleet.scripted_robot import FRAME_NS, NO_FIX, TRUE, Robot, off
 
@@ -206,6 +207,20 @@ def test_who_knew_that_he_might_be_anywhere_has_not_moved(tracking: Robot) -> No
     after = tracking.ride(12, 0.25)
     assert after[-1].status is Status.TRACKING
     assert all(estimate.moved_m is None for estimate in after)
+
+
+def test_a_robot_that_is_lifted_knows_at_once_that_it_is_lost(tracking: Robot) -> None:
+    """Its report says so."""
+    monitor = FailureMonitor()
+    monitor.handle(tracking.go(0.2))
+    tracking.odometry.lifts = True
+    said = [tracking.go(0.0, NO_FIX) for _ in range(12)]
+    assert {(e.status, e.cause) for e in said} == {(Status.LOST, Cause.CARRIED)}
+    failures = [failure for estimate in said if (failure := monitor.handle(estimate)) is not None]
+    assert [(failure.kind, failure.cause) for failure in failures] == [(FailureKind.BLIND, Cause.CARRIED)]
+    tracking.inliers = 100
+    assert tracking.knows(tracking.go(0.0))
+    assert tracking.go(0.0).cause is Cause.NONE
 
 
 def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:

@@ -43,10 +43,10 @@ class ScriptedOdometry:
         self.next_motion = np.eye(4)
         self.redefine: Array | None = None
         self.drift_share = 0.0
-        self.breaks = False  # at the next frame
+        self.breaks = self.lifts = False  # at the next frame
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        change, self.redefine = self.redefine, None
+        (change, self.redefine), (is_lifted, self.lifts) = (self.redefine, None), (self.lifts, False)
         status, self.breaks = OdometryStatus.DEGRADED if self.breaks else OdometryStatus.TRACKING, False
         if change is not None:
             self.odom_from_body = [change @ earlier for earlier in self.odom_from_body]
@@ -54,7 +54,7 @@ class ScriptedOdometry:
         self.odom_from_body.append(last @ self.next_motion)
         return OdometryEstimate(
             frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), np.zeros(3),
-            np.zeros(3), np.zeros(3), status, np.arange(50), 5.0, 1.0, False, True, change,
+            np.zeros(3), np.zeros(3), status, np.arange(50), 5.0, 1.0, False, True, change, is_lifted=is_lifted,
         )  # fmt: skip
 
     def will_forget(self, frame_index: int) -> bool:

@@ -1,0 +1,72 @@
+"""When a robot on wheels has left its floor, and what is no lift."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.odometry.lift_check import LiftCheck
+from fleetmap.sensors.samples import WheelSample
+
+FRAME_S, MOUNTED = 1 / 15, se3(so3_exp(np.array([0.02, 0.6, 0.0])), np.array([0.3, 0.0, 0.4]))  # base_from_body
+Pose = tuple[float, float, float]  # x and z of the base in metres, pitch in radians
+
+
+def ramp(t: float) -> Pose:
+    """Of 8 degrees, from 1 to 4 s, at 1 m/s."""
+    slope = np.radians(8.0) * np.clip((t - 1.0) / 0.3, 0, 1) * np.clip((4.0 - t) / 0.3, 0, 1)
+    return t, np.tan(np.radians(8.0)) * float(np.clip(t - 1.0, 0, 3)), -float(slope)
+
+
+def bump(t: float) -> Pose:
+    """A cable bridge of 4 cm, a quarter of a second long."""
+    u = np.clip((t - 2.0) / 0.25, 0, 1)
+    return 1.2 * t, float(0.04 * np.sin(np.pi * u)), float(0.07 * np.sin(2 * np.pi * u))
+
+
+def brake(t: float) -> Pose:
+    """From 1.8 m/s by 4 m/s^2; it dives by 3 degrees, and its wheels lock."""
+    left = np.clip(2.0 - t, -0.45, 0)
+    return 1.8 * min(t, 2.0) - float(1.8 * left + 2.0 * left**2), 0.0, 0.05 if 2.0 < t < 2.45 else 0.0
+
+
+def lift(t: float) -> Pose:
+    u = float(np.clip(t - 2.0, 0, 1))
+    return min(t, 1.8), 0.5 * (10 * u**3 - 15 * u**4 + 6 * u**5), 0.0
+
+
+def tip(t: float) -> Pose:
+    return min(t, 1.8), 0.0, float(np.clip(t - 2.0, 0, 0.5))
+
+
+def fork(t: float) -> Pose:
+    """Carried level, so gently that nothing was felt of the lift."""
+    return min(t, 1.8) + 0.8 * max(t - 2.0, 0.0), 0.0, 0.0
+
+
+@pytest.mark.parametrize(
+    ("way", "stops_s", "within_s"),
+    [(ramp, 9.0, None), (bump, 9.0, None), (brake, 2.0, None), (lift, 1.8, 0.5), (tip, 1.8, 0.5), (fork, 1.8, 0.5)],
+)
+@pytest.mark.parametrize("has_wheels", [True, False])
+def test_what_is_a_lift(way: Callable[[float], Pose], stops_s: float, within_s: float | None, has_wheels: bool) -> None:
+    check, before, told_s = LiftCheck(MOUNTED), MOUNTED, []
+    for k in range(1, round(5.0 / FRAME_S)):
+        x_m, z_m, pitch_rad = way(k * FRAME_S)
+        odom_from_body: Array = se3(so3_exp(np.array([0.0, pitch_rad, 0.0])), np.array([x_m, 0.0, z_m])) @ MOUNTED
+        speed_mps = np.array([1.0 if k * FRAME_S < stops_s else 0.0, 0.0, 0.0])
+        stamp_ns = int(k * FRAME_S * 1e9)
+        wheel = [WheelSample(stamp_ns, speed_mps, 0.0, 0.02, 0.02)] if has_wheels else []
+        if check.is_lifted(stamp_ns, wheel, odom_from_body, se3_inverse(before) @ odom_from_body, 0.01):
+            told_s.append(k * FRAME_S)
+        before = odom_from_body
+    assert bool(told_s) == (within_s is not None and has_wheels)
+    assert within_s is None or not told_s or 2.0 < told_s[0] < 2.0 + within_s
+
+
+def test_wheels_that_never_turn_say_nothing() -> None:
+    check, step = LiftCheck(np.eye(4)), se3(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    for k in range(30):
+        wheel = [WheelSample(k * 66_000_000, np.zeros(3), 0.0, 0.02, 0.02)]
+        assert not check.is_lifted(k * 66_000_000, wheel, np.eye(4), step, 0.01)
