@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "camera.h"
 #include "lie.h"
 #include "picture.h"
 

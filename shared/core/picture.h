@@ -14,11 +14,6 @@ struct Picture {
   Number* row(ptrdiff_t v) const { return at + v * width; }
 };
 
-// A rectified stereo pair's focal length and principal point in pixels, and the product of focal length and baseline in px m.
-struct StereoLens {
-  double focal, cx, cy, focal_baseline;
-};
-
 // A whole number, far outside of any picture where it is large or none.
 inline ptrdiff_t whole_or_outside(double number) {
   return std::abs(number) < 1e9 ? ptrdiff_t(number) : number > 0.0 ? 1'000'000'000 : -1'000'000'000;

@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "camera.h"
 #include "lie.h"
 #include "picture.h"
 

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "allocations.h"
+#include "camera.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -26,6 +27,12 @@ nb::ndarray<nb::numpy, Element, nb::ndim<kDimensions>> as_numpy(std::vector<T>&&
   auto* kept = new std::vector<T>(std::move(values));
   nb::capsule owner(kept, [](void* held) noexcept { delete static_cast<std::vector<T>*>(held); });
   return {reinterpret_cast<Element*>(kept->data()), shape, owner};
+}
+
+template <typename Element, typename T>
+nb::ndarray<nb::numpy, Element, nb::ndim<1>> as_numpy(std::vector<T>&& values) {
+  const size_t count = values.size();
+  return as_numpy<Element, 1>(std::move(values), {count});
 }
 
 // A numpy array with a copy of a few numbers.
@@ -49,3 +56,6 @@ template <typename T>
 std::vector<T> zeros(size_t count) {
   return unlocked([&] { return std::vector<T>(count); });
 }
+
+using Lens = Array<double, 4>;
+inline fleetmap::StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }

@@ -88,8 +88,7 @@ auto solve(const BlockCholesky& pattern, const Array<double, -1>& values, const 
     x.assign(rhs.data(), rhs.data() + rhs.size());
     pattern.solve(values.data(), x.data());
   });
-  const size_t count = x.size();
-  return as_numpy<double, 1>(std::move(x), {count});
+  return as_numpy<double>(std::move(x));
 }
 
 }  // namespace

@@ -15,7 +15,7 @@ auto undistort_of(const Array<double, 8>& lens, const Reals& goals_x, const Real
   if (goals_y.shape(0) != count) throw nb::value_error("goals_y: as many as goals_x");
   std::vector<double> x(count), y(count);
   unlocked([&] { undistort(radial_tangential(lens.data()), goals_x.data(), goals_y.data(), count, x.data(), y.data()); });
-  return std::make_tuple(as_numpy<double, 1>(std::move(x), {count}), as_numpy<double, 1>(std::move(y), {count}));
+  return std::make_tuple(as_numpy<double>(std::move(x)), as_numpy<double>(std::move(y)));
 }
 
 auto register_depth_of(const Array<float, -1, -1>& depth, const Array<double, -1, 3>& rays, const Array<double, 4, 4>& colour_from_depth,

@@ -19,7 +19,7 @@ auto spread_corners_of(const Image& image, int count, double distance_px, int th
   CornerFinder found;
   unlocked([&] { found.find(grey(image), size_t(count), {threshold, border_px, distance_px}, first(taken), taken.shape(0)); });
   const size_t size = found.corners.size();
-  return std::make_tuple(as_numpy<float, 2>(std::move(found.corners), {size, 2}), as_numpy<double, 1>(std::move(found.scores), {size}));
+  return std::make_tuple(as_numpy<float, 2>(std::move(found.corners), {size, 2}), as_numpy<double>(std::move(found.scores)));
 }
 
 auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, const Pixels& taken, double distance_px, int count, int width,
@@ -36,8 +36,7 @@ auto select_spread_of(const Pixels& pixels, const Array<int64_t, -1>& order, con
     return Suppression()(first(pixels), order.data(), order.shape(0), first(taken), taken.shape(0), distance_px, size_t(count), width,
                          height);
   });
-  const size_t found = chosen.size();
-  return as_numpy<int64_t, 1>(std::move(chosen), {found});
+  return as_numpy<int64_t>(std::move(chosen));
 }
 
 auto centroid_angles_deg_of(const Image& image, const Pixels& pixels, int radius) {
@@ -46,7 +45,7 @@ auto centroid_angles_deg_of(const Image& image, const Pixels& pixels, int radius
   if (count && image.size() == 0) throw nb::value_error("image: not empty");
   std::vector<float> degrees(count);
   unlocked([&] { centroid_angles(grey(image), first(pixels), count, radius, degrees.data()); });
-  return as_numpy<float, 1>(std::move(degrees), {count});
+  return as_numpy<float>(std::move(degrees));
 }
 
 }  // namespace

@@ -114,7 +114,7 @@ auto update(SharedFilter& filter, const Indices& alive, const Array<bool, -1>& d
   if (newest_odom_from_body) hint = se3(newest_odom_from_body->data());
   const LivingPoints living{alive.data(), due.data(), alive.shape(0)};
   const std::vector<int8_t>* const used = unlocked([&] { return &filter.update(living, first_depth_m, iterations, hint, sigma_scale); });
-  return as_numpy<int8_t, 1>(std::vector<int8_t>(*used), {used->size()});
+  return as_numpy<int8_t>(std::vector<int8_t>(*used));
 }
 
 double correct_by_wheels(SharedFilter& filter, const Vector& velocity_base_mps, double yaw_rate_radps, double sigma_mps, double sigma_radps,

@@ -9,7 +9,7 @@ namespace {
 using Image32 = Array<float, -1, -1>;
 using Voxels = MutableArray<uint8_t, -1, -1, kSlices>;
 
-auto cast_view_of(const Image32& disparity_px, const Image32& nearest_px, double sigma_px, const Array<double, 4>& lens,
+auto cast_view_of(const Image32& disparity_px, const Image32& nearest_px, double sigma_px, const Lens& lens,
                   const Array<double, 3, 3>& map_from_cam, const Array<double, 3>& camera, const Array<uint8_t, -1, -1>& was_free) {
   if (nearest_px.shape(0) != disparity_px.shape(0) || nearest_px.shape(1) != disparity_px.shape(1))
     throw nb::value_error("nearest_px: of the size of disparity_px");
@@ -18,9 +18,8 @@ auto cast_view_of(const Image32& disparity_px, const Image32& nearest_px, double
   auto looks = zeros<uint8_t>(rows * columns * slices), heights = zeros<uint8_t>(2 * rows * columns);
   const ptrdiff_t height = ptrdiff_t(disparity_px.shape(0)), width = ptrdiff_t(disparity_px.shape(1));
   unlocked([&] {
-    cast_view({disparity_px.data(), height, width}, {nearest_px.data(), height, width}, sigma_px, {lens(0), lens(1), lens(2), lens(3)},
-              mat3(map_from_cam.data()), vec3(camera.data()), was_free.data(),
-              {ptrdiff_t(rows), ptrdiff_t(columns), points.data(), looks.data(), heights.data()});
+    cast_view({disparity_px.data(), height, width}, {nearest_px.data(), height, width}, sigma_px, lens_of(lens), mat3(map_from_cam.data()),
+              vec3(camera.data()), was_free.data(), {ptrdiff_t(rows), ptrdiff_t(columns), points.data(), looks.data(), heights.data()});
   });
   return std::tuple(as_numpy<uint16_t, 3>(std::move(points), {rows, columns, slices}),
                     as_numpy<uint8_t, 3>(std::move(looks), {rows, columns, slices}),

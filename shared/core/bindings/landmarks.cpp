@@ -35,11 +35,6 @@ Lists lists_of(const Indices& starts, size_t size, const char* refusal) {
 
 uint8_t* bytes(const MutableArray<bool, -1>& flags) { return reinterpret_cast<uint8_t*>(flags.data()); }
 
-auto flags_array(std::vector<uint8_t>&& flags) {
-  const size_t count = flags.size();
-  return as_numpy<bool, 1>(std::move(flags), {count});
-}
-
 auto spare_keyframes_of(const Indices& rows, const Indices& row_starts, const Indices& tracks, const Indices& starts,
                         const Indices& keyframes, const Array<int8_t, -1>& octaves, int64_t gap, int64_t visits, double share,
                         int64_t least) {
@@ -56,7 +51,7 @@ auto spare_keyframes_of(const Indices& rows, const Indices& row_starts, const In
     const TrackMembers held{tracks.data(), by_track, keyframes.data(), octaves.data()};
     mark_spare(rows.data(), by_keyframe, held, {gap, visits, share, least}, spare.data());
   });
-  return flags_array(std::move(spare));
+  return as_numpy<bool>(std::move(spare));
 }
 
 auto duplicate_landmarks_of(const Array<int64_t, -1, 2>& near, const Points& points_map, const Reals& sigmas_m, const Indices& starts,
@@ -72,7 +67,7 @@ auto duplicate_landmarks_of(const Array<int64_t, -1, 2>& near, const Points& poi
     mark_duplicates(reinterpret_cast<const std::pair<int64_t, int64_t>*>(near.data()), near.shape(0), points_map.data(), sigmas_m.data(),
                     {landmarks, obs_keyframe.data()}, {descriptors.data(), count}, most_bits, duplicate.data());
   });
-  return flags_array(std::move(duplicate));
+  return as_numpy<bool>(std::move(duplicate));
 }
 
 auto redundant_keyframes_of(const Indices& order, const Indices& rows, const Indices& row_starts, const Numbers& obs_landmark,
@@ -91,14 +86,14 @@ auto redundant_keyframes_of(const Indices& order, const Indices& rows, const Ind
     mark_redundant(order.data(), order.shape(0), rows.data(), keyframes, {landmarks, obs_keyframe.data()}, obs_landmark.data(),
                    octaves.data(), observers, share, gone.data());
   });
-  return flags_array(std::move(gone));
+  return as_numpy<bool>(std::move(gone));
 }
 
 auto medoids_of(const Packed& descriptors, const Indices& starts) {
   const Lists landmarks = lists_of(starts, descriptors.shape(0), "starts: rising, of descriptors");
   auto chosen = zeros<int64_t>(landmarks.count);
   unlocked([&] { medoids({descriptors.data(), descriptors.shape(0)}, landmarks, chosen.data()); });
-  return as_numpy<int64_t, 1>(std::move(chosen), {landmarks.count});
+  return as_numpy<int64_t>(std::move(chosen));
 }
 
 size_t choose_landmarks_of(const Indices& candidates, const Indices& starts, const Indices& bins, const Reals& weights,
@@ -131,7 +126,7 @@ auto twins_of(const Packed& descriptors, const Points& points_map, int reach, in
   unlocked([&] {
     mark_twins({descriptors.data(), count}, points_map.data(), size_t(reach), size_t(most), {max_bits, height_m, own_m}, repeated.data());
   });
-  return flags_array(std::move(repeated));
+  return as_numpy<bool>(std::move(repeated));
 }
 
 }  // namespace

@@ -18,8 +18,7 @@ auto nearest_two_of(const Packed& a, const Packed& b) {
   std::vector<int64_t> index(count);
   std::vector<int32_t> first(count), second(count);
   unlocked([&] { nearest_two(descriptors_of(a), descriptors_of(b), index.data(), first.data(), second.data()); });
-  return std::make_tuple(as_numpy<int64_t, 1>(std::move(index), {count}), as_numpy<int32_t, 1>(std::move(first), {count}),
-                         as_numpy<int32_t, 1>(std::move(second), {count}));
+  return std::make_tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(first)), as_numpy<int32_t>(std::move(second)));
 }
 
 auto pairs_array(Pairs&& pairs) {
@@ -58,7 +57,7 @@ auto match_projected_of(const Array<double, -1, 2>& predicted, const Array<doubl
     match_projected({predicted.data(), radius_px.data(), octave_range.data(), descriptors_of(a)},
                     {pixels.data(), octaves.data(), descriptors_of(b)}, max_distance, ratio, index.data(), distances.data());
   });
-  return std::make_tuple(as_numpy<int64_t, 1>(std::move(index), {count}), as_numpy<int32_t, 1>(std::move(distances), {count}));
+  return std::make_tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(distances)));
 }
 
 }  // namespace

@@ -32,7 +32,7 @@ auto adjust_window_of(const Array<double, -1, 4, 4>& map_from_cam, size_t held, 
   const double cost = unlocked([&] { return adjust_window(window, iterations, squared.data()); });
   for (size_t k = 0; k < view_count; ++k) store(window.views[k], moved.data() + 16 * k);
   return std::make_tuple(as_numpy<double, 3>(std::move(moved), {view_count, 4, 4}),
-                         as_numpy<double, 2>(std::move(window.points), {count, 3}), as_numpy<double, 1>(std::move(squared), {seen}), cost);
+                         as_numpy<double, 2>(std::move(window.points), {count, 3}), as_numpy<double>(std::move(squared)), cost);
 }
 
 }  // namespace

@@ -5,13 +5,10 @@ using namespace fleetmap;
 
 namespace {
 
-using Lens = Array<double, 4>;
 using Points = Array<double, -1, 3>;
 using Size = std::tuple<double, double>;
 // pixels (N, 2), octaves (N,), descriptors (N, 4), disparities (N, 2), points_cam (N, 3), whether the disparities are measured
 using Features = std::tuple<Array<double, -1, 2>, Array<int8_t, -1>, Array<uint64_t, -1, 4>, Array<double, -1, 2>, Points, bool>;
-
-StereoLens stereo_lens(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
 KeyframeFeatures features_of(const Features& features) {
   const auto& [pixels, octaves, descriptors, disparities, points_cam, is_measured] = features;
@@ -25,8 +22,7 @@ auto match_guided_of(const Features& a, const Features& b, const Array<double, 4
                      double sigma_px, const Limits& refinement, int max_distance, const Array<double, -1>& radii_px, int least_inliers,
                      double least_share) {
   if (least_inliers < 0) throw nb::value_error("least_inliers: not negative");
-  const PairGuidance guidance{stereo_lens(lens), std::get<0>(size_px),      std::get<1>(size_px),
-                              sigma_px,          refinement_of(refinement), max_distance};
+  const PairGuidance guidance{lens_of(lens), std::get<0>(size_px), std::get<1>(size_px), sigma_px, refinement_of(refinement), max_distance};
   const PairStart start{{radii_px.data(), radii_px.data() + radii_px.size()}, least_inliers, least_share};
   const KeyframeFeatures ours = features_of(a), theirs = features_of(b);
   GuidedPair found = unlocked([&] { return match_guided(ours, theirs, guidance, se3(b_from_a.data()), start); });
@@ -42,7 +38,7 @@ double share_in_view_of(const Array<double, 4, 4>& b_from_a, const Points& point
                         const Lens& lens, const Size& size_px) {
   if (points_a.shape(0) != disparities_a.shape(0)) throw nb::value_error("disparities_a: one for each point");
   return unlocked([&] {
-    return share_in_view(se3(b_from_a.data()), points_a.data(), disparities_a.data(), points_a.shape(0), stereo_lens(lens),
+    return share_in_view(se3(b_from_a.data()), points_a.data(), disparities_a.data(), points_a.shape(0), lens_of(lens),
                          std::get<0>(size_px), std::get<1>(size_px));
   });
 }

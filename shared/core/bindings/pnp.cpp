@@ -10,7 +10,6 @@ using namespace fleetmap;
 
 namespace {
 
-using Lens = Array<double, 4>;
 using Points = Array<double, -1, 3>;
 using Weights = Array<double, -1, 2>;
 
@@ -19,8 +18,6 @@ Sightings sightings_of(const Points& points, const Points& pixels, const Weights
     throw nb::value_error("pixels and weights: one row for each point");
   return {points.data(), pixels.data(), weights.data(), points.shape(0)};
 }
-
-StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
 Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
 
@@ -31,9 +28,8 @@ Result result_of(std::optional<Resection>&& found) {
   if (!found) return {};
   std::vector<double> matrix(16), information(found->information, found->information + 36);
   store(found->cam_from_source, matrix.data());
-  const size_t count = found->squared.size();
   return {{as_numpy<double, 2>(std::move(matrix), {4, 4}), as_numpy<double, 2>(std::move(information), {6, 6}),
-           as_numpy<double, 1>(std::move(found->squared), {count})}};
+           as_numpy<double>(std::move(found->squared))}};
 }
 
 Result refine_pnp_of(const Points& points, const Points& pixels, const Weights& weights, const Lens& lens, const Limits& refinement,

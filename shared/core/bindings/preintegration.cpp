@@ -12,7 +12,7 @@ auto imu_intervals_of(const Stamps& stamps_ns, const Rows3& gyro_radps, const Ro
   std::vector<double> durations_s(count);
   std::vector<Vec3> gyro(count), accel(count);
   for (size_t n = 0; n < count; ++n) durations_s[n] = intervals[n].duration_s, gyro[n] = intervals[n].gyro, accel[n] = intervals[n].accel;
-  return std::make_tuple(as_numpy<double, 1>(std::move(durations_s), {count}), as_numpy<double, 2>(std::move(gyro), {count, 3}),
+  return std::make_tuple(as_numpy<double>(std::move(durations_s)), as_numpy<double, 2>(std::move(gyro), {count, 3}),
                          as_numpy<double, 2>(std::move(accel), {count, 3}));
 }
 

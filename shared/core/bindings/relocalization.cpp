@@ -34,8 +34,8 @@ auto visible_landmarks_of(const Cones& cones, const Array<double, 4, 4>& map_fro
     return visible_landmarks(landmarks, se3(map_from_cam.data()), camera, distance_scale, margin_px, max_view_angle_rad, octave_scale);
   });
   const size_t found = visible.rows.size();
-  return std::make_tuple(as_numpy<int64_t, 1>(std::move(visible.rows), {found}), as_numpy<double, 2>(std::move(visible.pixels), {found, 3}),
-                         as_numpy<double, 1>(std::move(visible.octaves), {found}));
+  return std::make_tuple(as_numpy<int64_t>(std::move(visible.rows)), as_numpy<double, 2>(std::move(visible.pixels), {found, 3}),
+                         as_numpy<double>(std::move(visible.octaves)));
 }
 
 using Poses = Array<double, -1, 4, 4>;
@@ -114,17 +114,17 @@ class FixFinder {
   static std::tuple<Reals2, Reals2, int, Rows, Rows, Flags, std::tuple<Reals2, Reals2, Reals2>, Rows, Flags, bool> as_python(MapFix&& fix) {
     std::vector<double> place(16);
     store(fix.map_from_cam, place.data());
-    const size_t matched = fix.rows.size(), expected = fix.covisible.size();
+    const size_t matched = fix.rows.size();
     return {as_numpy<double, 2>(std::move(place), {4, 4}),
             copied<2>(fix.covariance, {6, 6}),
             fix.cells,
-            as_numpy<int64_t, 1>(std::move(fix.features), {matched}),
-            as_numpy<int64_t, 1>(std::move(fix.rows), {matched}),
-            as_numpy<bool, 1>(std::move(fix.inliers), {matched}),
+            as_numpy<int64_t>(std::move(fix.features)),
+            as_numpy<int64_t>(std::move(fix.rows)),
+            as_numpy<bool>(std::move(fix.inliers)),
             {as_numpy<double, 2>(std::move(fix.points_map), {matched, 3}), as_numpy<double, 2>(std::move(fix.pixels), {matched, 3}),
              as_numpy<double, 2>(std::move(fix.sigmas_px), {matched, 2})},
-            as_numpy<int64_t, 1>(std::move(fix.covisible), {expected}),
-            as_numpy<bool, 1>(std::move(fix.is_found), {expected}),
+            as_numpy<int64_t>(std::move(fix.covisible)),
+            as_numpy<bool>(std::move(fix.is_found)),
             fix.is_passed};
   }
 
@@ -166,7 +166,7 @@ auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int c
     mark_near({descriptors.data(), descriptors.shape(0)}, {centres.data(), centres.shape(0)}, asked, {held.data(), count}, starts.data(),
               max_bits, is_near.data());
   });
-  return as_numpy<bool, 1>(std::move(is_near), {count});
+  return as_numpy<bool>(std::move(is_near));
 }
 
 }  // namespace

@@ -142,7 +142,7 @@ auto cast_of(const BoxGrid& grid, const Triple& origin, const Array<double, -1, 
       at[i] = hit.at, hits[2 * i] = hit.box, hits[2 * i + 1] = hit.side;
     }
   });
-  return std::tuple(as_numpy<double, 1>(std::move(at), {count}), as_numpy<int64_t, 2>(std::move(hits), {count, 2}));
+  return std::tuple(as_numpy<double>(std::move(at)), as_numpy<int64_t, 2>(std::move(hits), {count, 2}));
 }
 
 void bake_of(const BoxGrid& grid, const Quads& quads, const Numbers& numbers, const Array<int32_t, -1, 2>& owners, int64_t owner_shift,

@@ -17,11 +17,8 @@ using Levels = Array<uint8_t, -1>;
 using Image32 = Array<float, -1, -1>;
 using Image64 = Array<double, -1, -1>;
 using Pose = Array<double, 4, 4>;
-using Lens = Array<double, 4>;
 
 constexpr int64_t kMostPixels = 1 << 25;
-
-StereoLens stereo(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
 template <typename Numbers>
 Picture<const typename Numbers::Scalar> picture(const Numbers& image) {
@@ -41,7 +38,7 @@ auto voxel_keys_of(const Points& points_map, const Levels& levels) {
   unlocked([&] {
     for (size_t i = 0; i < count; ++i) keys[i] = voxel_key(points_map(i, 0), points_map(i, 1), points_map(i, 2), levels(i));
   });
-  return as_numpy<int64_t, 1>(std::move(keys), {count});
+  return as_numpy<int64_t>(std::move(keys));
 }
 
 // A table whose calls come one after the other, whichever threads they are from.
@@ -50,7 +47,7 @@ class Table {
   void add(const Image32& disparity_px, double sigma_px, const Lens& lens, const Pose& map_from_cam) {
     unlocked([&] {
       const std::lock_guard alone(mutex_);
-      table_.add(picture(disparity_px), sigma_px, stereo(lens), map_from_cam.data());
+      table_.add(picture(disparity_px), sigma_px, lens_of(lens), map_from_cam.data());
     });
   }
   auto surfels() {
@@ -80,10 +77,10 @@ auto look_at_of(const Points& points_map, const Levels& levels, const Image32& n
   auto marks = zeros<uint8_t>(count);
   auto weights = zeros<float>(count), pixels = zeros<float>(2 * count);
   unlocked([&] {
-    look_at(points_map.data(), levels.data(), count, picture(nearest_px), step_px, sigma_px, stereo(lens), cam_from_map.data(),
+    look_at(points_map.data(), levels.data(), count, picture(nearest_px), step_px, sigma_px, lens_of(lens), cam_from_map.data(),
             clear_sigmas, clear_m, marks.data(), weights.data(), pixels.data());
   });
-  return std::tuple(as_numpy<uint8_t, 1>(std::move(marks), {count}), as_numpy<float, 1>(std::move(weights), {count}),
+  return std::tuple(as_numpy<uint8_t>(std::move(marks)), as_numpy<float>(std::move(weights)),
                     as_numpy<float, 2>(std::move(pixels), {count, 2}));
 }
 
@@ -96,7 +93,7 @@ auto discs_before_of(const Points& points_map, const Points& normals_map, const 
                         {pinhole(0), pinhole(1), pinhole(2), pinhole(3)}, width, height);
   });
   const size_t kept = found.numbers.size();
-  return std::tuple(as_numpy<int32_t, 1>(std::move(found.numbers), {kept}), as_numpy<double, 2>(std::move(found.points), {kept, 3}),
+  return std::tuple(as_numpy<int32_t>(std::move(found.numbers)), as_numpy<double, 2>(std::move(found.points), {kept, 3}),
                     as_numpy<double, 2>(std::move(found.pixels), {kept, 2}));
 }
 

@@ -17,7 +17,7 @@ auto join_tracks_of(const Links& first, const Links& second, const Links& keyfra
       if (size_t(keyframes(n)) >= nodes) throw nb::value_error("keyframes: numbers below that of the nodes");
     return join_tracks(first.data(), second.data(), links, keyframes.data(), nodes);
   });
-  return as_numpy<int32_t, 1>(std::move(roots), {nodes});
+  return as_numpy<int32_t>(std::move(roots));
 }
 
 }  // namespace

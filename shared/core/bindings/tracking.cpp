@@ -16,14 +16,11 @@ namespace {
 
 using Matrix2 = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 using Images = std::vector<nb::ndarray<nb::numpy, uint8_t, nb::ndim<2>>>;
-using Lens = Array<double, 4>;
 using Motion = Array<double, 4, 4>;
 using Points = Array<double, -1, 3>;
 using Ids = Array<int64_t, -1>;
 using SharedTracker = Shared<Tracker>;
 constexpr int kMostLevels = 30;
-
-StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
 
 int checked_half(int half) {
   if (half < 1 || half > kMostFlowHalf) throw nb::value_error("half: 1 to 7");
@@ -69,7 +66,7 @@ auto follow_pixels_of(const Image& before, const Image& now, const Places& pixel
     follow_down(first, second, down_from, half, pixels.data(), places.data(), held, count);
     check_back(first.level(0), second.level(0), half, pixels.data(), places.data(), within_px, margin_px, held, back.data(), count);
   });
-  return std::make_tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool, 1>(std::move(found), {count}));
+  return std::make_tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool>(std::move(found)));
 }
 
 void make_tracker(SharedTracker* tracker, const Lens& lens, const nb::object& settings, const nb::object& stereo, double max_disparity_px,
@@ -124,8 +121,7 @@ auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std
 auto common_ways_px_of(const Ids& old_ids, const Points& old_pixels, const Ids& ids, const Points& pixels) {
   if (old_ids.shape(0) != old_pixels.shape(0) || ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
   auto ways = common_ways_px(old_ids.data(), old_pixels.data(), old_ids.shape(0), ids.data(), pixels.data(), ids.shape(0));
-  const size_t count = ways.size();
-  return as_numpy<double, 1>(std::move(ways), {count});
+  return as_numpy<double>(std::move(ways));
 }
 
 }  // namespace
@@ -145,11 +141,7 @@ void bind_tracking(nb::module_& module) {
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
       .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),
            "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none())
-      .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) {
-                     std::vector<int64_t> ids = tracker.ids();
-                     const size_t count = ids.size();
-                     return as_numpy<int64_t, 1>(std::move(ids), {count});
-                   }),
+      .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return as_numpy<int64_t>(std::vector<int64_t>(tracker.ids())); }),
                    nb::rv_policy::automatic)
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),
                    nb::rv_policy::automatic);

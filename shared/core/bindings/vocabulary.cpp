@@ -30,7 +30,7 @@ auto descend_of(const Packed& descriptors, const Packed& centres, const Numbers&
     check_tree(centres, first_child, child_count, word_of_node);
     descend({descriptors.data(), count}, tree, words.data());
   });
-  return as_numpy<int32_t, 1>(std::move(words), {count});
+  return as_numpy<int32_t>(std::move(words));
 }
 
 auto two_nearest_of(const Packed& descriptors, const Packed& centres) {
@@ -61,7 +61,7 @@ auto scores_of(SharedFile& index, const Numbers& word_ids, const Weights& weight
   const size_t count = index.places();
   std::vector<double> scores(count);
   unlocked([&] { index.score(word_ids.data(), weights.data(), word_ids.shape(0), scores.data()); });
-  return as_numpy<double, 1>(std::move(scores), {count});
+  return as_numpy<double>(std::move(scores));
 }
 
 }  // namespace
