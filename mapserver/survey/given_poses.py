@@ -10,6 +10,7 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
+from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
 from mapserver.survey.odometry_pass import summary_of
 from mapserver.survey.settings import SurveySettings
@@ -115,9 +116,11 @@ def _gyro_bias(given: Trajectory, inputs: SurveyInputs) -> Array:
 
 def _covariances(odom_from_body: Array) -> Array:
     """(F, 6, 6) of a random walk along the way, with a floor for each step."""
-    steps_m = np.linalg.norm(np.diff(odom_from_body[:, :3, 3], axis=0, prepend=odom_from_body[:1, :3, 3]), axis=1)
-    variances = np.repeat([_WALK_RAD**2, _WALK_M**2], 3) * np.cumsum(steps_m + 1e-4)[:, None]
-    return np.asarray(variances[:, :, None] * np.eye(6))
+    steps_m = np.diff(odom_from_body[:, :3, 3], axis=0, prepend=odom_from_body[:1, :3, 3])
+    of_a_metre, found = np.diag(np.repeat([_WALK_RAD**2, _WALK_M**2], 3)), [np.zeros((6, 6))]
+    for step_m in steps_m:
+        found.append(carried(found[-1] + (np.linalg.norm(step_m) + 1e-4) * of_a_metre, step_m))
+    return np.array(found[1:])
 
 
 def _scene_depth_m(pixels: Array, camera: StereoCamera) -> float:

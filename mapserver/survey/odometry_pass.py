@@ -11,6 +11,7 @@ from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus,
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
+from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
@@ -54,7 +55,9 @@ class OdometryRun:
         self._odometry.handle_imu(imu)
         self._odometry.handle_wheel(wheel)
         estimate = self._odometry.handle_stereo(frame)
-        number, frame_from_body = len(self.chain.estimates), self.chain.append(estimate)
+        number = len(self.chain.estimates)
+        since = self._odometry.motion_since(number - 1) if number else None
+        frame_from_body = self.chain.append(estimate, None if since is None else since[1])
         wanted = self._policy.wants(summary_of(frame, estimate, frame_from_body))
         return TrackedFrame(number, frame, estimate, frame_from_body, wanted)
 
@@ -97,7 +100,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
     done = OdometryPass(
         estimates,
         run.chain.odom_from_body(),
-        continued_covariances(estimates),
+        run.chain.covariances(),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]),
         keyframes,
         inertial,
@@ -109,21 +112,60 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
 
 
 class FrameChain:
-    """Estimates of all frames so far, and where each frame is in one continuous frame."""
+    """Estimates of all frames so far, where each frame is in one continuous frame, and how well that is known."""
 
     def __init__(self) -> None:
         self.estimates: list[OdometryEstimate] = []
         self._frame, self._frame_from_body = ContinuousFrame(), list[Array]()
+        self._covariances, self._own = list[Array](), np.zeros((6, 6))
 
-    def append(self, estimate: OdometryEstimate) -> Array:
-        """frame_from_body (4, 4) of one more frame; applies its corrections of earlier frames."""
-        self.estimates.append(replace(estimate, track_ids=_NO_IDS, track_pixels=None))
+    def append(self, estimate: OdometryEstimate, step_covariance: Array | None = None) -> Array:
+        """frame_from_body (4, 4) of one more frame; applies its corrections of earlier frames.
+
+        step_covariance (6, 6): that of the motion since the frame before, in axes of the body there, where the odometry knows it.
+        """
         self._frame_from_body.append(self._frame.handle(estimate))
+        self._covariances.append(self._covariance(estimate, step_covariance))
+        self.estimates.append(replace(estimate, track_ids=_NO_IDS, track_pixels=None))
         for earlier, placed in estimate.revised:
             self._frame_from_body[earlier] = self._frame.frame_from_odom @ placed
             tracked = replace(self.estimates[earlier], odom_from_body=placed, status=OdometryStatus.TRACKING)
             self.estimates[earlier] = replace(tracked, scale_known=estimate.scale_known)
         return self._frame_from_body[-1]
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of the last frame, in axes of the continuous frame."""
+        return self._covariances[-1]
+
+    def _covariance(self, estimate: OdometryEstimate, step_covariance: Array | None) -> Array:
+        """What the steps so far add up to: the frame follows them, and not what the filter learns of earlier places later.
+
+        Errors of steps are independent while pictures are followed. A filter that is lost is wrong by its speed at every step alike: by as
+        much as its own covariance gains. Across a restart, where that is zero, the one before goes on; a restart that loses gravity adds
+        a wide one, as the estimate before it is hardly worth more than that it did not jump. After a pause whose motion the images
+        do not show, a robot may be anywhere.
+        """
+        turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3])
+        own_before, self._own = self._own, turn @ estimate.cov_rot_trans @ turn.T
+        if not self.estimates:
+            return self._own
+        first, last = self._frame_from_body[-2:]
+        lever_m, reached, last_ns = last[:3, 3] - first[:3, 3], self._covariances[-1], self.estimates[-1].stamp_ns
+        if estimate.new_odom_from_old_odom is not None:
+            own_before = np.zeros((6, 6))
+            if not estimate.inertial:
+                reached = reached + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
+        if is_away(last_ns, estimate):
+            away_m = _AWAY_MPS * (estimate.stamp_ns - last_ns) * 1e-9
+            reached = reached + np.diag([_AWAY_RAD**2] * 3 + [away_m**2] * 3)
+        if step_covariance is None or estimate.status is OdometryStatus.DEGRADED:
+            values, vectors = np.linalg.eigh(carried(self._own, -lever_m) - own_before)
+            gained = (vectors * np.abs(values)) @ vectors.T
+        else:
+            carry = np.kron(np.eye(2), first[:3, :3])
+            gained = carry @ step_covariance @ carry.T
+        return carried(reached + gained, lever_m)
 
     @property
     def level_from_frame(self) -> Array:
@@ -134,37 +176,10 @@ class FrameChain:
         """(F, 4, 4) in the frame of the last estimate, by which gravity is known best."""
         return np.asarray(se3_inverse(self._frame.frame_from_odom) @ np.array(self._frame_from_body).reshape(-1, 4, 4))
 
-
-class ContinuedCovariance:
-    """Covariance (6, 6) that continues across restarts of the odometry, whose own covariance is zero there.
-
-    A restart that loses gravity adds a wide one: the estimate before it is hardly worth more than that it did not jump. After a
-    pause whose motion the images do not show, a robot may be anywhere.
-    """
-
-    def __init__(self) -> None:
-        self._carried, self._last = np.zeros((6, 6)), np.zeros((6, 6))
-        self._last_ns: int | None = None
-
-    def handle(self, estimate: OdometryEstimate) -> Array:
-        """That of one more estimate, in its odom axes."""
-        change = estimate.new_odom_from_old_odom
-        if self._last_ns is not None and change is not None:
-            turn = np.kron(np.eye(2), change[:3, :3])
-            self._carried = turn @ self._last @ turn.T
-            if not estimate.inertial:
-                self._carried = self._carried + np.diag([_GIVEN_UP_RAD**2] * 3 + [_GIVEN_UP_M**2] * 3)
-        if self._last_ns is not None and is_away(self._last_ns, estimate):
-            away_m = _AWAY_MPS * (estimate.stamp_ns - self._last_ns) * 1e-9
-            self._carried = self._carried + np.diag([_AWAY_RAD**2] * 3 + [away_m**2] * 3)
-        self._last_ns, self._last = estimate.stamp_ns, self._carried + estimate.cov_rot_trans
-        return self._last
-
-
-def continued_covariances(estimates: Sequence[OdometryEstimate]) -> Array:
-    """(F, 6, 6) of all estimates, as `ContinuedCovariance`."""
-    continued = ContinuedCovariance()
-    return np.array([continued.handle(estimate) for estimate in estimates])
+    def covariances(self) -> Array:
+        """(F, 6, 6) in the axes of `odom_from_body`."""
+        turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3].T)
+        return np.asarray(turn @ np.array(self._covariances).reshape(-1, 6, 6) @ turn.T)
 
 
 def summary_of(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:

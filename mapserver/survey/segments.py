@@ -15,7 +15,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
-from mapserver.survey.bundle.odometry_factors import blackout_factors, edge_covariance, initial_state
+from mapserver.survey.bundle.odometry_factors import blackout_factors, carried, edge_covariance, initial_state
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.state import Cut, FrameTracks, ImageStore, Landmarks, MemoryImageStore, OdometryPass, SurveyState
@@ -337,11 +337,14 @@ def _laid_on(joined_from_body: Array, segment_from_body: Array, level: bool) -> 
 
 def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
     """Every frame is of the segment that begins with it or before it; what two saw of a shared frame, it has of both."""
-    covariances, reached = list[Array](), np.zeros((6, 6))
+    covariances, reached = list[Array](), placed[0].made.odometry.covariances[0]
     starts, ids, pixels, size = [np.zeros(1, np.int64)], [], [], 0
     for each in placed:
-        own, turn = each.made.odometry.covariances, np.kron(np.eye(2), each.joined_from_odom[:3, :3])
-        covariances.append(reached + turn @ (own - own[0]) @ turn.T)
+        odometry, turn = each.made.odometry, np.kron(np.eye(2), each.joined_from_odom[:3, :3])
+        gained = reached - turn @ odometry.covariances[0] @ turn.T
+        levers_m = (odometry.odom_from_body[:, :3, 3] - odometry.odom_from_body[0, :3, 3]) @ turn[:3, :3].T
+        own = turn @ odometry.covariances @ turn.T
+        covariances.append(own + np.array([carried(gained, lever_m) for lever_m in levers_m]))
         reached = covariances[-1][-1]
         tracks = each.made.tracks
         # A shared frame ends where its rows of the later segment do.
@@ -350,7 +353,6 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
         ids.append(tracks.ids + np.int32(each.first_track))
         pixels.append(tracks.pixels)
         size += len(tracks.ids)
-    covariances[0] += placed[0].made.odometry.covariances[0]
     passes = [each.made.odometry for each in placed]
     return replace(
         passes[-1],

@@ -114,6 +114,13 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
     return RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(covariance).astype(np.float64))
 
 
+def carried(covariance: Array, lever_m: Array) -> Array:
+    """(6, 6) of a body that lies lever_m (3,) beside one of which this is known: what is not known of its direction moves it, too."""
+    about = np.eye(6)
+    about[3:, :3] = -skew(lever_m)
+    return np.asarray(about @ covariance @ about.T)
+
+
 def edge_covariance(odometry: OdometryPass, a: int, b: int, floor: Floor = FLOOR) -> Array:
     """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
     first, last = odometry.odom_from_body[[a, b]]
@@ -127,11 +134,8 @@ def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_fr
     What odometry does not know of its direction at first moves the last one too, and its covariance has that with every step anew. About
     the place of the first, where it moves nothing, the last one's is greater by what the step adds: such steps are independent.
     """
-    about = np.eye(6)
-    about[3:, :3] = skew(odom_from_first @ first_from_last[:3, 3])
-    gained = about @ known[1] @ about.T - known[0]
+    gained = carried(known[1], -odom_from_first @ first_from_last[:3, 3]) - known[0]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
-    # Where a filter learns, it knows less of the first place than of the last: what it learned is not known of the step either.
-    gained = (vectors * np.abs(values)) @ vectors.T
+    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames have moved since
     carry = np.kron(np.eye(2), odom_from_first.T)
     return np.asarray(carry @ gained @ carry.T + floor.covariance(first_from_last))

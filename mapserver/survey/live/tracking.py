@@ -12,7 +12,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from mapserver.survey.bundle.odometry_factors import floor_of, step_covariance
 from mapserver.survey.live.live_values import NewKeyframe, joined_imu
-from mapserver.survey.odometry_pass import ContinuedCovariance, OdometryRun
+from mapserver.survey.odometry_pass import OdometryRun, TrackedFrame
 from mapserver.survey.settings import SurveySettings
 
 _TORN_M2 = 100.0
@@ -33,10 +33,9 @@ class Tracked(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """The last keyframe: its covariance and rotation in odom axes, its place, and what was torn until then."""
+    """The last keyframe: its place with the covariance, and what was torn until then."""
 
     covariance: Array
-    odom_from_body: Array
     frame_from_body: Array
     torn_m2: float
 
@@ -48,7 +47,6 @@ class LiveTracking:
         self._run = OdometryRun(calibration, rectifier, settings)
         self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
         self._torn_m2 = 0.0  # variance of what lies between runs of one camera
-        self._continued = ContinuedCovariance()
         self._before: _Before | None = None
         self._imu: list[ImuSamples] = []
 
@@ -56,11 +54,10 @@ class LiveTracking:
         """The next frame, with the samples of the IMU and the wheels up to it that were not given before."""
         tracked = self._run.handle(frame, imu, wheel)
         self._imu.append(imu)
-        estimate, covariance = tracked.estimate, self._continued.handle(tracked.estimate)
-        self._turn(estimate)
+        estimate = tracked.estimate
         keyframe = None
         if tracked.is_keyframe and self._has_place(estimate):
-            keyframe = self._keyframe(tracked.number, estimate, covariance, tracked.frame_from_body)
+            keyframe = self._keyframe(tracked)
         quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
         return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe, estimate.track_pixels)
 
@@ -74,30 +71,20 @@ class LiveTracking:
             self._torn_m2 += _TORN_M2  # a new start has a scale of its own
         return False
 
-    def _turn(self, estimate: OdometryEstimate) -> None:
-        """The last keyframe's values in the axes that odom has now."""
-        change = estimate.new_odom_from_old_odom
-        if change is not None and self._before is not None:
-            turn = np.kron(np.eye(2), change[:3, :3])
-            covariance = turn @ self._before.covariance @ turn.T
-            rotation = change[:3, :3] @ self._before.odom_from_body
-            self._before = self._before._replace(covariance=covariance, odom_from_body=rotation)
-
-    def _keyframe(
-        self, number: int, estimate: OdometryEstimate, covariance: Array, frame_from_body: Array
-    ) -> NewKeyframe:
+    def _keyframe(self, tracked: TrackedFrame) -> NewKeyframe:
+        estimate, covariance, frame_from_body = tracked.estimate, self._run.chain.covariance, tracked.frame_from_body
         before, step_cov, imu = self._before, None, joined_imu(self._imu)
         if before is not None:
             step = se3_inverse(before.frame_from_body) @ frame_from_body
             known, floor = (before.covariance, covariance), floor_of(inertial=estimate.inertial)
-            step_cov = step_covariance(known, before.odom_from_body, step, floor)
+            step_cov = step_covariance(known, before.frame_from_body[:3, :3], step, floor)
             if self._torn_m2 > before.torn_m2:
                 step_cov = step_cov + _TORN_M2 * np.eye(6)
         rotation = estimate.odom_from_body[:3, :3]
-        self._before = _Before(covariance, rotation, frame_from_body, self._torn_m2)
+        self._before = _Before(covariance, frame_from_body, self._torn_m2)
         self._imu = []
         return NewKeyframe(
-            number=number,
+            number=tracked.number,
             frame_from_body=frame_from_body,
             level_from_frame=self._run.chain.level_from_frame,
             step_cov=step_cov,

@@ -29,7 +29,7 @@ _ALIAS_REACH, _ALIAS_GATE = 0.5, 4.0
 _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
 # Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
 # learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
-_WELL_KNOWN_COV = np.diag([0.005**2] * 3 + [0.05**2] * 3)
+_WELL_KNOWN = np.repeat([0.005, 0.05], 3)  # rad, m
 _LEARNED_PER_DOUBLING = 64
 _SAME_SHARE = 0.25  # of its length by which a step may differ from another one to be the same
 _ENOUGH = 3  # keyframes that saw a step before it is believed: one match may be wrong
@@ -169,10 +169,15 @@ class LoopCloser:
             js = found.ids[start : start + _CHUNK]
             reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
             reachable = self._marginals.reachable(i, js, reach_m)
+            # A loop there would tell nothing, and the global adjustment matches what is seen from both.
+            apart_m = np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
+            known = (apart_m < _ALIAS_REACH * reach_m) & self._marginals.known(i, js, _WELL_KNOWN)
             for n, is_reachable in enumerate(reachable.tolist(), start):
                 here, there = self._map_from_body[[i, found.ids[n]], :3, 3]
                 if not is_reachable:
                     far.append(n)
+                elif known[n - start]:
+                    continue
                 elif not self._config.zones.compatible(here, there):
                     zoned.append(n)
                 else:
@@ -260,7 +265,7 @@ class LoopCloser:
 
     def _accept(self, edge: PoseEdge) -> None:
         self.loops.edges.append(edge)
-        well_known = _WELL_KNOWN_COV * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING)
+        well_known = np.diag(_WELL_KNOWN**2) * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING)
         if self._marginals.gain(edge, well_known) > _WORTH_LEARNING:
             self._marginals.add(edge)
             self.learned.append(edge)

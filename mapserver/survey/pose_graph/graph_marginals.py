@@ -99,6 +99,11 @@ class GraphMarginals:
         variance = np.einsum("ma,mab,mb->m", direction, self.relative_covs(i, js)[:, 3:, 3:], direction)
         return np.asarray(beyond_m**2 <= chi2 * variance)
 
+    def known(self, i: int, js: Indices, sigmas: Array) -> NDArray[np.bool_]:
+        """(M,) whether i_from_j is known to sigmas (6,) or better, in all directions at once."""
+        whitened = self.relative_covs(i, js) / (sigmas[:, None] * sigmas)
+        return np.asarray(np.linalg.eigvalsh(whitened)[:, -1] < 1.0)
+
     def innovation_squared(self, edge: PoseEdge) -> float:
         """Squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from what the graph predicts.
 

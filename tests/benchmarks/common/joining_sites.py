@@ -23,7 +23,7 @@ from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
 from mapserver.survey.merge.membership import MembershipTest, SessionKeyframes
-from mapserver.survey.odometry_pass import FrameChain, continued_covariances
+from mapserver.survey.odometry_pass import FrameChain
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.simulated_run import EstimatorSession
 
@@ -149,7 +149,7 @@ def drive(run: EstimatorSession) -> Drive:
     guess: Any = SimpleNamespace(
         keyframes=[SimpleNamespace(frame_index=frame) for frame in frames],
         odom_from_body=placed,
-        covariances=continued_covariances(trajectory.estimates),
+        covariances=trajectory.covariances(),
         inertial=trajectory.estimates[-1].inertial,
     )
     state: Any = SimpleNamespace(map_from_body=placed[frames])

@@ -26,7 +26,7 @@ from fleetsim.motion.routes import Route
 from fleetsim.scenarios import SCENARIOS, find_scenario
 from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside
-from mapserver.survey.odometry_pass import OdometryRun, SampleFeed, continued_covariances
+from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyInputs
@@ -159,7 +159,7 @@ def simulated_survey(session: EstimatorSession, settings: SurveySettings) -> Sim
             exact_px.append(exact)
     estimates = run.chain.estimates
     odometry = OdometryPass(
-        estimates, run.chain.odom_from_body(), continued_covariances(estimates),
+        estimates, run.chain.odom_from_body(), run.chain.covariances(),
         np.array([e.status is not OdometryStatus.DEGRADED for e in estimates]), keyframes, estimates[-1].inertial,
         estimates[-1].scale_known, estimates[-1].inertial and settings.odometry.filter.use_wheels, FrameTracks.joined(seen),
     )  # fmt: skip

@@ -22,7 +22,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import WheelSample
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import TrackSettings
-from mapserver.survey.odometry_pass import continued_covariances
+from mapserver.survey.odometry_pass import FrameChain
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame, view
@@ -442,6 +442,9 @@ def test_no_motion_is_carried_through_a_pause(imu: ImuNoise | None, is_elsewhere
     assert not resumed.inertial
     assert (resumed.status is OdometryStatus.DEGRADED) == is_elsewhere
     assert is_away(last.stamp_ns, resumed) == is_elsewhere
-    cov_before, cov_after = continued_covariances([last, resumed])
+    chain = FrameChain()
+    for each in (last, resumed):
+        chain.append(each)
+    cov_before, cov_after = chain.covariances()
     if is_elsewhere:
         assert np.sqrt(np.trace((cov_after - cov_before)[3:, 3:])) > 1000

@@ -2,17 +2,19 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3, se3_exp, se3_inverse, skew, so3_exp
+from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, skew
+from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges
 from mapserver.survey.keyframes.connected_components import SigmaBetween
-from mapserver.survey.odometry_pass import continued_covariances
+from mapserver.survey.odometry_pass import FrameChain
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import adjoint
 from mapserver.survey.settings import SurveySettings
@@ -20,8 +22,20 @@ from mapserver.survey.state import OdometryPass
 from support.worlds.corridor_scene import scene
 
 
-def estimate(cov: float, change: np.ndarray | None = None, *, inertial: bool = True) -> SimpleNamespace:
-    return SimpleNamespace(stamp_ns=0, cov_rot_trans=cov * np.eye(6), new_odom_from_old_odom=change, inertial=inertial)
+def estimate(
+    variance: float,
+    change: Array | None = None,
+    *,
+    x_m: float = 0.0,
+    inertial: bool = True,
+    status: OdometryStatus = OdometryStatus.TRACKING,
+) -> Any:
+    """An odometry's estimate at x_m; its covariance is the unit matrix times `variance`."""
+    unknown = np.zeros(3), np.zeros(3), np.zeros(3)
+    place = se3(np.eye(3), np.array([x_m, 0.0, 0.0]))
+    return OdometryEstimate(
+        0, 0, place, variance * np.eye(6), *unknown, status, np.zeros(0, np.int64), 5.0, 1.0, False, inertial, change
+    )
 
 
 def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() -> None:
@@ -81,36 +95,40 @@ def test_no_inertial_factor_spans_a_pause_which_odometry_bridges(pause_s: float,
     assert [(term.i, term.j) for term in blackout_factors(guess, state)] == ([(1, 2)] if is_pause else [])
 
 
+def chain(*estimates: tuple[SimpleNamespace, float | None]) -> Array:
+    """(F, 6, 6) of estimates, each with the standard deviation of its step as the odometry knows it, None where it does not."""
+    frames = FrameChain()
+    for each, sigma in estimates:
+        frames.append(each, None if sigma is None else sigma**2 * np.eye(6))
+    return frames.covariances()
+
+
 def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     """An odometry that begins anew takes its place for known: the doubt of before goes on, and one metre with it."""
-    turn = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
-    whole = continued_covariances(
-        [estimate(0.0), estimate(0.01), estimate(0.04), estimate(0.0, np.eye(4), inertial=False), estimate(0.01)]
+    anew = estimate(0.0, change=np.eye(4), inertial=False)
+    whole = chain(
+        (estimate(0.0), None), (estimate(0.01), None), (estimate(0.04), None), (anew, None), (estimate(0.01), None)
     )
     between = SigmaBetween(np.trace(whole[:, 3:, 3:], axis1=1, axis2=2))
     assert between(1, 2) == pytest.approx(np.sqrt(3 * 0.03))
     assert between(2, 3) > 1.0
     assert between(3, 4) == pytest.approx(np.sqrt(3 * 0.01))
-    first = np.diag([0.0, 0.0, 0.0, 0.04, 0.01, 0.0])
-    seen = SimpleNamespace(stamp_ns=0, cov_rot_trans=first, new_odom_from_old_odom=None, inertial=False)
-    begun = continued_covariances([seen, estimate(0.0, turn)])
-    np.testing.assert_allclose(np.diag(begun[1]), [0.0, 0.0, 0.0, 0.01, 0.04, 0.0], atol=1e-12)
 
 
-def test_what_a_filter_learns_at_a_step_is_not_known_of_that_step() -> None:
-    """Blind for a while, then tied to old points: the place before was as wrong as it was doubted, and so is the way from it."""
-    turn = so3_exp(np.array([0.0, 0.0, 0.7]))
-    odom_from_body = np.stack([se3(turn, turn @ np.array([0.5 * k, 0.0, 0.0])) for k in range(4)])
-    covariances = np.stack([np.diag([1e-8] * 3 + [sigma_m**2] * 3) for sigma_m in (0.05, 0.05, 0.26, 0.1)])
-    known = OdometryPass(
-        [], odom_from_body, covariances, np.ones(4, bool),
-        [SimpleNamespace(frame_index=k) for k in range(4)], inertial=True,
-    )  # fmt: skip
-    edges = chain_edges(known, SimpleNamespace(map_from_body=odom_from_body))
-    sigmas_m = [np.sqrt(np.diag(edge.cov_rot_trans)[3:]) for edge in edges]
-    assert sigmas_m[0].max() < 0.01
-    assert sigmas_m[1].min() > 0.25
-    assert sigmas_m[2].min() > 0.23
+def test_what_a_filter_learns_of_earlier_places_is_no_doubt_of_the_way() -> None:
+    """In a bend a filter doubts where it is and learns it back, while it knows each step well: then so is the way known.
+
+    Blind, it doubts its speed, and what it learns in the light does not move the frames that it saw nothing in.
+    """
+    doubts, way_m = (0.01, 0.25, 0.1, 0.02), [0.0, 0.5, 1.0, 1.5]
+    bend = [(estimate(d**2, x_m=x), 0.01) for d, x in zip(doubts, way_m, strict=True)]
+    dark = [bend[0], (estimate(0.25**2, x_m=0.5, status=OdometryStatus.DEGRADED), 0.01), *bend[2:]]
+    keyframes: Any = [SimpleNamespace(frame_index=k) for k in range(4)]
+    places = np.array([se3(np.eye(3), np.array([x, 0.0, 0.0])) for x in way_m])
+    for seen, least_m, most_m in ((bend, 0.02, 0.05), (dark, 0.25, 0.3)):
+        known = OdometryPass([], places, chain(*seen), np.ones(4, bool), keyframes, inertial=True)
+        marginals = GraphMarginals(places, chain_edges(known, SimpleNamespace(map_from_body=places)))
+        assert least_m < np.sqrt(marginals.relative_cov(0, 3)[3, 3]) < most_m
 
 
 def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:
