@@ -13,7 +13,7 @@ RadialTangential radial_tangential(const double* k) { return {k[0], k[1], k[2], 
 auto undistort_of(const Array<double, 8>& lens, const Reals& goals_x, const Reals& goals_y) {
   const size_t count = goals_x.shape(0);
   if (goals_y.shape(0) != count) throw nb::value_error("goals_y: as many as goals_x");
-  std::vector<double> x(count), y(count);
+  auto x = zeros<double>(count), y = zeros<double>(count);
   unlocked([&] { undistort(radial_tangential(lens.data()), goals_x.data(), goals_y.data(), count, x.data(), y.data()); });
   return std::make_tuple(as_numpy<double>(std::move(x)), as_numpy<double>(std::move(y)));
 }

@@ -15,8 +15,8 @@ Descriptors descriptors_of(const Packed& packed) { return {packed.data(), packed
 
 auto nearest_two_of(const Packed& a, const Packed& b) {
   const size_t count = a.shape(0);
-  std::vector<int64_t> index(count);
-  std::vector<int32_t> first(count), second(count);
+  auto index = zeros<int64_t>(count);
+  auto first = zeros<int32_t>(count), second = zeros<int32_t>(count);
   unlocked([&] { nearest_two(descriptors_of(a), descriptors_of(b), index.data(), first.data(), second.data()); });
   return std::make_tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(first)), as_numpy<int32_t>(std::move(second)));
 }
@@ -51,8 +51,8 @@ auto match_projected_of(const Array<double, -1, 2>& predicted, const Array<doubl
     throw nb::value_error("predicted, radius_px, octave_range: one for each descriptor of a");
   if (pixels.shape(0) != b.shape(0) || octaves.shape(0) != b.shape(0))
     throw nb::value_error("pixels, octaves: one for each descriptor of b");
-  std::vector<int64_t> index(count);
-  std::vector<int32_t> distances(count);
+  auto index = zeros<int64_t>(count);
+  auto distances = zeros<int32_t>(count);
   unlocked([&] {
     match_projected({predicted.data(), radius_px.data(), octave_range.data(), descriptors_of(a)},
                     {pixels.data(), octaves.data(), descriptors_of(b)}, max_distance, ratio, index.data(), distances.data());

@@ -125,17 +125,19 @@ BoxGrid box_grid_of(const Array<double, -1, 8>& boxes, const Triple& low, const 
     if (along > kMostCellsAlong || cells > double(1 << 24))
       throw nb::value_error("low, high, cell_m: at most 2^24 cells, 4096 along an axis");
   }
-  std::vector<YawedBox> all(boxes.shape(0));
-  for (size_t b = 0; b < all.size(); ++b)
-    all[b] = {{boxes(b, 0), boxes(b, 1), boxes(b, 2)}, {boxes(b, 3), boxes(b, 4), boxes(b, 5)}, boxes(b, 6), boxes(b, 7)};
-  return unlocked([&] { return BoxGrid(std::move(all), vec3(low.data()), vec3(high.data()), cell_m); });
+  return unlocked([&] {
+    std::vector<YawedBox> all(boxes.shape(0));
+    for (size_t b = 0; b < all.size(); ++b)
+      all[b] = {{boxes(b, 0), boxes(b, 1), boxes(b, 2)}, {boxes(b, 3), boxes(b, 4), boxes(b, 5)}, boxes(b, 6), boxes(b, 7)};
+    return BoxGrid(std::move(all), vec3(low.data()), vec3(high.data()), cell_m);
+  });
 }
 
 auto cast_of(const BoxGrid& grid, const Triple& origin, const Array<double, -1, 3>& directions, const Reals& farthest) {
   const size_t count = directions.shape(0);
   if (farthest.shape(0) != count) throw nb::value_error("farthest: one for each of directions");
-  std::vector<double> at(count);
-  std::vector<int64_t> hits(2 * count);
+  auto at = zeros<double>(count);
+  auto hits = zeros<int64_t>(2 * count);
   unlocked([&] {
     for (size_t i = 0; i < count; ++i) {
       const Hit hit = grid.cast(vec3(origin.data()), vec3(directions.data() + 3 * i), farthest(i), false, -1);

@@ -40,13 +40,13 @@ GreyImage pictured(const Image& image) {
 Images halvings(const Image& image, int count) {
   Pyramid pyramid;
   const size_t levels = checked_levels(count);
-  pyramid.set(pictured(image));
-  unlocked([&] { pyramid.level(levels); });
+  unlocked([&] { pyramid.set(pictured(image)), pyramid.level(levels); });
   Images halved;
   for (size_t level = 1; level <= levels; ++level) {
     const GreyImage of = pyramid.level(level);
     const size_t height = size_t(of.height), width = size_t(of.width);
-    halved.push_back(as_numpy<uint8_t, 2>(std::vector<uint8_t>(of.at, of.at + height * width), {height, width}));
+    auto pixels = unlocked([&] { return std::vector<uint8_t>(of.at, of.at + height * width); });
+    halved.push_back(as_numpy<uint8_t, 2>(std::move(pixels), {height, width}));
   }
   return halved;
 }
@@ -56,12 +56,12 @@ auto follow_pixels_of(const Image& before, const Image& now, const Places& pixel
   const size_t count = pixels.shape(0);
   if (predicted.shape(0) != count) throw nb::value_error("predicted: one for each pixel");
   Pyramid first, second;
-  first.set(pictured(before)), second.set(pictured(now));
   std::vector<double> places(predicted.data(), predicted.data() + 2 * count), back(2 * count);
   std::vector<uint8_t> found(count);
   const size_t down_from = checked_levels(levels);
   checked_half(half);
   unlocked([&] {
+    first.set(pictured(before)), second.set(pictured(now));
     bool* const held = reinterpret_cast<bool*>(found.data());
     follow_down(first, second, down_from, half, pixels.data(), places.data(), held, count);
     check_back(first.level(0), second.level(0), half, pixels.data(), places.data(), within_px, margin_px, held, back.data(), count);
@@ -133,10 +133,7 @@ void bind_tracking(nb::module_& module) {
              "levels"_a, "within_px"_a, "margin_px"_a);
   nb::class_<SharedTracker>(module, "Tracker")
       .def("__init__", &make_tracker, lens, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
-      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) {
-             const GreyImage image = pictured(left);
-             unlocked([&] { tracker.begin(image); });
-           }),
+      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) { unlocked([&] { tracker.begin(pictured(left)); }); }),
            "left"_a.noconvert())
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
       .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),

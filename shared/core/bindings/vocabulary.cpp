@@ -24,7 +24,7 @@ void check_tree(const Packed& centres, const Numbers& first_child, const Numbers
 auto descend_of(const Packed& descriptors, const Packed& centres, const Numbers& first_child, const Numbers& child_count,
                 const Numbers& word_of_node) {
   const size_t count = descriptors.shape(0);
-  std::vector<int32_t> words(count);
+  auto words = zeros<int32_t>(count);
   const Tree tree{{centres.data(), centres.shape(0)}, first_child.data(), child_count.data(), word_of_node.data()};
   unlocked([&] {
     check_tree(centres, first_child, child_count, word_of_node);
@@ -35,7 +35,7 @@ auto descend_of(const Packed& descriptors, const Packed& centres, const Numbers&
 
 auto two_nearest_of(const Packed& descriptors, const Packed& centres) {
   const size_t count = descriptors.shape(0);
-  std::vector<int32_t> found(2 * count);
+  auto found = zeros<int32_t>(2 * count);
   unlocked([&] { two_nearest({descriptors.data(), count}, {centres.data(), centres.shape(0)}, found.data()); });
   return as_numpy<int32_t, 2>(std::move(found), {count, 2});
 }
