@@ -238,7 +238,10 @@ class _Answer:
             self._body += message.get("body", b"")
             if message.get("more_body"):
                 return
-            body = _SCRIPT.sub(b'<script nonce="%s"' % self._nonce.encode(), self._body)
+            is_strict = not any(
+                b"'nonce-" in value for name, value in self._start["headers"] if name == b"content-security-policy"
+            )
+            body = self._body if is_strict else _SCRIPT.sub(b'<script nonce="%s"' % self._nonce.encode(), self._body)
             if body and self._may_compress:
                 body = gzip.compress(body, _LEVEL)
                 self._start["headers"] += [(b"content-encoding", b"gzip"), (b"vary", b"Accept-Encoding")]

@@ -1,4 +1,4 @@
-"""Parts of the fleet page and of the shift leader's page: figures, trials, failure rates, what got worse, tiles to survey again."""
+"""Parts of the page of trends and of the shift leader's page: figures, trials, failure rates, what got worse, tiles to survey again."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -81,17 +81,22 @@ def localised_figure(name: str, found: Kpis) -> Figure:
     return Figure(name, shown or "–", f"{words} driven without being localised" if shown else "nothing was driven")
 
 
+def trial_words(trial: Trial, moment: Callable[[int | None], str | None]) -> tuple[str, str, str]:
+    """Tone, what became of a trial, and what was found, empty before."""
+    canary, finding = trial.canary, trial.finding
+    tone, sentence = _TRIAL_WORDS[canary.state]
+    when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
+    words = f"Version {canary.version} {sentence.format(share=share(canary.share), when=when)}."
+    return tone, words, f"{finding[:1].upper()}{finding[1:]}." if finding else ""
+
+
 def trial_notices(trials: Iterable[Trial], moment: Callable[[int | None], str | None]) -> Markup:
     """The running trial of a version, and how those before it ended; moment: a stamp as people read it."""
-    notice = Markup('<div class="notice {}" role="status"><strong>Version {} {}.</strong><br>{}</div>')
+    notice = Markup('<div class="notice {}" role="status"><strong>{}</strong><br>{}</div>')
     parts = []
     for trial in trials:
-        canary, finding = trial.canary, trial.finding
-        tone, sentence = _TRIAL_WORDS[canary.state]
-        when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
-        words = sentence.format(share=share(canary.share), when=when)
-        said = f"{finding[:1].upper()}{finding[1:]}." if finding else ""
-        parts.append(notice.format(tone, canary.version, words, said))
+        canary = trial.canary
+        parts.append(notice.format(*trial_words(trial, moment)))
         sides = ((f"version {canary.version}", trial.tried), (f"others, version {canary.base_version}", trial.others))
         name = f"Failures per robot-day with version {canary.version} and with the others"
         if any(map(is_telling, (trial.tried, trial.others))):
@@ -116,15 +121,6 @@ def rates(found: list[Bar], remark: str) -> Markup:
         '<h2>Failures per robot-day</h2>{}<p class="quiet">A robot-day is 16 hours of driving. The thin line is the 95 % interval of '
         "the true rate; periods with little driving have no bar. {}</p>"
     ).format(bar_chart.bars(found, "Failures per robot-day"), remark)
-
-
-def worse_sentence(trends: Sequence[AreaTrend]) -> Markup:
-    """Which areas got worse this week, with a link to the table that says by how much."""
-    if not trends:
-        return Markup("")
-    return Markup('<p class="week">This week: {}. <a href="#worse">Area by area</a></p>').format(
-        trend_sentence(list(trends))
-    )
 
 
 def got_worse(trends: Sequence[AreaTrend], area_address: Callable[[str], str], *, has_areas: bool) -> Markup:

@@ -12,6 +12,7 @@ from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
+from mapserver.dashboard import overview
 from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -20,7 +21,6 @@ from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.pages import (
     failure_page,
     failures_page,
-    fleet_page,
     live_page,
     map_page,
     robot_page,
@@ -48,9 +48,10 @@ def install_dashboard(
         surveys,
         RobotPlacing(store, fleet, bus),
     )
-    for page in (fleet_page, robot_page, map_page, space_page, failures_page, failure_page, survey_page, live_page):
+    for page in (robot_page, map_page, space_page, failures_page, failure_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
+    overview.install(pages, services)
     _install_pictures(services, store)
 
     @app.get("/", include_in_schema=False)

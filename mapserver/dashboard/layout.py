@@ -27,19 +27,19 @@ from mapserver.serving.robot_placing import RobotPlacing
 
 T = TypeVar("T")
 
-PAGES = {"": "Fleet", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
+PAGES = {"": "Overview", "trends": "Trends", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
 RESPONSE_TIMEOUT_S = 30.0
 _HOUR_NS = 3_600_000_000_000
 _WEEK_NS = 7 * 24 * _HOUR_NS
-_LOOK_COOKIE = "fleetmap_look"
-_ZONE_COOKIE = "fleetmap_zone"
+LOOK_COOKIE = "fleetmap_look"
+ZONE_COOKIE = "fleetmap_zone"
 _TELL_ZONE = (
-    f"<script>document.cookie = '{_ZONE_COOKIE}=' + Intl.DateTimeFormat().resolvedOptions().timeZone"
+    f"<script>document.cookie = '{ZONE_COOKIE}=' + Intl.DateTimeFormat().resolvedOptions().timeZone"
     " + ';path=/;max-age=31536000;samesite=strict'</script>"
 )
 _SWITCH_LOOK = (
     "const dark = !document.body.classList.contains('body--dark');"
-    f"document.cookie = '{_LOOK_COOKIE}=' + (dark ? 'dark' : 'light') + ';path=/;max-age=31536000;samesite=strict';"
+    f"document.cookie = '{LOOK_COOKIE}=' + (dark ? 'dark' : 'light') + ';path=/;max-age=31536000;samesite=strict';"
     "setDark(dark)"
 )
 _CHOOSE_SITE = "this.form.submit()"
@@ -162,7 +162,7 @@ async def show(
         if site is None and under_way and (page == "live" or not sites):
             site = under_way[0]
         chosen = site if site in under_way else await load(services.maps.chosen_site, site)
-        zone = zone_of(request.cookies.get(_ZONE_COOKIE))
+        zone = zone_of(request.cookies.get(ZONE_COOKIE))
         sites, context = sorted({*sites, *under_way}), PageContext(root, page, chosen, zone, request.query_params)
     except FleetmapError as error:
         _head(services, request, page, None, [])
@@ -171,13 +171,14 @@ async def show(
     _head(services, request, page, context.site, sites)
     _end_with_session(services, request)
     try:
-        _check_query(request, knows)
+        check_query(request, knows)
         await build(context)
     except FleetmapError as error:
         html(notice("bad", str(error)))
 
 
-def _check_query(request: Request, knows: Sequence[str]) -> None:
+def check_query(request: Request, knows: Sequence[str]) -> None:
+    """Raises UsageError for a query parameter beside `site` and those that a page knows."""
     unknown = [name for name in request.query_params if name not in {"site", *knows}]
     if unknown:
         raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {', '.join(('site', *knows))}")
@@ -225,7 +226,7 @@ def _style() -> str:
 def _set_look(request: Request) -> None:
     """The look that was chosen with the button, else that of the browser."""
     ui.add_head_html(_style() + _TELL_ZONE)
-    look = request.cookies.get(_LOOK_COOKIE)
+    look = request.cookies.get(LOOK_COOKIE)
     if look in {"dark", "light"}:
         ui.dark_mode(look == "dark")
 
@@ -244,8 +245,8 @@ def _end_with_session(services: Services, request: Request) -> None:
     ui.timer(_SESSION_EVERY_S, look)
 
 
-def _person(request: Request) -> Markup:
-    """Who is signed in, and the way out."""
+def person(request: Request) -> Markup:
+    """Name and role of the operator who is signed in, and the way out."""
     who = getattr(request.state, "operator", None)
     if who is None:
         return Markup("")
@@ -275,7 +276,7 @@ def _head(services: Services, request: Request, page: str, site: str | None, sit
         Markup(
             '<nav class="top"><strong>fleetmap</strong>{}<span class="space"></span>{}'
             '<button class="plain" type="button" onclick="{}">Light or dark</button>{}</nav>'
-        ).format(links, chooser if sites else "", _SWITCH_LOOK, _person(request))
+        ).format(links, chooser if sites else "", _SWITCH_LOOK, person(request))
     )
     if services.guard.warning:
         html(notice("bad", services.guard.warning))

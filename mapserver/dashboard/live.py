@@ -63,9 +63,9 @@ class LiveSite:
 
     robots: tuple[LiveRobot, ...]
 
-    def count(self, tone: str, words: str | None = None) -> int:
-        """How many robots are in a tone, and in the state that these words say."""
-        return sum(robot.tone == tone and words in {None, robot.words} for robot in self.robots)
+    def count(self, tone: str) -> int:
+        """How many robots are in a tone."""
+        return sum(robot.tone == tone for robot in self.robots)
 
     def robot(self, name: str) -> LiveRobot | None:
         """The robot of a name, None where it was never heard."""

@@ -1,6 +1,6 @@
 """What interactive maps show, in metres of `map`: pictures, squares, areas, lines, dots and marks, in named layers. Pure.
 
-Maps draw these by `site_map.js`; the field `kind` says how.
+Maps draw these by `static/map/index.js`; the field `kind` says how.
 """
 
 import base64

@@ -15,7 +15,7 @@ from mapserver.dashboard.map_layers import Box, Item, Layer
 _STYLES = Path(nicegui.elements.leaflet.__file__).parent / "dist"
 
 
-class SiteMap(Element, component="site_map.js", esm={"fleetmap-marks": "marks"}, default_classes="site-map"):
+class SiteMap(Element, component="site_map.js", esm={"fleetmap-map": "static/map"}, default_classes="site-map"):
     """A map of layers over a box. label: what it shows, for those who cannot see it. is_small: beside a text.
 
     follows: the map keeps everything in sight while its layers grow, until somebody moves it.

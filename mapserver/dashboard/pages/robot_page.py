@@ -46,9 +46,7 @@ def install(services: Services) -> None:
         async def build(context: PageContext) -> None:
             found = (await load(services.robots.look, context.site)).robot(robot)
             if found is None:
-                raise UsageError(
-                    f"site {context.site} never heard of a robot {robot[:40]!r}; the fleet page lists them"
-                )
+                raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the Overview lists them")
             await _page(services, context, found)
 
         await show(services, request, "robots", site, build, ("since", "until"))

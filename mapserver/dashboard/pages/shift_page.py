@@ -1,4 +1,4 @@
-"""The shift leader's page: one HTML file without links, made of the parts of the fleet page, light or dark as the screen is."""
+"""The shift leader's page: one HTML file without links, made of the parts of the page of trends, light or dark as the screen is."""
 
 from collections.abc import Sequence
 from datetime import datetime

@@ -54,7 +54,7 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     asked = page.get_by_text(re.compile("asked by ada at .*robots lose themselves in aisle 3"))
     expect(asked).to_have_count(1)
     expect(page.locator(".site-map path.area")).to_have_count(1)
-    opened(page, served, "")
+    opened(page, served, "trends")
     expect(page.get_by_role("table", name="Tiles to survey again")).to_contain_text("ada asked for it", timeout=15_000)
     opened(page, served, "map")
     change(page, page.get_by_role("button", name=re.compile("^Survey .* is done")).inner_text())

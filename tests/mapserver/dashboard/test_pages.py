@@ -22,11 +22,13 @@ from support.fleet.dashboard_scene import (
     overlapping,
     place_of,
     talking,
+    wait_until,
 )
 from support.pages.whole_page import assert_whole
 
 PAGES = {
-    "": "Robots of hall",
+    "": "Overview of hall",
+    "trends": "Trends of hall",
     "map": "Map of hall",
     "failures": "Failures of hall",
     "failures/1": "Failure 1 of tug-7",
@@ -50,7 +52,7 @@ def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page
 def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> None:
     with talking(served.zenoh, ROBOTS) as moved:
         seen = opened(page, served, "")
-        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
+        expect(page.locator("#figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
         assert len(marks(page, ROBOTS)) == ROBOTS
         assert page.locator(".site-map *").count() < ROBOTS / 3, "robots are painted: they cost no elements"
         assert page.evaluate(PLACE_OF, "tug-4") == pytest.approx(place_of(4), abs=0.05), "drawn where it is"
@@ -59,11 +61,10 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         assert page.evaluate(PLACE_OF, "tug-4") == pytest.approx(place_of(4), abs=0.05)
         moved["tug-4"] = (40.0, 14.0)
         at_new_place = "marks => marks.some(m => m.name === 'tug-4' && m.x === 40 && m.y === 14 && m.tone === 'bad')"
-        page.wait_for_function(f"({at_new_place})(document.querySelector('.site-map').marks())", timeout=15_000)
-        attention = page.get_by_role("region", name="Robots that need a look")
-        expect(page.locator(".attention")).to_contain_text(f"of {ROBOTS} robots need a look")
-        attention.get_by_role("link").first.click()
-        lost = attention.page.url.rpartition("/")[2].partition("?")[0]
+        wait_until(page, f"({at_new_place})(document.querySelector('.site-map').marks())")
+        expect(page.get_by_role("status")).to_contain_text(f"{ROBOTS} robots are online")
+        page.get_by_role("list", name="Robots, problems first").get_by_role("link").first.click()
+        lost = page.url.rpartition("/")[2].partition("?")[0]
         expect(page.locator("h1")).to_have_text(lost)
         expect(page.locator(".notice.bad")).to_contain_text(re.compile(r"^Lost since \d{4}-"))
         assert [mark["name"] for mark in marks(page)] == [lost]
@@ -71,7 +72,7 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         opened(page, served, "")
         before = page.evaluate("performance.timeOrigin")
         page.get_by_label("Find a robot").fill("tug-4")
-        row = page.locator("tbody tr", has=page.get_by_role("link", name="tug-4", exact=True))
+        row = page.locator("#robots li", has=page.get_by_role("link", name="tug-4", exact=True))
         expect(row).to_contain_text("lost", timeout=15_000)
         assert page.evaluate("performance.timeOrigin") == before, "the page changed by itself, it was not loaded again"
         assert seen.faults == []
@@ -93,9 +94,6 @@ PLACE_OF = """name => {
 
 def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) -> None:
     seen = opened(page, served, "")
-    # While robots of the test before are still heard, those in trouble stand above the map; it moves when they are gone.
-    expect(page.locator(".notice").first).to_contain_text("No robot is heard now", timeout=20_000)
-    page.locator(".site-map").scroll_into_view_if_needed()
     for _ in range(3):  # until no other robot is within the pointer's reach
         page.get_by_role("button", name="Zoom in").click()
     middle = page.evaluate(
@@ -115,7 +113,7 @@ def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) 
 def test_names_do_not_overlap(page: Page, served: Served) -> None:
     with talking(served.zenoh, ROBOTS):
         opened(page, served, "")
-        expect(page.locator(".figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
+        expect(page.locator("#figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
         named = [mark["nameBox"] for mark in marks(page, ROBOTS) if mark["nameBox"]]
         assert 1 < len(named) < ROBOTS / 2
         assert not overlapping(named)
@@ -215,8 +213,9 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
         ("surveys?since=soon", "is no time; write"),
         ("map?until=soon", "is no time; write"),
-        ("?since=soon", "is no time; write"),
-        ("?sinc=2026-01-01", "this page knows site, since, until"),
+        ("trends?since=soon", "is no time; write"),
+        ("trends?sinc=2026-01-01", "this page knows site, since, until"),
+        ("?site=nowhere", "no site nowhere"),
     ):
         assert words in httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text, path
     for path in ("plans/hall/99.png", "pictures/1/9.jpg", "underlays/hall/2/floor.png", "underlays/hall/99/grid.png"):
@@ -250,13 +249,13 @@ def test_surveys_the_history_and_the_figures_keep_to_a_range(served: Served) -> 
     assert "cameras are swapped" in shown("surveys", **within)
     assert "Nothing happened in this time." in shown("map", **before)
     assert "first survey" in shown("map", **within), "the reason in the history"
-    assert "Failures per robot-day, chosen hours" in shown("", **within)
-    assert "Failures per robot-day, last 24 h" in shown("")
+    assert "Failures per robot-day, chosen hours" in shown("trends", **within)
+    assert "Failures per robot-day, last 24 h" in shown("trends")
 
 
 def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:
     opened(page, served, "")
-    page.get_by_role("button", name="Light or dark").click()
+    page.get_by_label("Theme").select_option("Dark")
     chosen = "document.body.classList.contains('body--dark')"
     assert page.evaluate(chosen)
     opened(page, served, "surveys")

@@ -2,6 +2,8 @@
 
 from playwright.sync_api import Page
 
+from support.fleet.dashboard_scene import wait_until
+
 SIZES = ((1280, 800), (820, 1180), (390, 844))
 
 # Contrast (WCAG 2) of all words with the nearest ground that is painted behind them: the weakest, and its words.
@@ -36,7 +38,7 @@ def assert_whole(page: Page) -> None:
         page.emulate_media(color_scheme=look)
         for width, height in SIZES:
             page.set_viewport_size({"width": width, "height": height})
-            page.wait_for_function(f"document.body.classList.contains('body--{look}')")
+            wait_until(page, f"document.body.matches('.body--{look}, .print')")
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
                 f"{page.url} is wider than {width}"
             )

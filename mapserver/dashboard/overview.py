@@ -1,0 +1,291 @@
+"""The first pages: Overview (does anything need me?) and Trends (what got worse?). Templates filled from the same functions as the other
+pages; the Overview is kept up to date by a stream of server-sent events.
+"""
+
+import asyncio
+import time
+from base64 import b64encode
+from collections.abc import AsyncIterator, Callable
+from hashlib import sha256
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from fastapi.responses import HTMLResponse, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from nicegui.elements import leaflet
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import FleetmapError
+from mapserver.api.guard import SIGN_IN
+from mapserver.api.moments import zone_of
+from mapserver.dashboard import fleet_parts
+from mapserver.dashboard.bar_chart import Bar
+from mapserver.dashboard.data import EVER
+from mapserver.dashboard.fleet_health import SiteHealth
+from mapserver.dashboard.fleet_parts import Figure
+from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
+from mapserver.dashboard.live import LiveRobot, LiveSite
+from mapserver.dashboard.map_layers import Layer, Mark, box_around, box_of, ground, heat
+from mapserver.dashboard.markup import age, share
+from mapserver.dashboard.pages.robot_page import where_words
+from mapserver.fleet_statistics.area_trend import trend_sentence
+from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telling
+from mapserver.fleet_statistics.robot_calibration import PARAMETERS
+from mapserver.floor_plan.areas import Areas
+
+_HERE = Path(__file__).parent
+_EVERY_S = 1.0
+_SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
+_THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
+_MANY = 20  # robots, whose places say better than the map's tiles what to show first
+# {}: the hash of the import map, the one script within a page.
+_POLICY = (
+    "default-src 'none'; script-src 'self' 'sha256-{}'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+_TEMPLATES = Environment(loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined)
+
+
+def install(app: FastAPI, services: Services) -> None:
+    """Adds the pages, what they load, and the stream."""
+    app.mount("/static", StaticFiles(directory=_HERE / "static"))
+    app.mount("/leaflet", StaticFiles(directory=Path(leaflet.__file__).parent / "dist"))
+
+    @app.get("/style.css", include_in_schema=False)
+    def style() -> HTMLResponse:
+        """Colours and parts that all pages share."""
+        return HTMLResponse((_HERE / "style.css").read_text("utf-8"), media_type="text/css")
+
+    @app.get("/", include_in_schema=False)
+    async def overview(request: Request, site: str | None = None) -> HTMLResponse:
+        """The Overview."""
+
+        def fill(context: PageContext) -> dict[str, object]:
+            data = {"scene": _scene(services, context), "now": _now(services, context)}
+            return {"data": to_json(data).decode().replace("<", "\\u003c")}
+
+        return await _page(services, request, "", site, fill)
+
+    @app.get("/trends", include_in_schema=False)
+    async def trends(request: Request, site: str | None = None) -> HTMLResponse:
+        """Trends."""
+        return await _page(services, request, "trends", site, lambda context: _trends(services, context))
+
+    @app.get("/now", include_in_schema=False)
+    async def now(request: Request, site: str) -> StreamingResponse:
+        """What the Overview shows, every second, for as long as the session lasts."""
+        root, zone = str(request.scope.get("root_path", "")), zone_of(request.cookies.get(ZONE_COOKIE))
+        context = PageContext(root, "", await load(services.maps.chosen_site, site), zone)
+
+        def one() -> bytes:
+            is_signed_in = getattr(request.state, "operator", None) is not None
+            if is_signed_in and services.guard.identify(request.scope, uses=False) is None:
+                return b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
+            return b"data: %s\n\n" % to_json(_now(services, context))
+
+        async def events() -> AsyncIterator[bytes]:
+            while not await request.is_disconnected():
+                yield await load(one)
+                await asyncio.sleep(_EVERY_S)
+
+        return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+
+async def _page(
+    services: Services,
+    request: Request,
+    page: str,
+    site: str | None,
+    fill: Callable[[PageContext], dict[str, object]],
+) -> HTMLResponse:
+    """The template of a page, filled; a FleetmapError becomes a notice within the frame."""
+    root, sites, chosen, found, status = str(request.scope.get("root_path", "")), [], site, {}, 200
+    try:
+        sites = await load(services.maps.sites)
+        chosen = await load(services.maps.chosen_site, site)
+        zone = zone_of(request.cookies.get(ZONE_COOKIE))
+        check_query(request, ("since", "until") if page else ())
+        found = await load(fill, PageContext(root, page, chosen, zone, request.query_params))
+        template = f"{page or 'overview'}.html"
+    except FleetmapError as error:
+        template, found, status = "problem.html", {"words": str(error)}, 404
+    imports = to_json({"imports": {"nicegui-leaflet": f"{root}/leaflet/index.js"}}).decode()
+    look = request.cookies.get(LOOK_COOKIE, "")
+    frame = {
+        "root": root,
+        "imports": Markup(imports),
+        "pages": PAGES,
+        "page": page,
+        "sites": sites,
+        "site": chosen,
+        "look": look if look in _THEMES else "",
+        "theme": _THEMES.get(look, "print"),
+        "person": person(request),
+        "warning": services.guard.warning,
+    }
+    policy = _POLICY.format(b64encode(sha256(imports.encode()).digest()).decode())
+    filled = _TEMPLATES.get_template(template).render(frame | found)
+    return HTMLResponse(filled, status, {"Content-Security-Policy": policy})
+
+
+def _scene(services: Services, context: PageContext) -> dict[str, object] | None:
+    """The map, None before the first version."""
+    site, version = context.site, services.maps.current_version(context.site)
+    if version is None:
+        return None
+    plan, live = services.maps.plan(site, version), services.robots.look(site)
+    box, below = box_of(plan), services.maps.underlays(site, version, context.root)
+    layers = [
+        *ground(plan, context.plan_picture(version), services.maps.areas(site), below),
+        Layer("Failures", heat(services.health.places(site), box), shown=False),
+        Layer("Robots", _marks(context, live)),
+    ]
+    places = [robot.place_m for robot in live.robots if robot.place_m is not None]
+    seen = box_around(places, box) if len(places) > _MANY else box
+    return {"label": f"Map of {site}, version {version}", "box": seen, "layers": layers, "follows": False}
+
+
+def _now(services: Services, context: PageContext) -> dict[str, object]:
+    """What changes from second to second."""
+    live, health = services.robots.look(context.site), services.health.site(context.site)
+    areas = services.maps.areas(context.site)
+    return {
+        "line": _line(live),
+        "notices": _notices(context, health),
+        "figures": _figures(live, health),
+        "robots": [_robot(context, robot, health, areas) for robot in live.robots],
+        "marks": _marks(context, live),
+    }
+
+
+def _line(live: LiveSite) -> dict[str, str]:
+    """One sentence for all robots."""
+    online = [robot for robot in live.robots if robot.tone != "quiet"]
+    lost, unsure = live.count("bad"), live.count("warn")
+    if not live.robots:
+        return {"tone": "quiet", "words": "No robot has reported yet; `locclient run` on a robot does."}
+    if not online:
+        last_s = min(robot.seconds_since for robot in live.robots)
+        return {"tone": "quiet", "words": f"All robots are offline; the last one reported {age(last_s)} ago."}
+    troubled = sum(robot.tone == "good" and bool(_troubles(robot)) for robot in online)
+    counts = ((lost, "not localized"), (unsure, "uncertain"), (troubled, "with something else to look at"))
+    parts = [f"{count} {words}" for count, words in counts if count]
+    if not parts:
+        return {"tone": "good", "words": f"All {len(online)} robots online are localized."}
+    told = f"{', '.join(parts)}; {len(online)} robots are online."
+    return {"tone": "bad" if lost else "warn", "words": told}
+
+
+def _troubles(robot: LiveRobot) -> list[str]:
+    """What is wrong beside the state."""
+    found = [f"refuses a version: {robot.refused}"] if robot.refused else []
+    found += ["was connected twice: was its certificate copied?"] if robot.is_copied else []
+    if robot.is_behind and robot.wanted_version is not None:
+        found.append(f"runs version {robot.version or 'none'}, should run {robot.wanted_version}")
+    if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:
+        found.append(f"clock wrong by {robot.clock_ahead_s:+.0f} s")
+    return found + [f"{PARAMETERS[f.name]} drifts" for f in robot.calibration if f.is_drifted]
+
+
+def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas) -> dict[str, object]:
+    """One row of the list."""
+    words, own = [*robot.flags, *_troubles(robot)], health.robots.get(robot.name)
+    failures = 0 if own is None else own.failures.events + own.failures_running
+    words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
+    words += ["tries a new version"] if robot.is_canary else []
+    since, exact = "", ""
+    if robot.tone == "quiet":
+        since = f"{age(robot.seconds_since)} ago"
+    elif robot.tone != "good" and robot.since_ns is not None:
+        since, exact = age(max(0.0, time.time() - robot.since_ns / 1e9)), context.moment(robot.since_ns) or ""
+    return {
+        "name": robot.name,
+        "to": context.to(f"robots/{robot.name}"),
+        "tone": robot.tone,
+        "state": robot.words,
+        "since": since,
+        "exact": exact,
+        "about": " · ".join(filter(None, [where_words(robot, areas), ", ".join(words).replace("_", " ")])),
+        "place": robot.place_m,
+    }
+
+
+def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
+    """Robots that ever sent a position, those in trouble on top."""
+    found = []
+    for robot in reversed(live.robots):
+        if robot.place_m is not None:
+            shape, words = _SHAPES.get(robot.tone, "circle"), f"{robot.name}: {robot.words}"
+            address, (x, y) = context.to(f"robots/{robot.name}"), robot.place_m
+            place = round(x, 2), round(y, 2)
+            found.append(Mark(*place, robot.tone, shape, words, address, robot.name, robot.heading_rad))
+    return found
+
+
+def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
+    """Those that are known: what cannot be known yet is left out."""
+    online, failures = len(live.robots) - live.count("quiet"), health.day.failures
+    found: list[dict[str, object]] = [{"name": "Online", "value": f"{online} of {len(live.robots)}"}]
+    if shown := share(health.day.localised_share_of_all):
+        found.append({"name": "Localized while driving, 24 h", "value": shown})
+    if is_telling(failures):
+        low, high = (figure(value or 0.0) for value in (failures.low, failures.high))
+        days = [day.per_robot_day if is_telling(day) else None for day in health.days]
+        value, more = figure(failures.per_robot_day or 0.0), f"{low} to {high} with 95 %"
+        found.append({"name": "Failures per robot-day, 24 h", "value": value, "more": more, "days": days})
+    return found
+
+
+def _notices(context: PageContext, health: SiteHealth) -> list[dict[str, str]]:
+    """Trials of versions, running or just ended, and what got worse this week, each with a page that says more."""
+    found = []
+    for trial in health.trials:
+        tone, words, said = fleet_parts.trial_words(trial, context.moment)
+        found.append({"tone": tone, "words": f"{words} {said}", "to": context.to("trends"), "more": "Trends"})
+    if health.areas:
+        words = f"This week: {trend_sentence(list(health.areas))}."
+        found.append({"tone": "quiet", "words": words, "to": f"{context.to('trends')}#worse", "more": "Area by area"})
+    return found
+
+
+def _trends(services: Services, context: PageContext) -> dict[str, object]:
+    """The figures of a day, or of the range in the address, and what they were before."""
+    live, health = services.robots.look(context.site), services.health.site(context.site)
+    span_ns = context.time_range()
+    day, when, trend = health.day, "last 24 h", f"; {health.trend}"
+    if span_ns != EVER:
+        day, when, trend = services.health.span(context.site, *span_ns), "chosen hours", ""
+    figures = [
+        fleet_parts.localised_figure(f"Localised while driving, {when}", day),
+        fleet_parts.rate_figure(f"Failures per robot-day, {when}", day.failures, trend),
+        fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
+        Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
+    ]
+    axis, since = ("area" if health.has_areas else "tile"), context.written(health.week_since_ns)
+    calibrations = [(robot.name, robot.calibration) for robot in live.robots if robot.calibration]
+    return {
+        "range": context.range_form("trends", usual="Last 24 h"),
+        "trials": fleet_parts.trial_notices(health.trials, context.moment),
+        "figures": fleet_parts.figures(figures),
+        "worse": fleet_parts.got_worse(
+            health.areas,
+            lambda name: context.to("failures", **{axis: name, "since": since}),
+            has_areas=health.has_areas,
+        ),
+        "rates": fleet_parts.rates(_bars(health.days), _last_day(health)),
+        "calibrations": fleet_parts.calibrations(calibrations),
+        "resurvey": fleet_parts.resurvey(health.resurvey, lambda tile: context.to("failures", tile=tile)),
+    }
+
+
+def _bars(days: tuple[Rate, ...]) -> list[Bar]:
+    """Failures per robot-day of the last days."""
+    last = len(days) - 1
+    return [fleet_parts.rate_bar("24 h" if n == last else f"-{last - n} d", day) for n, day in enumerate(days)]
+
+
+def _last_day(health: SiteHealth) -> str:
+    day = health.day.failures
+    return f"A bar for each 24 hours. Last 24 hours: {day.events} in {driven_words(day.robot_days)}, {health.trend}."

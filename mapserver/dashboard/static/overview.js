@@ -1,0 +1,103 @@
+// The Overview: the map, and beside it the robots; the server's stream keeps both up to date.
+import { SiteMap } from "./map/index.js";
+
+const NEAR_ZOOM = 5;
+const { scene, now } = JSON.parse(document.getElementById("data").textContent);
+const element = document.getElementById("map");
+const map = scene && new SiteMap(element, scene, { fillsPage: true });
+if (!map) element.replaceWith(made("p", "notice", "No map is published yet: robots cannot be shown on it."));
+const line = document.getElementById("line");
+const list = document.getElementById("robots");
+const search = document.getElementById("search");
+const rows = new Map();
+const shownNow = new Map();
+let state = now;
+
+function made(tag, className, text) {
+  const node = document.createElement(tag);
+  node.className = className;
+  node.textContent = text; // robots choose their words: text, never markup
+  return node;
+}
+
+function row({ name, to }) {
+  const item = made("li", "", "");
+  const link = made("a", "name", name);
+  link.href = to;
+  item.append(link, ...["state", "since", "about"].map((part) => made("span", part, "")));
+  item.addEventListener("click", ({ target }) => {
+    const place = state.robots.find((robot) => robot.name === name)?.place;
+    if (target !== link && place && map) map.map.setView([place[1], place[0]], NEAR_ZOOM);
+  });
+  return item;
+}
+
+function refresh(item, robot) {
+  item.className = robot.tone;
+  const [, now, since, about] = item.children;
+  for (const [part, text] of [[now, robot.state], [since, robot.since], [about, robot.about]]) if (part.textContent !== text) part.textContent = text;
+  since.title = robot.exact;
+}
+
+function notice({ tone, words, to, more }) {
+  const box = made("p", `notice ${tone}`, `${words} `);
+  box.append(Object.assign(made("a", "", more), { href: to }));
+  return box;
+}
+
+function say({ words, tone }) {
+  if (line.textContent === words) return;
+  line.textContent = words;
+  line.className = `line ${tone}`;
+}
+
+function bars(days) {
+  const most = Math.max(...days, 1e-9);
+  const drawn = made("span", "bars", "");
+  drawn.setAttribute("role", "img");
+  drawn.setAttribute("aria-label", `failures per robot-day of the last ${days.length} days`);
+  for (const day of days) drawn.append(Object.assign(document.createElement("i"), { style: `height: ${Math.round((100 * (day ?? 0)) / most)}%` }));
+  return drawn;
+}
+
+function keyFigure({ name, value, more, days }) {
+  const box = document.createElement("div");
+  box.append(made("span", "quiet", name), made("strong", "", value));
+  if (days) box.append(bars(days));
+  if (more) box.append(made("span", "quiet", more));
+  return box;
+}
+
+function show(id, found, draw) {
+  const key = JSON.stringify(found);
+  if (shownNow.get(id) === key) return;
+  shownNow.set(id, key);
+  document.getElementById(id).replaceChildren(...found.map(draw));
+}
+
+function update() {
+  say(state.line);
+  show("figures", state.figures, keyFigure);
+  show("notices", state.notices, notice);
+  const wanted = search.value.toLowerCase();
+  const shown = state.robots.filter((robot) => `${robot.name} ${robot.state} ${robot.about}`.toLowerCase().includes(wanted));
+  const items = shown.map((robot) => {
+    if (!rows.has(robot.name)) rows.set(robot.name, row(robot));
+    refresh(rows.get(robot.name), robot);
+    return rows.get(robot.name);
+  });
+  // What stands in its place already stays: a click or a focus is not lost to a report.
+  items.forEach((item, n) => list.children[n] !== item && list.insertBefore(item, list.children[n] ?? null));
+  while (list.children.length > items.length) list.lastChild.remove();
+  map?.show("Robots", state.marks);
+}
+
+update();
+search.addEventListener("input", update);
+const stream = new EventSource(`now?site=${encodeURIComponent(document.querySelector("header select[name=site]").value)}`);
+stream.onmessage = ({ data }) => {
+  state = JSON.parse(data);
+  update();
+};
+stream.addEventListener("ended", ({ data }) => location.assign(data));
+stream.onerror = () => say({ words: "The server does not answer; trying again.", tone: "bad" });
