@@ -170,10 +170,10 @@ def _line(live: LiveSite) -> dict[str, str]:
         last_s = min(robot.seconds_since for robot in live.robots)
         return {"tone": "quiet", "words": f"All robots are offline; the last one reported {age(last_s)} ago."}
     troubled = sum(robot.tone == "good" and bool(_troubles(robot)) for robot in online)
-    counts = ((lost, "not localized"), (unsure, "uncertain"), (troubled, "with something else to look at"))
+    counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "with something else to look at"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
-        return {"tone": "good", "words": f"All {len(online)} robots online are localized."}
+        return {"tone": "good", "words": f"All {len(online)} robots online are localised."}
     told = f"{', '.join(parts)}; {len(online)} robots are online."
     return {"tone": "bad" if lost else "warn", "words": told}
 
@@ -229,7 +229,7 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
     online, failures = len(live.robots) - live.count("quiet"), health.day.failures
     found: list[dict[str, object]] = [{"name": "Online", "value": f"{online} of {len(live.robots)}"}]
     if shown := share(health.day.localised_share_of_all):
-        found.append({"name": "Localized while driving, 24 h", "value": shown})
+        found.append({"name": "Localised while driving, 24 h", "value": shown})
     if is_telling(failures):
         low, high = (figure(value or 0.0) for value in (failures.low, failures.high))
         days = [day.per_robot_day if is_telling(day) else None for day in health.days]

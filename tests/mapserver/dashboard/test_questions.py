@@ -80,7 +80,7 @@ def test_names_of_robots_keep_off_those_of_areas(page: Page, served: Served, siz
 
 
 def test_which_robots_need_a_person_now(operator: Operator) -> None:
-    expect(operator.page.get_by_role("status")).to_contain_text("not localized", timeout=60_000)
+    expect(operator.page.get_by_role("status")).to_contain_text("not localised", timeout=60_000)
     row = operator.page.locator("#robots li", has=operator.page.get_by_role("link", name="tug-4", exact=True))
     expect(row).to_contain_text("lost")
     expect(row).to_contain_text(WORSE)
