@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap import core
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
@@ -25,6 +24,7 @@ from mapserver.calibration.parameters import (
     right_camera,
 )
 from mapserver.calibration.problem import CalibrationData, MotionState
+from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
@@ -34,16 +34,16 @@ _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PAIR_ROLL]), 1e-5)
 _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION), 1e-5)
 _LENS_STEPS |= dict.fromkeys(range(len(COLUMNS) + 2 * DISTORTION, UNKNOWNS), 0.01)
-HUBER_SIGMAS, CUTOFF_SIGMAS = 3.0, 8.0  # of an observation's four rows together
+_PLACE = [INDEX[p] for p in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z)]
+_TURN = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
+_SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
 
 
-class ImageRows(NamedTuple):
-    """Whitened rows of M observations: residuals (M, 4), derivatives by pose (M, 4, 6), point (M, 4, 3) and calibration (M, 4, C)."""
+class Fixed(NamedTuple):
+    """What hardly changes near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes` (M, 4, C)."""
 
-    residuals: Array
-    by_keyframe: Array
-    by_point: Array
-    by_calibration: Array
+    rates_map: Array
+    slopes: Array
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ class Observations:
         return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
 
     def measured_slopes(self, theta: Array) -> Array:
-        """(M, 4, C) derivatives of `measured` by central differences, the scale of its pinholes held."""
+        """(M, 4, C) derivatives of `measured` by central differences, the scale of its pinholes held; zero where there are none."""
         views, slopes = self.views(theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
         for column, size in _LENS_STEPS.items():
             step = size * (np.arange(UNKNOWNS) == column)
             change = self.measured(theta + step, views) - self.measured(theta - step, views)
-            slopes[:, :, column] = change / (2.0 * size)
+            slopes[:, :, column] = np.where(np.isfinite(change), change / (2.0 * size), 0.0)
         return slopes
 
 
@@ -119,9 +119,8 @@ class _View:
 
 
 def _view(seen: Observations, data: CalibrationData, state: MotionState, theta: Array) -> _View:
-    turned = seen.axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
-    shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
-    place = seen.calibration.cameras[0].body_from_cam[:3, 3] + shift
+    turned = seen.axes.body_from_rect @ so3_exp(theta[_TURN])
+    place = seen.calibration.cameras[0].body_from_cam[:3, 3] + theta[_SHIFT]
     body_from_map = state.map_from_body[:, :3, :3].transpose(0, 2, 1)
     rect_from_map = (turned.T @ body_from_map)[data.obs_keyframe]
     from_body = state.points_map[data.obs_landmark] - state.map_from_body[data.obs_keyframe, :3, 3]
@@ -130,82 +129,50 @@ def _view(seen: Observations, data: CalibrationData, state: MotionState, theta: 
     return _View(in_left, from_body, rect_from_map, apart)
 
 
-def image_residuals(
-    seen: Observations, data: CalibrationData, state: MotionState, theta: Array, scales: Array
-) -> tuple[Array, Array]:
-    """Whitened rows (M, 4), zero where nothing is seen, and the robust cost's weight of each observation (M,).
-
-    scales (4,): factors on the rows' sigmas.
-    """
-    view = _view(seen, data, state, theta)
-    off = seen.measured(theta) - _predicted(view, seen.views(theta))
-    usable = (view.in_left[:, 2] > _MIN_DEPTH_M)[:, None] & np.isfinite(seen.row_sigmas)
-    rows = np.where(usable, off, 0.0) / (np.where(usable, seen.row_sigmas, 1.0) * scales)
-    norm = np.linalg.norm(rows, axis=1)
-    weight = np.where(norm > CUTOFF_SIGMAS, 0.0, np.minimum(1.0, HUBER_SIGMAS / np.maximum(norm, 1e-9)))
-    return rows, weight
-
-
-def robust_cost(rows: Array) -> float:
-    """Half the robust sum of squares: square, linear from HUBER_SIGMAS, constant from CUTOFF_SIGMAS."""
-    reach = np.minimum(np.linalg.norm(rows, axis=1), CUTOFF_SIGMAS)
-    linear = HUBER_SIGMAS * (reach - 0.5 * HUBER_SIGMAS)
-    return float(np.where(reach <= HUBER_SIGMAS, 0.5 * reach**2, linear).sum())
-
-
 def image_rows(
     seen: Observations,
     data: CalibrationData,
-    point: tuple[MotionState, Array],
+    state: MotionState,
+    theta: Array,
+    measured: Array,
     scales: Array,
-    fixed: tuple[Array, Array],
+    fixed: Fixed | None,
 ) -> ImageRows:
-    """The rows and their derivatives at a state and theta.
+    """Whitened rows at a state, a theta and what is `measured` there, zero where nothing is seen; with `fixed` also their derivatives.
 
-    fixed: what hardly changes near it: rates_map (K, 3), angular rate of the body, and `measured_slopes` (M, 4, C).
+    scales (4,): factors on the rows' sigmas.
     """
-    (state, theta), (rates_map, slopes) = point, fixed
-    view = _view(seen, data, state, theta)
-    rows, weight = image_residuals(seen, data, state, theta, scales)
-    views = seen.views(theta)
+    view, views, positions = _view(seen, data, state, theta), seen.views(theta), state.map_from_body[:, :3, 3]
+    usable = (view.in_left[:, 2] > _MIN_DEPTH_M)[:, None] & np.isfinite(seen.row_sigmas)
+    off = np.where(usable, measured - _predicted(view, views), 0.0)
+    factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)
+    if fixed is None:
+        return ImageRows(off * factor, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
     by_left = _projection_slopes(view.in_left, views[0])
     by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
-    by_apart = np.zeros((len(rows), 4, 3))
+    by_calibration = fixed.slopes.copy()
     if seen.axes.baseline_m > 0:
         by_right = _projection_slopes(view.in_left - view.right_m, views[1])
-        by_cam[:, 2:], by_apart[:, 2:] = by_left - by_right, by_right
+        by_cam[:, 2:] = by_left - by_right
+        by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, _right_place_slopes(seen.axes, theta))
     by_point = -np.einsum("mij,mjk->mik", by_cam, view.rect_from_map)
-    by_keyframe = np.concatenate([np.cross(by_point, view.from_body[:, None, :]), -by_point], axis=2)
-    by_calibration = slopes.copy()
-    turned = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
     # X <- Exp(-phi) X changes by X x phi
-    by_calibration[:, :, turned] = -np.cross(by_cam, view.in_left[:, None, :])
-    map_from_body = state.map_from_body[data.obs_keyframe, :3, :3]
-    placed = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
-    by_calibration[:, :, placed] = -np.einsum("mij,mjk->mik", by_point, map_from_body)
-    rates = np.concatenate([rates_map, state.motions[:, :3]], axis=1)[data.obs_keyframe]
-    by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_keyframe, rates)
-    if seen.axes.baseline_m > 0:
-        _by_baseline(by_calibration, by_apart, seen.axes, theta)
-    off = rows * np.where(np.isfinite(seen.row_sigmas), seen.row_sigmas, 0.0) * scales
+    by_calibration[:, :, _TURN] = -np.cross(by_cam, view.in_left[:, None, :])
+    by_calibration[:, :, _SHIFT] = -np.einsum("mij,mjk->mik", by_point, state.map_from_body[data.obs_keyframe, :3, :3])
+    flow = np.cross(view.from_body, fixed.rates_map[data.obs_keyframe]) - state.motions[data.obs_keyframe, :3]
+    by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_point, flow)
     by_calibration[:, :, INDEX[P.FOCAL]] += off / (1.0 + theta[INDEX[P.FOCAL]])
     by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 2:] - off[:, :2]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
-    factor = np.sqrt(weight)[:, None] / np.where(np.isfinite(seen.row_sigmas), seen.row_sigmas * scales, np.inf)
-    factor[view.in_left[:, 2] <= _MIN_DEPTH_M] = 0.0
-    derivatives = [np.ascontiguousarray(by) for by in (by_keyframe, by_point, by_calibration)]
-    for by in derivatives:
-        core.weigh(by, factor)
-    return ImageRows(rows * np.sqrt(weight)[:, None], *derivatives)
+    by_point *= factor[:, :, None]
+    by_calibration *= factor[:, :, None]
+    return ImageRows(off * factor, by_point, by_calibration, positions)
 
 
-def _by_baseline(by_calibration: Array, by_apart: Array, axes: RigAxes, theta: Array) -> None:
-    """Derivatives by the right camera's place: the disparity row holds minus the right pixel, which falls with it."""
-    for parameter in (P.BASELINE, P.BASELINE_Y, P.BASELINE_Z):
-        step = np.zeros(UNKNOWNS)
-        step[INDEX[parameter]] = 1e-6
-        moved = (right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1]) / 2e-6
-        # row = measured - (left - right(X - t)); d right / dt = -slopes
-        by_calibration[:, :, INDEX[parameter]] = -np.einsum("mij,j->mi", by_apart, moved)
+def _right_place_slopes(axes: RigAxes, theta: Array) -> Array:
+    """(3, 3) derivatives of the right camera's place by baseline and its direction."""
+    steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
+    moved = [right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1] for step in steps]
+    return np.stack(moved, axis=1) / 2e-6
 
 
 def _predicted(view: _View, views: tuple[StereoCamera, StereoCamera]) -> Array:

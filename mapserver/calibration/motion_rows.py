@@ -1,57 +1,65 @@
-"""Rows of the adjustment that the IMU and the wheels give between neighbouring keyframes."""
+"""What the IMU and the wheels say of neighbouring keyframes: terms of the adjustment and their whitened residuals."""
 
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3_inverse, skew, so3_exp, so3_log
-from fleetmap.inertial import GRAVITY_MAP, imu_intervals, preintegrate
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.inertial import GRAVITY_MAP, Preintegrated, imu_intervals, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import wheel_between
-from mapserver.calibration.parameters import INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.survey.bundle.factors import FLOOR_SIGMA, packed_increments
+from mapserver.survey.state import RelativeTerm
 
 _SLIP_MPS = 0.05  # sideways and upwards, which wheels do not measure
 _RATE_NS = 5_000_000  # half the time over which the angular rate at a keyframe is averaged
-ROTATION, MOTION, WALK, WHEEL = range(4)  # groups of rows
 
 
-@dataclass(frozen=True)
-class Edge:
-    """What was measured between keyframes first and first + 1: whitening (n, n) of n rows and their groups (n,)."""
+class InertialEdge(NamedTuple):
+    """Samples between keyframes first and first + 1; root (15, 15): of their covariance, its lower triangular factor."""
 
     first: int
-    whitening: Array
-    groups: Array
+    summed: Preintegrated
+    root: Array
+
+    def residual(self, state: MotionState) -> Array:
+        """(15,) whitened: rotation, motion, and what the biases wander."""
+        ends = slice(self.first, self.first + 2)
+        increments = packed_increments([self.summed])[0]
+        residual, _ = core.inertial_residual(state.map_from_body[ends], state.motions[ends], GRAVITY_MAP, increments)
+        return np.asarray(np.linalg.solve(self.root, residual))
+
+    def believed(self, rotation: float, motion: float) -> Preintegrated:
+        """The samples with information of rotation and motion that counts so many times."""
+        root = self.root / np.sqrt(np.repeat([rotation, motion, 1.0], [3, 6, 6]))
+        return replace(self.summed, cov=root @ root.T - np.diag(FLOOR_SIGMA**2))
 
 
-@dataclass(frozen=True)
-class InertialEdge(Edge):
-    """increments (67,) as the core takes them."""
+class WheelEdge(NamedTuple):
+    """What the wheels rolled between keyframes first and first + 1.
 
-    increments: Array
+    way_m (3,): in body axes; lever_m (3,): what the turning adds, which no scale changes. whitening (3, 3): the way ahead, and slip.
+    """
 
-
-@dataclass(frozen=True)
-class WheelEdge(Edge):
-    """way_m (3,): of the wheels in body axes; lever_m (3,): what the turning adds, which no scale changes; base_from_body (3, 3)."""
-
+    first: int
     way_m: Array
     lever_m: Array
-    base_from_body: Array
+    whitening: Array
 
+    def residual(self, state: MotionState, wheel_scale: float) -> Array:
+        """(3,) the way of the body in the axes of the base against that of the wheels, whitened."""
+        here, there = state.map_from_body[self.first : self.first + 2]
+        way_m = here[:3, :3].T @ (there[:3, 3] - here[:3, 3])
+        return np.asarray(self.whitening @ (way_m - (1.0 + wheel_scale) * self.way_m - self.lever_m))
 
-@dataclass(frozen=True)
-class Rows:
-    """Whitened rows of one edge: residual (n,), by_keyframes (n, 2 stride), by_calibration (n, C), groups (n,)."""
-
-    first: int
-    residual: Array
-    by_keyframes: Array
-    by_calibration: Array
-    groups: Array
+    def term(self, share: float) -> RelativeTerm:
+        """The way as a relative pose that says nothing of the turn; it counts so many times along the way."""
+        whitening, information = np.sqrt([[share], [1.0], [1.0]]) * self.whitening, np.zeros((6, 6))
+        information[3:, 3:] = whitening.T @ whitening
+        return RelativeTerm(self.first, self.first + 1, se3(np.eye(3), self.way_m + self.lever_m), information)
 
 
 def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, noise: ImuNoise) -> list[InertialEdge]:
@@ -59,13 +67,12 @@ def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, n
     if not data.is_inertial:
         return []
     stamps = imu_stamps(data, offset_s)
-    edges, groups = [], np.repeat([ROTATION, MOTION, MOTION, WALK, WALK], 3)
+    edges = []
     for k in range(len(stamps) - 1):
         summed = preintegrate(
             data.imu, int(stamps[k]), int(stamps[k + 1]), state.motions[k, 3:6], state.motions[k, 6:], noise
         )
-        factor = np.linalg.cholesky(summed.cov + np.diag(FLOOR_SIGMA**2))
-        edges.append(InertialEdge(k, np.linalg.inv(factor), groups, packed_increments([summed])[0]))
+        edges.append(InertialEdge(k, summed, np.asarray(np.linalg.cholesky(summed.cov + np.diag(FLOOR_SIGMA**2)))))
     return edges
 
 
@@ -87,13 +94,13 @@ def body_rates(data: CalibrationData, state: MotionState, offset_s: float) -> Ar
     return rates
 
 
-def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float) -> list[WheelEdge]:
-    """What the wheels rolled between keyframes, along the turn that the state has there."""
+def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scale: float) -> list[WheelEdge]:
+    """What the wheels rolled between keyframes, along the turn that the state has there. scale: of the sigma along the way."""
     if not data.wheel:
         return []
     stamps, base_from_body = imu_stamps(data, offset_s), data.calibration.base_from_body
     base_in_body = se3_inverse(base_from_body)[:3, 3]
-    edges, groups = [], np.full(3, WHEEL)
+    edges = []
     for k in range(len(stamps) - 1):
         samples = wheel_between(data.wheel, int(stamps[k]), int(stamps[k + 1]))
         dt_s = (stamps[k + 1] - stamps[k]) * 1e-9
@@ -107,9 +114,9 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float) -> l
             variance += (share * dt_s * sample.sigma_mps) ** 2
         # the base moves by R v; the body, which sits elsewhere, by that and the turn of what lies between
         lever = base_in_body - so3_exp(turn) @ base_in_body
-        sigma = np.array([np.sqrt(variance), _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
+        sigma = np.array([scale * np.sqrt(variance), _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
         turned = base_from_body[:3, :3] @ so3_exp(-0.5 * turn)
-        edges.append(WheelEdge(k, np.diag(1.0 / sigma), groups, way, lever, turned))
+        edges.append(WheelEdge(k, way, lever, turned / sigma[:, None]))
     return edges
 
 
@@ -118,29 +125,3 @@ def _shares(sample_ns: list[int], start_ns: int, end_ns: int) -> Array:
     at = (np.array(sample_ns, np.int64) - start_ns) / (end_ns - start_ns)
     bounds = np.concatenate([[0.0], 0.5 * (at[1:] + at[:-1]), [1.0]])
     return np.column_stack([at, np.diff(bounds)])
-
-
-def inertial_rows(edge: InertialEdge, state: MotionState) -> Rows:
-    """Residual and derivatives of an inertial edge."""
-    k = edge.first
-    ends = slice(k, k + 2)
-    residual, jacobian = core.inertial_residual(
-        state.map_from_body[ends], state.motions[ends], GRAVITY_MAP, edge.increments
-    )
-    nothing = np.zeros((15, UNKNOWNS))
-    return Rows(k, edge.whitening @ residual, edge.whitening @ jacobian, nothing, edge.groups)
-
-
-def wheel_rows(edge: WheelEdge, state: MotionState, wheel_scale: float, stride: int) -> Rows:
-    """The way of the body from one keyframe to the next in the axes of the base, against that of the wheels."""
-    k = edge.first
-    body_from_map = state.map_from_body[k, :3, :3].T
-    apart = state.map_from_body[k + 1, :3, 3] - state.map_from_body[k, :3, 3]
-    whitening = edge.whitening @ edge.base_from_body
-    residual = whitening @ (body_from_map @ apart - (1.0 + wheel_scale) * edge.way_m - edge.lever_m)
-    by_keyframes, by_calibration = np.zeros((3, 2 * stride)), np.zeros((3, UNKNOWNS))
-    by_keyframes[:, :3] = whitening @ body_from_map @ skew(apart)
-    by_keyframes[:, 3:6] = -whitening @ body_from_map
-    by_keyframes[:, stride + 3 : stride + 6] = whitening @ body_from_map
-    by_calibration[:, INDEX[CalibrationParameter.WHEEL_SCALE]] = -whitening @ edge.way_m
-    return Rows(k, residual, by_keyframes, by_calibration, edge.groups)

@@ -235,6 +235,13 @@ bool BlockCholesky::factorise(double* values) const {
   return true;
 }
 
+double BlockCholesky::log_determinant(const double* values) const {
+  double sum = 0.0;
+  for (const Front& front : fronts_)
+    for (int a = 0; a < front.own; ++a) sum += 2.0 * std::log(values[front.start + ptrdiff_t(a) * (front.own + 1)]);
+  return sum;
+}
+
 void BlockCholesky::solve(const double* values, double* b) const {
   std::vector<double> x(unknowns()), gathered, pulled;
   for (size_t n = 0; n < x.size(); ++n) x[n] = b[order_[n]];

@@ -37,6 +37,9 @@ class BlockCholesky {
   // Values become those of the factor; false where the matrix is not positive definite.
   bool factorise(double* values) const;
 
+  // log det A by the values of the factor.
+  double log_determinant(const double* values) const;
+
   // b (U,) becomes the x of A x = b, by the values of the factor.
   void solve(const double* values, double* b) const;
 

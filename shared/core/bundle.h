@@ -1,7 +1,8 @@
-// Bundle adjustment: keyframes, landmarks, motion and biases that explain all observations best.
+// Bundle adjustment: keyframes, landmarks, motion, biases, and where it is wanted the calibration, that explain all observations best.
 //
 // Levenberg-Marquardt on the robust cost; landmarks are eliminated by the Schur complement, and what is left is solved in one piece, by
-// dense or by sparse factorisation. Source: Triggs et al. 2000, Bundle adjustment, a modern synthesis, section 6.1.
+// dense or by sparse factorisation. Sources: Triggs et al. 2000, Bundle adjustment, a modern synthesis, section 6.1; Lourakis and
+// Argyros 2009, SBA: a software package for generic sparse bundle adjustment.
 //
 // A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes. So with q = X - p an observation's derivative by the pose is
 // minus that by its point times L(q)^T, where L(q) = [skew(q); I] (6, 3). Everything that an observation n says therefore fits into
@@ -11,6 +12,11 @@
 //   coupling          H_pl = -L A
 //   reduced system    S = H_pp - sum_ij (L A)_i H_ll^-1 (A L^T)_j    b = b_p + sum (L A) H_ll^-1 b_l
 //   back-substitution dX = H_ll^-1 (b_l + sum A L^T d)
+//
+// A calibration c that all images share is a dense border of the system. With J_c = dr/dc, E_n = w J^T J_c and E = sum E_n of a point:
+//   border            S_pc = -sum L (E_n - A H_ll^-1 E)    S_cc = sum w J_c^T J_c - sum E^T H_ll^-1 E
+//                     b_c = -sum w J_c^T r - sum E^T H_ll^-1 b_l
+//   back-substitution dX = H_ll^-1 (b_l + sum A L^T d - E d_c)
 #pragma once
 
 #include <array>
@@ -24,6 +30,21 @@
 #include "factors.h"
 
 namespace fleetmap {
+
+// Everything that moves.
+struct BundleState {
+  std::vector<SE3> map_from_body;
+  std::vector<double> motions;  // (K, 9) or none
+  std::vector<Vec3> points;
+  std::vector<double> calibration;  // (C,) or none
+};
+
+// Whitened rows of M observations in the problem's order; their derivatives only where they are asked for.
+struct ImageRows {
+  const double *residuals, *by_point, *by_calibration;  // (M, 4), (M, 4, 3), (M, 4, C)
+  const Vec3* positions;                                // (K,) of the bodies when the images were taken
+  std::shared_ptr<const void> owner;                    // of these numbers
+};
 
 // What is adjusted, and by which measurements: K keyframes, N landmarks, M observations. What is not named here is as in _core.pyi.
 struct BundleProblem {
@@ -41,6 +62,7 @@ struct BundleProblem {
     int32_t i, j;
     SE3 i_from_j;
     std::vector<double> information;  // (6, 6)
+    Vec3 way;                         // by which the calibration's `scale` lengthens the translation
   };
   struct Edge {
     int32_t i, j;
@@ -58,13 +80,10 @@ struct BundleProblem {
   std::vector<Edge> edges;
   Vec3 gravity;
   std::vector<double> motion_mean, motion_weight;  // (K, 9) or none: 1 / sigma^2
-};
-
-// Everything that moves.
-struct BundleState {
-  std::vector<SE3> map_from_body;
-  std::vector<double> motions;  // (K, 9) or none
-  std::vector<Vec3> points;
+  // Where the calibration moves: 1 / sigma^2 of it (C,) about zero, which of it is the scale, and what says the images' rows.
+  std::vector<double> calibration_weight;
+  size_t scale;
+  std::function<ImageRows(const BundleState&, bool derivatives)> rows;
 };
 
 class BundleSolver {
@@ -84,9 +103,9 @@ class BundleSolver {
 
   const BundleState& state() const { return state_; }
   size_t slots() const { return slot_keyframes_.size(); }
-  size_t unknowns() const { return slots() * size_t(problem_.unknowns); }
+  size_t unknowns() const { return border() + columns(); }
 
-  // The reduced system's nodes, the pose of each slot and its motion where there is one, and which of them are coupled.
+  // The reduced system's nodes, the pose of each slot and its motion where there is one, then the calibration, and which are coupled.
   std::vector<int64_t> node_sizes() const;
   std::vector<std::pair<int64_t, int64_t>> node_pairs() const;
   // Systems are factorised as sparse ones from now on; order: nodes in an order that fills in little.
@@ -101,6 +120,8 @@ class BundleSolver {
   void reduced(double damping, std::vector<double>& lower, std::vector<double>& b);
   // The damped step (U,), by linearising where the state is; false where S is not positive definite.
   bool solve(double damping, std::vector<double>& step);
+  // log det of the undamped normal equations of everything; NaN where they are not positive definite.
+  double log_determinant();
 
   // The optimum near the state, which becomes it. between: called before each iteration.
   Outcome optimize(const Settings& settings, const std::function<void()>& between);
@@ -113,14 +134,20 @@ class BundleSolver {
   using Symmetric = std::array<double, 6>;  // xx, xy, xz, yy, yz, zz
   struct Residual;
 
+  size_t border() const { return slots() * size_t(problem_.unknowns); }  // the calibration's first unknown
+  size_t columns() const { return problem_.calibration_weight.size(); }
   void sort_observations();
   void find_pattern();
   size_t block_of(int32_t row, int32_t col) const;
   void view(const BundleState& state);
   bool residual(const Seen& seen, const Mat3& cam_from_map, Vec3 q, Residual& out) const;
+  void measure(const BundleState& state);
   double cost_of(const BundleState& state);
+  Linear<6, 13> relative(const BundleState& state, const BundleProblem::Relative& each) const;
   Moment moment(const BundleState& state, int32_t keyframe) const;
   void linearise();
+  bool linearise(const Seen& seen, Vec3 q, Symmetric& info, Vec3& slope) const;
+  bool linearise(const ImageRows& rows, size_t observation, Symmetric& info, Vec3& slope);
   void linearise_images();
   void reduce(double damping);
   void invert_landmarks(double damping);
@@ -154,9 +181,12 @@ class BundleSolver {
   std::vector<Symmetric> obs_info_, point_info_;
   std::vector<Mat3> point_inverse_;
   std::vector<Vec3> point_rhs_;
+  std::vector<Vec3> positions_;  // (K,) of the bodies when the images were taken
   std::vector<double> pose_info_, pose_rhs_, edge_blocks_, edge_rhs_;
-  // The reduced system: blocks (B, 6, 6), diagonal and rhs (P, unknowns), damp: what is added to the diagonal.
-  std::vector<double> blocks_, diagonal_, damp_, rhs_, factor_;  // the last: S, then its factor
+  // E_n of one observation, E (N, 3, C), and of the border H_pc (P, 6, C), the lower triangle of H_cc (C, C), and b_c.
+  std::vector<double> coupling_, point_border_, pose_border_, corner_, corner_rhs_;
+  // The reduced system: blocks (B, 6, 6), border (P, 6, C) and (C, C), diagonal and rhs (U,), damp: what is added to the diagonal.
+  std::vector<double> blocks_, border_, diagonal_, damp_, rhs_, factor_;  // the last: S, then its factor
 };
 
 }  // namespace fleetmap

@@ -20,8 +20,8 @@ Linear<6, 6> pose_prior(const SE3& map_from_body, const SE3& measured) {
   return out;
 }
 
-Linear<6, 12> relative_pose(const SE3& map_from_i, const SE3& map_from_j, const SE3& i_from_j) {
-  Linear<6, 12> out = {};
+Linear<6, 13> relative_pose(const SE3& map_from_i, const SE3& map_from_j, const SE3& i_from_j, Vec3 way) {
+  Linear<6, 13> out = {};
   const Mat3 i_from_map = transposed(map_from_i.rotation);
   const Vec3 apart = map_from_j.translation - map_from_i.translation;
   const Vec3 turn = so3_log(i_from_map * map_from_j.rotation * transposed(i_from_j.rotation));
@@ -31,6 +31,7 @@ Linear<6, 12> relative_pose(const SE3& map_from_i, const SE3& map_from_j, const 
   put(out, 0, 0, -1.0 * turned), put(out, 0, 6, turned);
   put(out, 3, 0, i_from_map * skew(apart));
   put(out, 3, 3, -1.0 * i_from_map), put(out, 3, 9, i_from_map);
+  for (int a = 0; a < 3; ++a) out.jacobian[3 + a][12] = -way[a];
   return out;
 }
 

@@ -48,8 +48,8 @@ struct Linear {
 // [Log(R R_m^T), p - p_m] of a pose by the measured one.
 Linear<6, 6> pose_prior(const SE3& map_from_body, const SE3& measured);
 
-// [Log(R_i^T R_j R_m^T), R_i^T (p_j - p_i) - p_m] of the poses i and j by the measured i_from_j.
-Linear<6, 12> relative_pose(const SE3& map_from_i, const SE3& map_from_j, const SE3& i_from_j);
+// [Log(R_i^T R_j R_m^T), R_i^T (p_j - p_i) - p_m] by the poses i and j, and by the scale of that part `way` of the measured p_m.
+Linear<6, 13> relative_pose(const SE3& map_from_i, const SE3& map_from_j, const SE3& i_from_j, Vec3 way);
 
 struct Moment {
   SE3 map_from_body;

@@ -4,6 +4,8 @@ Headers there say what each function does. Images (H, W) uint8 grey, descriptors
 ValueError for sizes and numbers that cannot be, TypeError for another kind of array; what is not finite gives values.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +22,7 @@ _Octaves = NDArray[np.int8]
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
-_ImageRows = tuple[_Reals, _Reals, _Reals, _Reals]
-_Landmarks = tuple[_Reals, _Reals, _Reals]
+_Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
     """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
@@ -629,7 +630,10 @@ class BundleSolver:
     unknowns that move, of pose and motion. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
     obs_sigma_px (M, 2): of u and v, and of the disparity. Relative poses i_from_j (R, 4, 4), priors of poses (Q, 4, 4), each with its
     information (6, 6); inertial edges with increments (E, 67) and information (E, 15, 15); motion_mean (K, 9), motion_weight (K, 9)
-    1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant.
+    1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: what moves besides, theta
+    (C,) with weight (C,) 1 / sigma^2 about zero; ways (R, 3), what theta[scale] adds to the translations of the relative poses; and what
+    says the whitened rows of the images in the place of the lens, called with map_from_body, motions, points_map, theta, and whether
+    derivatives are wanted: residuals (M, 4), derivatives by point (M, 4, 3) and theta (M, 4, C), positions (K, 3) of the exposed bodies.
     """
 
     def __init__(
@@ -659,6 +663,7 @@ class BundleSolver:
         gravity: _Reals,
         huber: float,
         cutoff: float,
+        calibration: tuple[_Reals, _Reals, _Reals, int, _Rows] | None = None,
     ) -> None: ...
     @property
     def unknowns(self) -> int:
@@ -684,6 +689,9 @@ class BundleSolver:
     def step(self, damping: float) -> _Reals | None:
         """(U,) damped step from the current values; None where the system is not positive definite."""
 
+    def log_determinant(self) -> float:
+        """Of the undamped normal equations of everything, landmarks included; NaN where they are not positive definite."""
+
     def map_from_body(self) -> _Reals:
         """(K, 4, 4)"""
 
@@ -692,6 +700,9 @@ class BundleSolver:
 
     def points_map(self) -> _Reals:
         """(N, 3)"""
+
+    def calibration(self) -> _Reals:
+        """(C,), none where it is held"""
 
     def squared_sigmas(self) -> _Reals:
         """(M,) squared residuals in sigmas at the last cost, huge for points behind the camera."""
@@ -990,29 +1001,3 @@ class BoxGrid:
         light: _Floats,
     ) -> None:
         """Adds the lamps' (L, 5) direct light to light (groups, samples) of faces; their own boxes come owner_shift later."""
-
-def reduce_landmarks(
-    images: _ImageRows,
-    keyframes: _Indices,
-    starts: _Indices,
-    stride: int,
-    damping: float,
-    information: _Reals,
-    rhs: _Reals,
-    landmarks: _Landmarks,
-) -> bool:
-    """Adds what images say of poses and calibration to information (D, D), its upper triangle of blocks, and rhs (D,); fills `landmarks`.
-
-    images: whitened rows of M observations, landmark by landmark: residuals (M, 4), derivatives by pose (M, 4, 6), point (M, 4, 3) and
-    calibration (M, 4, C); keyframes (M,); starts (N + 1,) of each landmark. landmarks: inverse (N, 3, 3) of their information, rhs (N, 3),
-    coupling (N, 3, C) to the calibration. stride: unknowns per keyframe; the calibration is the last C. damping: of the landmarks. False
-    where the information of one has no inverse of finite numbers.
-    """
-
-def landmark_steps(
-    images: _ImageRows, keyframes: _Indices, starts: _Indices, landmarks: _Landmarks, stride: int, step: _Reals
-) -> _Reals:
-    """Back-substitution: (N, 3) steps of the landmarks for a step (D,) of the poses and of the calibration."""
-
-def weigh(slopes: _Reals, factors: _Reals) -> None:
-    """Multiplies derivatives (M, 4, n) by factors (M, 4) in place; NaN counts as zero, and what is infinite as the largest number."""

@@ -47,8 +47,7 @@ DTYPES = {
     "_Features": "tuple[dtype=float64, dtype=int8, dtype=uint64, dtype=float64, dtype=float64, bool]",
     "_Pyramid": "tuple[dtype=uint8, dtype=uint8, dtype=uint8]",
     "_Counts": "uint16",
-    "_ImageRows": "tuple[dtype=float64, dtype=float64, dtype=float64, dtype=float64]",
-    "_Landmarks": "tuple[dtype=float64, dtype=float64, dtype=float64]",
+    "_Rows": "collections.abc.Callable",
 }
 
 
@@ -56,7 +55,7 @@ def named(annotation: ast.expr | None) -> str:
     """A stub's type in nanobind's words."""
     written = ast.unparse(annotation) if annotation is not None else "?"
     for name, dtype in DTYPES.items():
-        written = re.sub(rf"\b{name}\b", dtype if "[" in dtype else f"dtype={dtype}", written)
+        written = re.sub(rf"\b{name}\b", dtype if "[" in dtype or "." in dtype else f"dtype={dtype}", written)
     return re.sub(r"NDArray\[np\.(\w+)\]", r"dtype=\1", written)
 
 

@@ -33,11 +33,8 @@ CALLS = {name for name, member in MEMBERS.items() if not isinstance(member, type
     for method in dir(member)
     if (method == "__init__" or not method.startswith("_")) and callable(getattr(member, method))
 }
-START, NUMBER, SINGLES = np.zeros(1, np.int64), np.zeros(1, np.int32), np.ones((5, 3), np.float32)
+NUMBER, SINGLES = np.zeros(1, np.int32), np.ones((5, 3), np.float32)
 CONES, WORDS = (np.ones((5, 3)), SINGLES, SINGLES[:, 0].copy(), SINGLES[:, 0].copy()), np.zeros((5, 4), np.uint64)
-ROWS, LANDMARKS = (
-    tuple(np.zeros((0, *of)) for of in sides) for sides in (((4,), (4, 6), (4, 3), (4, 2)), ((3, 3), (3,), (3, 2)))
-)
 QUADS, SIXES, FACES = np.ones((0, 9)), np.zeros((0, 6)), np.zeros((0, 6), np.int32)
 TEXTURES = np.zeros(1 << 18, np.uint8), np.zeros((1, 14), np.int32), np.zeros((1, 1), np.int32), np.zeros(2, np.int32)
 PICTURE = np.zeros((4, 4)), np.zeros((4, 4), np.float32), np.zeros((4, 4), np.int32)
@@ -83,8 +80,6 @@ GIVEN: dict[str, Callable[[Any], tuple[object, ...]]] = {
         *(NUMBER[:0], np.zeros((0, 3)), np.zeros((0, 2)), np.eye(4), SINGLES[:0], TEXTURES[0][:0], TEXTURES[0][:0]),
         *(1.0, 1.0, np.zeros((4, 4, 3)), PICTURE[1]),
     ),
-    "landmark_steps": lambda _: (ROWS, START[:0], START, LANDMARKS, 6, np.ones(8)),
-    "reduce_landmarks": lambda _: (ROWS, START[:0], START, 6, 1.0, np.ones((8, 8)), np.ones(8), LANDMARKS),
     "register_depth": lambda _: (PICTURE[1], np.ones((16, 3)), np.eye(4), np.ones(4), np.zeros(8), 1.0, 9, 9),
 }
 

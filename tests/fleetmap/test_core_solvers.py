@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleetmap import core
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import Array
 
 CHAIN = core.BlockCholesky(np.full(3, 100), np.array([[0, 1], [1, 2]]), np.arange(3))
 POSES, EYES, NONE = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (1, 1, 1)), np.zeros((0, 4, 4))
@@ -47,14 +47,19 @@ def bundle(**other: object) -> core.BundleSolver:
     return core.BundleSolver(**(BUNDLE | other))
 
 
-# Two keyframes and a calibration of three see two landmarks, twice each.
-IMAGES = np.ones((4, 4)), np.ones((4, 4, 6)), np.ones((4, 4, 3)), np.ones((4, 4, 3))
-KEYFRAMES, STARTS = np.array([0, 1, 0, 1]), np.array([0, 2, 4])
-LANDMARKS = np.zeros((2, 3, 3)), np.zeros((2, 3)), np.zeros((2, 3, 3))
+def rows(observations: int = 8, unknowns: int = 2, keyframes: int = 3) -> core.BundleSolver:
+    """With a calibration of two unknowns, whose rows are those of another problem."""
+    answer = (
+        np.ones((observations, 4)),
+        np.ones((observations, 4, 3)),
+        np.ones((observations, 4, unknowns)),
+        np.ones((keyframes, 3)),
+    )
+    return calibrated(lambda *_: answer)
 
 
-def border(keyframes: AnyArray = KEYFRAMES, starts: AnyArray = STARTS, stride: int = 6, size: int = 15) -> None:
-    core.reduce_landmarks(IMAGES, keyframes, starts, stride, 0.1, np.zeros((15, 15)), np.zeros(size), LANDMARKS)
+def calibrated(rows: Any, *, weight: int = 2, ways: int = 1, scale: int = 1) -> core.BundleSolver:
+    return bundle(calibration=(np.zeros(2), np.ones(weight), np.zeros((ways, 3)), scale, rows))
 
 
 @pytest.mark.parametrize(
@@ -90,15 +95,14 @@ def border(keyframes: AnyArray = KEYFRAMES, starts: AnyArray = STARTS, stride: i
             ),
             "edge_ends: of keyframes with motion",
         ),
-        (lambda: border(keyframes=np.array([0, 1, 0, 2])), "keyframes: those"),
-        (lambda: border(keyframes=np.array([0, 1, 0])), "images, keyframes"),
-        (lambda: border(starts=np.array([0, 2, 5])), "starts"),
-        (lambda: border(starts=np.array([0, 3, 2, 4])), "starts"),
-        (lambda: border(starts=np.array([0, 4])), "landmarks"),
-        (lambda: border(stride=5), "stride"),
-        (lambda: border(size=14), "information"),
-        (lambda: core.landmark_steps(IMAGES, KEYFRAMES, STARTS, LANDMARKS, 6, np.zeros(2)), "rhs"),
-        (lambda: core.weigh(IMAGES[1].copy(), np.ones((3, 4))), "factors"),
+        (lambda: calibrated(print, weight=3), "calibration: a weight"),
+        (lambda: calibrated(print, scale=2), "calibration: a weight"),
+        (lambda: calibrated(print, ways=2), "calibration: a way"),
+        (lambda: calibrated(lambda *_: None).cost(), "rows: residuals, derivatives"),
+        (lambda: calibrated(lambda *_: (np.ones((8, 3)),) * 4).cost(), "rows: residuals, derivatives"),
+        (lambda: rows(observations=7).cost(), "rows: residuals of each"),
+        (lambda: rows(unknowns=3).reduced(0.0), "rows: derivatives"),
+        (lambda: rows(keyframes=2).reduced(0.0), "rows: a position"),
         (lambda: bundle().factorise_sparsely(np.arange(5)), "order"),
         (lambda: bundle().optimize(0.0, 9, 1e-4), "lambda_start"),
         (lambda: bundle().optimize(float("nan"), 9, 1e-4), "lambda_start"),
@@ -118,15 +122,19 @@ NUMBERS = [name for name, value in BUNDLE.items() if isinstance(value, np.ndarra
 
 @settings(max_examples=100, deadline=None)
 @given(
-    name=st.sampled_from(NUMBERS),
+    name=st.sampled_from([*NUMBERS, "rows"]),
     numbers=arrays(np.float64, 40, elements=HOSTILE),
     sparse=st.booleans(),
     held=st.booleans(),
 )
 def test_hostile_numbers_give_values(name: str, numbers: Array, sparse: bool, held: bool) -> None:
-    solver = bundle(**{name: np.resize(numbers, BUNDLE[name].shape)}, points_held=held)
+    if name == "rows":
+        shapes = (8, 4), (8, 4, 3), (8, 4, 2), (3, 3)
+        solver = calibrated(lambda *_: tuple(np.resize(numbers, shape) for shape in shapes))
+    else:
+        solver = bundle(**{name: np.resize(numbers, BUNDLE[name].shape)}, points_held=held)
     if sparse:
-        solver.factorise_sparsely(np.arange(6))
+        solver.factorise_sparsely(np.arange(len(solver.nodes()[0])))
     costs, iterations, _ = solver.optimize(1e-4, 5, 1e-6)
     assert 1 <= len(costs) <= iterations + 1 <= 6
     assert solver.points_map().shape == (4, 3)

@@ -3,6 +3,7 @@
 import functools
 import inspect
 import re
+from collections.abc import Callable
 from types import CodeType, SimpleNamespace
 
 import numpy as np
@@ -72,6 +73,11 @@ class Arguments:
             values[strange] = np.array(odd, "float64" if values.dtype.kind == "f" else "int64").astype(dtype)
         return np.ascontiguousarray(values)
 
+    def rows(self) -> Callable[..., tuple[Array, ...]]:
+        """What a bundle adjustment asks for the rows of its images."""
+        answer = tuple(self.array("float64", sides) for sides in ("*, 4", "*, 4, 3", "*, 4, *", "*, 3"))
+        return lambda *_: answer
+
     def of(self, function: object) -> list[object]:
         words = {
             "array": self.array,
@@ -79,6 +85,7 @@ class Arguments:
             "real": self.real,
             "some": lambda: bool(self.rng.random() < 0.5),
             "several": lambda *parts: parts,
+            "rows": self.rows,
             "thrice": lambda one: [one] * 3,
             "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, SETTINGS),
         }
@@ -92,6 +99,7 @@ class Arguments:
 MAKERS = {
     r"ndarray\[dtype=(\w+), shape=\(([^)]*)\)[^\]]*\]": r"array('\1', '\2')",
     r"collections\.abc\.Sequence\[": "thrice(",
+    r"collections\.abc\.Callable": "rows()",
     r"tuple\[": "several(",
     r"\]": ")",
     r" \| None": " if some() else None",

@@ -63,6 +63,7 @@ def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSo
         GRAVITY_MAP,
         settings.huber_sigmas,
         settings.cutoff_sigmas,
+        problem.calibration,
     )
     if solver.unknowns > settings.dense_unknowns:
         sizes, pairs = solver.nodes()

@@ -4,8 +4,9 @@ Perturbations, here and in every information and covariance: rotation first, in 
 map_from_body that is R <- Exp(rot) R, p <- p + trans, both in map axes; for i_from_j in the axes of i.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,32 @@ class InertialTerms:
     fixed: NDArray[np.bool_] | None = None
 
 
+class ImageRows(NamedTuple):
+    """Whitened rows of M observations: residuals (M, 4), derivatives by point (M, 4, 3) and calibration (M, 4, C).
+
+    positions_map (K, 3): of the keyframes' bodies when the images were taken.
+    """
+
+    residuals: Array
+    by_point: Array
+    by_calibration: Array
+    positions_map: Array
+
+
+class SelfCalibration(NamedTuple):
+    """A calibration that moves too: theta (C,), with weight (C,) 1 / sigma^2 about zero.
+
+    ways_m (R, 3): what theta[scale] adds to the translation of each relative pose. rows: the images at map_from_body, motions, points and
+    theta, with derivatives where the last argument says so; they replace the camera and its pixels.
+    """
+
+    theta: Array
+    weight: Array
+    ways_m: Array
+    scale: int
+    rows: Callable[[Array, Array, Array, Array, bool], ImageRows]
+
+
 @dataclass
 class BundleProblem:
     """K keyframes, N landmarks, M observations.
@@ -77,6 +104,7 @@ class BundleProblem:
     priors: list[PriorTerm] = field(default_factory=list)
     gauge: Literal["pose", "yaw_position"] = "pose"
     points_held: bool = False
+    calibration: SelfCalibration | None = None
 
 
 @dataclass(frozen=True)

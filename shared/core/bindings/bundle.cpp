@@ -31,6 +31,55 @@ std::vector<Vec3> points_of(const Reals<-1, 3>& points) {
   return out;
 }
 
+// What moves where the calibration does: theta, its weight, the ways of the relative poses, which of theta is their scale, and the rows.
+using Calibration = std::tuple<Reals<-1>, Reals<-1>, Reals<-1, 3>, size_t, nb::callable>;
+using Rows = std::tuple<Reals<-1, 4>, Reals<-1, 4, 3>, Reals<-1, 4, -1>, Reals<-1, 3>>;
+
+auto poses_of(const BundleState& state) {
+  auto matrices = zeros<double>(16 * state.map_from_body.size());
+  unlocked([&] {
+    for (size_t k = 0; k < state.map_from_body.size(); ++k) store(state.map_from_body[k], &matrices[16 * k]);
+  });
+  return as_numpy<double, 3>(std::move(matrices), {state.map_from_body.size(), 4, 4});
+}
+
+auto motions_of(const BundleState& state) {
+  const size_t count = state.map_from_body.size();
+  return as_numpy<double, 2>(unlocked([&] { return state.motions; }), {count, count ? state.motions.size() / count : 0});
+}
+
+auto points_of(const BundleState& state) {
+  return as_numpy<double, 2>(unlocked([&] { return state.points; }), {state.points.size(), 3});
+}
+
+auto calibration_of(const BundleState& state) {
+  return as_numpy<double, 1>(unlocked([&] { return state.calibration; }), {state.calibration.size()});
+}
+
+// What Python owns, for whoever does not hold its lock.
+template <typename T>
+std::shared_ptr<const T> kept(const T& value) {
+  return {new T(value), [](const T* held) {
+            const nb::gil_scoped_acquire lock;
+            delete held;
+          }};
+}
+
+// The rows at a state, as Python says them.
+ImageRows rows_at(const nb::callable& said, const BundleState& state, bool derivatives, size_t observations) {
+  const nb::gil_scoped_acquire held;
+  Rows rows;
+  const nb::object answer = said(poses_of(state), motions_of(state), points_of(state), calibration_of(state), derivatives);
+  check(nb::try_cast(answer, rows), "rows: residuals, derivatives by point and calibration, and positions");
+  const auto& [residuals, by_point, by_calibration, positions] = rows;
+  const size_t derived = derivatives ? observations : 0;
+  check(residuals.shape(0) == observations, "rows: residuals of each observation");
+  check(by_point.shape(0) >= derived && by_calibration.shape(0) >= derived && by_calibration.shape(2) == state.calibration.size(),
+        "rows: derivatives of each observation, by all of the calibration");
+  check(positions.shape(0) == state.map_from_body.size(), "rows: a position for each keyframe");
+  return {residuals.data(), by_point.data(), by_calibration.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
+}
+
 void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from_cam, const Reals<-1, 4, 4>& map_from_body,
           const Reals<-1, -1>& motions, const Reals<-1, 3>& points_map, const Array<bool, -1, -1>& free, bool points_held,
           const Indices<-1>& obs_keyframe, const Indices<-1>& obs_landmark, const Reals<-1, 3>& obs_pixels,
@@ -38,8 +87,12 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
           const Reals<-1, 6, 6>& relative_information, const Indices<-1>& prior_keyframe, const Reals<-1, 4, 4>& prior_map_from_body,
           const Reals<-1, 6, 6>& prior_information, const Indices<-1, 2>& edge_ends, const Reals<-1, 67>& increments,
           const Reals<-1, 15, 15>& edge_information, const Reals<-1, -1>& motion_mean, const Reals<-1, -1>& motion_weight,
-          const Reals<3>& gravity, double huber, double cutoff) {
+          const Reals<3>& gravity, double huber, double cutoff, const std::optional<Calibration>& calibration) {
   find_lapack();
+  std::function<ImageRows(const BundleState&, bool)> rows;
+  if (calibration)
+    rows = [said = kept(std::get<nb::callable>(*calibration)), observations = obs_keyframe.shape(0)](
+               const BundleState& state, bool derivatives) { return rows_at(*said, state, derivatives, observations); };
   const nb::gil_scoped_release others_run;
   constexpr size_t kMost = size_t(1) << 31;
   const size_t keyframes = map_from_body.shape(0), landmarks = points_map.shape(0), observations = obs_keyframe.shape(0);
@@ -78,35 +131,31 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
   for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
     problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), copied(&prior_information(n, 0, 0), 36)});
   for (size_t n = 0; n < relative_ends.shape(0); ++n)
-    problem.relatives.push_back(
-        {int32_t(relative_ends(n, 0)), int32_t(relative_ends(n, 1)), se3(&i_from_j(n, 0, 0)), copied(&relative_information(n, 0, 0), 36)});
+    problem.relatives.push_back({int32_t(relative_ends(n, 0)),
+                                 int32_t(relative_ends(n, 1)),
+                                 se3(&i_from_j(n, 0, 0)),
+                                 copied(&relative_information(n, 0, 0), 36),
+                                 {}});
   for (size_t n = 0; n < edge_ends.shape(0); ++n)
     problem.edges.push_back({int32_t(edge_ends(n, 0)), int32_t(edge_ends(n, 1)), copied(&increments(n, 0), kIncrements),
                              copied(&edge_information(n, 0, 0), 225)});
   problem.gravity = vec3(gravity.data());
   problem.motion_mean = copied(motion_mean.data(), motion_mean.size());
   problem.motion_weight = copied(motion_weight.data(), motion_weight.size());
-  BundleState start = {{}, copied(motions.data(), motions.size()), points_of(points_map)};
+  BundleState start = {{}, copied(motions.data(), motions.size()), points_of(points_map), {}};
   for (size_t k = 0; k < keyframes; ++k) start.map_from_body.push_back(se3(&map_from_body(k, 0, 0)));
+  if (calibration) {
+    const auto& [theta, weight, ways, scale, said] = *calibration;
+    check(theta.shape(0) > 0 && weight.shape(0) == theta.shape(0) && scale < theta.shape(0),
+          "calibration: a weight for each, one the scale");
+    check(ways.shape(0) == problem.relatives.size(), "calibration: a way for each of relative_ends");
+    start.calibration = copied(theta.data(), theta.size());
+    problem.calibration_weight = copied(weight.data(), weight.size());
+    problem.scale = scale;
+    problem.rows = std::move(rows);
+    for (size_t n = 0; n < ways.shape(0); ++n) problem.relatives[n].way = vec3(&ways(n, 0));
+  }
   new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff);
-}
-
-auto poses_of(const BundleSolver& solver) {
-  const auto& poses = solver.state().map_from_body;
-  auto matrices = zeros<double>(16 * poses.size());
-  unlocked([&] {
-    for (size_t k = 0; k < poses.size(); ++k) store(poses[k], &matrices[16 * k]);
-  });
-  return as_numpy<double, 3>(std::move(matrices), {poses.size(), 4, 4});
-}
-
-auto motions_of(const BundleSolver& solver) {
-  const size_t count = solver.state().map_from_body.size();
-  return as_numpy<double, 2>(unlocked([&] { return solver.state().motions; }), {count, count ? solver.state().motions.size() / count : 0});
-}
-
-auto points_map_of(const BundleSolver& solver) {
-  return as_numpy<double, 2>(unlocked([&] { return solver.state().points; }), {solver.state().points.size(), 3});
 }
 
 auto squared_sigmas_of(const BundleSolver& solver) {
@@ -176,7 +225,8 @@ void bind_bundle(nb::module_& module) {
            "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(), "i_from_j"_a.noconvert(),
            "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(), "prior_map_from_body"_a.noconvert(),
            "prior_information"_a.noconvert(), "edge_ends"_a.noconvert(), "increments"_a.noconvert(), "edge_information"_a.noconvert(),
-           "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a, "cutoff"_a)
+           "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a, "cutoff"_a,
+           "calibration"_a = nb::none())
       .def_prop_ro("unknowns", &BundleSolver::unknowns)
       .def("nodes", &nodes_of)
       .def("factorise_sparsely", &factorise_sparsely, "order"_a.noconvert())
@@ -184,9 +234,11 @@ void bind_bundle(nb::module_& module) {
       .def("optimize", &optimize, "lambda_start"_a, "max_iterations"_a, "relative_cost_tolerance"_a)
       .def("reduced", &reduced, damping)
       .def("step", &step_of, damping)
-      .def("map_from_body", &poses_of)
-      .def("motions", &motions_of)
-      .def("points_map", &points_map_of)
+      .def("log_determinant", [](BundleSolver& solver) { return unlocked([&] { return solver.log_determinant(); }); })
+      .def("map_from_body", [](const BundleSolver& solver) { return poses_of(solver.state()); })
+      .def("motions", [](const BundleSolver& solver) { return motions_of(solver.state()); })
+      .def("points_map", [](const BundleSolver& solver) { return points_of(solver.state()); })
+      .def("calibration", [](const BundleSolver& solver) { return calibration_of(solver.state()); })
       .def("squared_sigmas", &squared_sigmas_of);
   module.def("inertial_residual", &inertial_residual, "map_from_body"_a.noconvert(), "motions"_a.noconvert(), "gravity"_a.noconvert(),
              "increments"_a.noconvert());

@@ -12,7 +12,6 @@ namespace nb = nanobind;
 void bind_aliases(nb::module_&);
 void bind_block_cholesky(nb::module_&);
 void bind_bundle(nb::module_&);
-void bind_calibration(nb::module_&);
 void bind_camera(nb::module_&);
 void bind_corners(nb::module_&);
 void bind_filter(nb::module_&);
@@ -57,7 +56,6 @@ NB_MODULE(_core, module) {
   bind_aliases(module);
   bind_block_cholesky(module);
   bind_bundle(module);
-  bind_calibration(module);
   bind_corners(module);
   bind_filter(module);
   bind_grid(module);
