@@ -27,8 +27,7 @@ class BaseMap:
         self.map_from_body = self.map_from_cam @ se3_inverse(body_from_cam)
         self.cones = viewing_cones(survey_map, self.map_from_cam)
         self.points_map, self.descriptors = survey_map.points_map, survey_map.descriptors
-        own = survey_map.camera
-        self.baseline_ratio = camera.baseline_m / own.baseline_m if own.baseline_m and camera.baseline_m else 1.0
+        self.baseline_ratio = baseline_ratio(camera, survey_map.camera)
         self.obs_pixels, self.obs_sigma_px = with_baseline(
             survey_map.obs_pixels, survey_map.obs_sigma_px, self.baseline_ratio
         )
@@ -66,6 +65,11 @@ class BaseMap:
     def reference_cameras(self, rows: Rows) -> Array:
         """(V, 4, 4) map_from_cam of the keyframes that the patches of `rows` were cut from."""
         return np.asarray(self.map_from_cam[self.map.obs_keyframe[self.references[rows]]])
+
+
+def baseline_ratio(camera: StereoCamera, other: StereoCamera) -> float:
+    """By what disparities of `camera` are larger than the other's; 1 where one of them is a single camera and has none."""
+    return camera.baseline_m / other.baseline_m if camera.baseline_m and other.baseline_m else 1.0
 
 
 def with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, PriorTerm, continued
-from mapserver.survey.merge.base_map import BaseMap, with_baseline
+from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
@@ -105,10 +105,11 @@ def _solved(
     turn, carried = _carried(state, map_from_body)
     rig_from_body = earlier.body_from_cam @ se3_inverse(state.body_from_cam)  # of the body that the problem speaks of
     own_rig = bool(np.allclose(rig_from_body, np.eye(4), atol=1e-9))
+    camera = earlier.camera if earlier.camera.baseline_m else state.camera  # only a pair sees distances
     pixels, sigmas_px = with_baseline(
         np.concatenate([*(s.pixels for _, s in seen), marks.obs_pixels[own]]),
         np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own]]),
-        earlier.camera.baseline_m / state.camera.baseline_m,
+        baseline_ratio(camera, state.camera),
     )
     keyframes = [earlier.obs_keyframe, *(np.full(len(s.rows), old + k) for k, s in seen), old + marks.obs_keyframe[own]]
     landmarks = [
@@ -120,6 +121,7 @@ def _solved(
     fixed[0] |= old == 0
     problem = replace(
         earlier,
+        camera=camera,
         map_from_body=np.concatenate([earlier.map_from_body, map_from_body @ se3_inverse(rig_from_body)]),
         fixed=fixed,
         points_map=np.concatenate([earlier.points_map, carried[own_used]]),
