@@ -10,18 +10,14 @@ from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.sensors.samples import WheelSample
 
 _WINDOW_NS = 400_000_000
-_CLIMB_M, _CLIMB_SHARE = (
-    0.05,
-    0.3,
-)  # that a floor allows: thresholds, and slopes of 17 degrees over the way that the wheels roll
+# That a floor allows: thresholds, and slopes of 17 degrees over the way that the wheels roll.
+_CLIMB_M, _CLIMB_SHARE = 0.05, 0.3
 _SIGMAS = 4.0
 _TILT = np.cos(np.radians(12.0))  # against the floor that it rolled on: driving onto a ramp and braking make less
 _FLOOR_KEPT = 0.95  # of which way is up, with each frame in which the wheels roll
 _ROLLING_MPS = 0.05
-_CARRIED_M, _SKID_SHARE = (
-    0.15,
-    0.8,
-)  # of way without a turn of the wheels; a robot that skids with locked wheels slows down
+# Of way without a turn of the wheels; a robot that skids with locked wheels slows down.
+_CARRIED_M, _SKID_SHARE = 0.15, 0.8
 
 
 class _Step(NamedTuple):
@@ -29,6 +25,7 @@ class _Step(NamedTuple):
     climb_m: float
     way_m: Array  # (2,) of the base along the floor, in its own axes
     rolled_m: float
+    is_rolling: bool  # straight on or in a turn on the spot
 
 
 class LiftCheck:
@@ -59,7 +56,8 @@ class LiftCheck:
         step_m = (self._base_from_body @ earlier_from_body @ self._body_from_base)[:3, 3]
         climb_m, speed_mps = float(up @ step_m), length(self._wheel.velocity_base_mps)
         rolled_m = speed_mps * (stamp_ns - self._steps[-1].stamp_ns) * 1e-9 if self._steps else 0.0
-        self._steps.append(_Step(stamp_ns, climb_m, (step_m - climb_m * up)[:2], rolled_m))
+        is_rolling = speed_mps > 0.0 or abs(self._wheel.yaw_rate_radps) > 0.0
+        self._steps.append(_Step(stamp_ns, climb_m, (step_m - climb_m * up)[:2], rolled_m, is_rolling))
         while stamp_ns - self._steps[0].stamp_ns > _WINDOW_NS:
             self._steps.popleft()
         return self._climbs(climb_sigma_mps) or self._is_tilted(up, speed_mps) or self._is_moved(speed_mps)
@@ -69,17 +67,19 @@ class LiftCheck:
         return abs(climb_m) > _CLIMB_M + _CLIMB_SHARE * rolled_m + _SIGMAS * sigma_mps * _WINDOW_NS * 1e-9
 
     def _is_tilted(self, up: Array, speed_mps: float) -> bool:
-        floor_up = up if self._floor_up is None else self._floor_up
-        if self._floor_up is None or speed_mps > _ROLLING_MPS:
-            mixed = _FLOOR_KEPT * floor_up + (1.0 - _FLOOR_KEPT) * up
+        is_tilted = self._floor_up is not None and bool(self._floor_up @ up < _TILT)
+        if self._floor_up is None or is_tilted:
+            self._floor_up = up  # said once: it may stand on a slope from now on, and search there
+        elif speed_mps > _ROLLING_MPS:
+            mixed = _FLOOR_KEPT * self._floor_up + (1.0 - _FLOOR_KEPT) * up
             self._floor_up = mixed / length(mixed)
-        return bool(floor_up @ up < _TILT)
+        return is_tilted
 
     def _is_moved(self, speed_mps: float) -> bool:
         """Whether it moves on and on without a turn of its wheels, which had turned before."""
         self._has_rolled |= speed_mps > _ROLLING_MPS
         ways_m, half = np.array([step.way_m for step in self._steps]), len(self._steps) // 2
-        if not self._has_rolled or half < 2 or any(step.rolled_m > 0.0 for step in self._steps):
+        if not self._has_rolled or half < 2 or any(step.is_rolling for step in self._steps):
             return False
         early_m, late_m = length(ways_m[:half].sum(axis=0)), length(ways_m[-half:].sum(axis=0))
         self._has_rolled = early_m + late_m < _CARRIED_M or late_m < _SKID_SHARE * early_m

@@ -70,3 +70,21 @@ def test_wheels_that_never_turn_say_nothing() -> None:
     for k in range(30):
         wheel = [WheelSample(k * 66_000_000, np.zeros(3), 0.0, 0.02, 0.02)]
         assert not check.is_lifted(k * 66_000_000, wheel, np.eye(4), step, 0.01)
+
+
+def test_a_turn_on_the_spot_is_no_lift_and_a_robot_set_down_on_a_slope_is_told_once() -> None:
+    """The camera is half a metre ahead of the axle; the slope is of 15 degrees, on which it stands for half a minute."""
+    axle_from_base, told_s = se3(np.eye(3), np.array([0.5, 0.0, 0.0])), []
+    check, before = LiftCheck(np.eye(4)), axle_from_base
+    for k in range(1, round(40.0 / FRAME_S)):
+        t = k * FRAME_S
+        yaw_rad, pitch_rad = 2.0 * np.clip(t - 2.0, 0, 3), np.radians(15.0) * np.clip(t - 8.0, 0, 0.5) / 0.5
+        axle = se3(so3_exp(np.array([0.0, 0.0, yaw_rad])), np.array([min(t, 2.0), 0.0, 0.0]))
+        now: Array = axle @ axle_from_base @ se3(so3_exp(np.array([0.0, pitch_rad, 0.0])), np.zeros(3))
+        speed_mps, stamp_ns = np.array([1.0 if t < 2.0 else 0.0, 0.0, 0.0]), int(t * 1e9)
+        wheel = [WheelSample(stamp_ns, speed_mps, 2.0 if 2.0 < t < 5.0 else 0.0, 0.02, 0.02)]
+        if check.is_lifted(stamp_ns, wheel, now, se3_inverse(before) @ now, 0.01):
+            told_s.append(t)
+        before = now
+    assert len(told_s) == 1
+    assert 8.0 < told_s[0] < 8.6
