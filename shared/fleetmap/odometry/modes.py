@@ -468,17 +468,14 @@ class InertialMode(WindowMode):
         Bays of a rack look alike, and matches may agree on the next one. They are believed once that repeats itself: the IMU is wrong then.
         """
         if not tracked.earlier:
+            self._elsewhere_frames = self._elsewhere_frames if tracked.lost else 0
             return tracked
         possible = tuple(e for e in tracked.earlier if not self._off_mps(e.frame_index, e.cam_from_earlier))
         self._elsewhere_frames = 0 if possible else self._elsewhere_frames + 1
         if self._elsewhere_frames > _MAX_ELSEWHERE:
             return tracked
-        motion = (
-            tracked.cam_from_previous
-            if any(e.cam_from_earlier is tracked.cam_from_previous for e in possible)
-            else None
-        )
-        return replace(tracked, earlier=possible, cam_from_previous=motion)
+        is_possible = any(e.cam_from_earlier is tracked.cam_from_previous for e in possible)
+        return replace(tracked, earlier=possible, cam_from_previous=tracked.cam_from_previous if is_possible else None)
 
     def _bridge_gap(self, end_ns: int) -> None:
         """Without samples: as all points of the last two frames moved, as uncertain as without an IMU.
