@@ -114,7 +114,7 @@ class Runtime:
     def _finish(self, threads: list[threading.Thread]) -> None:
         self._manager.stopping()
         if self._server is not None:
-            self._server.health.append(self._health(is_silent=False))  # of all frames
+            self._server.health.append(self._health())  # of all frames
         self.stop()
         for thread in threads:
             thread.join(_DRAIN_S)
@@ -124,7 +124,7 @@ class Runtime:
         if self._parts.replays is not None and self._robot.ring is not None:
             self._robot.ring.finish()
             self._parts.replays.work()
-        _log.info("stopped: %s", self._health(is_silent=False))
+        _log.info("stopped: %s", self._health())
         if words := self._figures.search.words:
             _log.warning("stopped: %s", words)
 
@@ -192,18 +192,21 @@ class Runtime:
         if self._parts.intake.counts.unreadable > self._unreadable:
             self._unreadable = self._parts.intake.counts.unreadable
             self._refusals.warning("message", "a sensor's message is not used: %s", self._parts.intake.unreadable_why)
-        is_silent = self._last_frame_s is not None and now_s - self._last_frame_s > _SILENT_S
+        is_silent = self._is_silent()
         if is_silent and self._parts.fleet_manager is not None:
             self._parts.fleet_manager.adapter.silence()
         if self._server is not None:
-            self._server.health.append(self._health(is_silent))
+            self._server.health.append(self._health())
         if self._publisher is not None:
             _send(partial(self._publisher.alive, is_silent))
         last = self._figures.last
         status = "no frame yet" if last is None else last.estimate.status.value
         self._manager.alive("no frames come" if is_silent else status)
 
-    def _health(self, is_silent: bool) -> RobotHealth:
+    def _is_silent(self) -> bool:
+        return self._last_frame_s is not None and time.monotonic() - self._last_frame_s > _SILENT_S
+
+    def _health(self) -> RobotHealth:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
         with suppress(StoreError):  # the thread of the disk or of the network says so
             self._outbox_counts = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
@@ -218,7 +221,7 @@ class Runtime:
         if self._server is not None:
             counts["map_word_hours"] = self._server.client.word_hours
         profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles}
-        return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, is_silent)
+        return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, self._is_silent())
 
     # --- the other threads --------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ import pytest
 from fleetmap.errors import FleetmapError, RecordingError, StoreError
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import (
+    Cause,
     FailureAck,
     FailureReport,
     InitialPoseMessage,
@@ -23,6 +24,7 @@ from fleetmap.messages import (
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
+from locclient.daemon import runtime
 from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
@@ -270,6 +272,13 @@ def test_faults_of_the_tile_cache_reach_the_server(world: World) -> None:
     parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
     Runtime(parts, ServiceManager("")).run()
     assert world.fleet.robots("room")[0].last_health["metrics"]["cache_faults"] == len(parts.caches)
+
+
+def test_a_robot_that_ends_without_frames_says_so(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "_SILENT_S", -1.0)
+    parts = world.parts(ScriptedSource(list(robot_world.bundles(3))), robot_world.new_robot(), Listener())
+    Runtime(parts, ServiceManager("")).run()
+    assert Cause.NO_FRAMES.value in world.fleet.robots("room")[0].last_health["flags"]
 
 
 def test_a_spool_on_a_disk_that_refuses_costs_no_estimate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
