@@ -104,7 +104,8 @@ class InitialPosePrior:
         if not order or competitors:
             return False
         has_more = order[0].support > self._settings.confirming_fixes
-        return has_more and found.is_supported(order[0]) and not found.may_be_lookalike(order[0])
+        is_telling = not self.is_told and order[0].speaks_against_others(self._settings)  # as against a confirmed pose
+        return has_more and (is_telling or found.is_supported(order[0])) and not found.may_be_lookalike(order[0])
 
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
         """(N,) which positions (N, 3) may show what the robot sees now."""
@@ -114,7 +115,7 @@ class InitialPosePrior:
     def weighed(self, observations: Observations) -> Observations:
         """The fixes of a query, with what a person's word for its place is worth to each: 0 for places that were not named. Exact sources
         exclude the others instead."""
-        for _, hypothesis in observations if self.is_revisable else ():
+        for _, hypothesis in observations if self.is_revisable and self.is_told else ():
             if self.is_compatible(hypothesis):
                 share = self._settings.wrong_prior_share
                 hypothesis.told_log_odds = float(np.log1p(-share) - np.log(share))

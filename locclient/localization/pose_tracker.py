@@ -194,7 +194,7 @@ class PoseTracker:
         self.prior = None
         if np.isfinite(confirmed.now_cov).all() and np.isfinite(confirmed.now_map_from_body).all():
             at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov)
-            self.prior = self._prior_at(at_present, is_revisable=False, is_told=False)
+            self.prior = self._prior_at(at_present, is_revisable=True, is_told=False)
 
     def end_query(self) -> None:
         self._query_frame = None

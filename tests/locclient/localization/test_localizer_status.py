@@ -285,6 +285,17 @@ def test_a_pose_that_may_be_at_the_next_bay_is_confirmed_like_any_place(
         assert estimate.map_from_body is None or tracking.error_m(estimate) < radius_95_m(estimate.cov_rot_trans)
 
 
+@pytest.mark.parametrize("step_m", [0.2, 0.0])
+@pytest.mark.parametrize("radius_m", [1.4, 2.5])
+def test_a_doubted_pose_keeps_nobody_from_where_he_was_carried(tracking: Robot, radius_m: float, step_m: float) -> None:
+    tracking.odometry.drift_share = 0.2
+    while radius_95_m(tracking.go(0.2, NO_FIX, 0.0).cov_rot_trans) < radius_m:
+        pass
+    tracking.inliers, tracking.relocalizer.alias_ratio = 80, 0.1
+    tracking.map_from_body[:2, 3] += [20.0, 7.0]
+    assert tracking.knows(tracking.ride(12, step_m)[-1])
+
+
 def test_a_new_version_is_taken_over_without_losing_the_place(tracking: Robot) -> None:
     tracking.load(2)
     estimate = tracking.go(0.1)
