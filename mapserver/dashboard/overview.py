@@ -173,7 +173,10 @@ def _line(live: LiveSite) -> dict[str, str]:
     counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "with something else to look at"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
-        return {"tone": "good", "words": f"All {len(online)} robots online are localised."}
+        words = (
+            f"All {len(online)} robots online are localised." if len(online) > 1 else f"{online[0].name} is localised."
+        )
+        return {"tone": "good", "words": words}
     told = f"{', '.join(parts)}; {len(online)} robots are online."
     return {"tone": "bad" if lost else "warn", "words": told}
 

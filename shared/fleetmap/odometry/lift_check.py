@@ -78,9 +78,10 @@ class LiftCheck:
     def _is_moved(self, speed_mps: float) -> bool:
         """Whether it moves on and on without a turn of its wheels, which had turned before."""
         self._has_rolled |= speed_mps > _ROLLING_MPS
-        ways_m, half = np.array([step.way_m for step in self._steps]), len(self._steps) // 2
+        half = len(self._steps) // 2
         if not self._has_rolled or half < 2 or any(step.is_rolling for step in self._steps):
             return False
+        ways_m = np.array([step.way_m for step in self._steps])
         early_m, late_m = length(ways_m[:half].sum(axis=0)), length(ways_m[-half:].sum(axis=0))
         self._has_rolled = early_m + late_m < _CARRIED_M or late_m < _SKID_SHARE * early_m
         return not self._has_rolled
