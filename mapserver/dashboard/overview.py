@@ -197,6 +197,11 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
     words, own = [*robot.flags, *_troubles(robot)], health.robots.get(robot.name)
     failures = 0 if own is None else own.failures.events + own.failures_running
     words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
+    words += (
+        [f"suspected failures: {own.silent_estimated.events}"]
+        if own is not None and own.silent_estimated.events
+        else []
+    )
     words += ["tries a new version"] if robot.is_canary else []
     since, exact = "", ""
     if robot.tone == "quiet":
