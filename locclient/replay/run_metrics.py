@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap import failure_definition
-from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S, SPARSE_S, SearchClock
+from fleetmap.failure_definition import BLIND_S, GOOD_S, SILENT_S, SearchClock
 from fleetmap.geometry import Array
 from fleetmap.messages import Status
 
@@ -35,6 +35,10 @@ class FrameRecord:
     may_be_mapped: bool = True
 
     @property
+    def radius_95_m(self) -> float:
+        return failure_definition.radius_95_m(self.cov_rot_trans)
+
+    @property
     def error_m(self) -> float | None:
         return None if self.error_map_m is None else float(np.linalg.norm(self.error_map_m))
 
@@ -43,13 +47,13 @@ Frames = Sequence[FrameRecord]
 
 
 def localised(frames: Frames) -> list[bool]:
-    """For each frame: TRACKING, or a fix of its own where the recording is so sparse that frames are over a second apart."""
-    out = []
-    for index, frame in enumerate(frames):
-        beside = [frames[k].stamp_ns for k in (index - 1, index + 1) if 0 <= k < len(frames)]
-        sparse = max((abs(stamp_ns - frame.stamp_ns) * 1e-9 for stamp_ns in beside), default=0.0) > SPARSE_S
-        out.append(frame.status is Status.TRACKING or (sparse and frame.has_fix))
-    return out
+    """For each frame, by `failure_definition.is_localised`, whether it is, with the longer of the gaps before and after it."""
+    stamps_ns = np.array([frame.stamp_ns for frame in frames], np.int64)
+    gaps_ns = np.maximum(np.diff(stamps_ns, prepend=stamps_ns[:1]), np.diff(stamps_ns, append=stamps_ns[-1:]))
+    return [
+        failure_definition.is_localised(frame.status, frame.has_fix, frame.radius_95_m, gap_ns * 1e-9)
+        for frame, gap_ns in zip(frames, gaps_ns, strict=True)
+    ]
 
 
 def first_fix(frames: Frames) -> int | None:
@@ -152,10 +156,9 @@ def not_found(frames: Frames) -> list[tuple[int, int]]:
     clock, stretches = SearchClock(), []
     begin = None
     for frame, is_localised in zip(frames, localised(frames), strict=True):
-        radius_m = failure_definition.radius_95_m(frame.cov_rot_trans)
         fails = clock.handle(
             frame.stamp_ns,
-            is_found=failure_definition.is_found(is_localised, frame.has_fix, frame.status, radius_m),
+            is_found=failure_definition.is_found(is_localised, frame.has_fix, frame.status, frame.radius_95_m),
             is_driving=failure_definition.is_driving(frame.speed_mps),
             may_be_mapped=frame.may_be_mapped,
         )
@@ -171,8 +174,7 @@ def _is_silent(frame: FrameRecord, is_localised: bool) -> bool:
 
 
 def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
-    radius_m = failure_definition.radius_95_m(frame.cov_rot_trans)
-    return not is_localised and failure_definition.is_blind(frame.status, radius_m)
+    return not is_localised and failure_definition.is_blind(frame.status, frame.radius_95_m)
 
 
 def is_outside_its_bound(frame: FrameRecord) -> bool:

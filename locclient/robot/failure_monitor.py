@@ -8,11 +8,11 @@ from fleetmap.failure_definition import (
     FIND_DRIVING_S,
     GOOD_S,
     SILENT_S,
-    SPARSE_S,
     SearchClock,
     is_blind,
     is_driving,
     is_found,
+    is_localised,
     is_wrong,
     radius_95_m,
 )
@@ -116,10 +116,8 @@ class FailureMonitor:
         """Whether the robot has searched for itself for too long."""
         before_ns = estimate.stamp_ns if self._last is None else self._last.stamp_ns
         has_fix = estimate.fix is not None
-        is_localised = estimate.status is Status.TRACKING or (
-            has_fix and (estimate.stamp_ns - before_ns) * 1e-9 > SPARSE_S
-        )
-        found = is_found(is_localised, has_fix, estimate.status, radius_m)
+        localised = is_localised(estimate.status, has_fix, radius_m, (estimate.stamp_ns - before_ns) * 1e-9)
+        found = is_found(localised, has_fix, estimate.status, radius_m)
         if found:
             self._search_causes.clear()
         else:

@@ -49,6 +49,11 @@ def is_driving(speed_mps: float | None) -> bool:
     return speed_mps is None or abs(speed_mps) >= DRIVING_MPS
 
 
+def is_localised(status: str, has_fix: bool, radius_95_m: float, gap_s: float) -> bool:
+    """Whether the robot knows its place: tracking; or, far in time from the frames beside it, by a fix that its position rests on."""
+    return status == Status.TRACKING or (has_fix and radius_95_m <= RADIUS_LIMIT_M and gap_s > SPARSE_S)
+
+
 def is_found(is_localised: bool, has_fix: bool, status: str, radius_95_m: float) -> bool:
     """Whether a frame or report shows that the robot knows where it is: localised, or a fix behind a position to be relied upon."""
     return is_localised or (has_fix and is_usable(status, radius_95_m))

@@ -197,6 +197,8 @@ def test_between_sparse_frames_nothing_better_is_known() -> None:
     assert METRICS["localised_share"](frames) == pytest.approx(0.8)
     assert counts(frames) == (0, 1)
     kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.5}
+    assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (0, 1), "whoever is lost claims nothing"  # type: ignore[arg-type]
+    kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.1}
     assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (1, 1)  # type: ignore[arg-type]
 
 
