@@ -14,6 +14,7 @@ from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard import overview
 from mapserver.dashboard.compression_cache import CompressionCache
+from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
@@ -33,8 +34,6 @@ from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import MapStore
 
-PATH = "/dashboard"
-
 
 def install_dashboard(
     app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys, bus: Bus
@@ -51,7 +50,9 @@ def install_dashboard(
     for page in (robot_page, map_page, space_page, failures_page, failure_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
-    overview.install(pages, services)
+    console = Console(pages, services)
+    console.files()
+    overview.install(console)
     _install_pictures(services, store)
 
     @app.get("/", include_in_schema=False)

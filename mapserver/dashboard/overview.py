@@ -2,30 +2,15 @@
 pages; the Overview is kept up to date by a stream of server-sent events.
 """
 
-import asyncio
 import time
-from base64 import b64encode
-from collections.abc import AsyncIterator, Callable
-from hashlib import sha256
-from pathlib import Path
 
-from fastapi import FastAPI, Request
-from fastapi.responses import HTMLResponse, StreamingResponse
-from fastapi.staticfiles import StaticFiles
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
-from nicegui.elements import leaflet
-
-from fleetmap.encoding import to_json
-from fleetmap.errors import FleetmapError
-from mapserver.api.guard import SIGN_IN
-from mapserver.api.moments import zone_of
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.bar_chart import Bar
+from mapserver.dashboard.console import Console
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Figure
-from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
+from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_around, box_of, ground, heat
 from mapserver.dashboard.markup import age, share
@@ -35,99 +20,20 @@ from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telli
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import Areas
 
-_HERE = Path(__file__).parent
-_EVERY_S = 1.0
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
-_THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
-# {}: the hash of the import map, the one script within a page.
-_POLICY = (
-    "default-src 'none'; script-src 'self' 'sha256-{}'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
-    "form-action 'self'; frame-ancestors 'none'"
-)
-_TEMPLATES = Environment(loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined)
 
 
-def install(app: FastAPI, services: Services) -> None:
-    """Adds the pages, what they load, and the stream."""
-    app.mount("/static", StaticFiles(directory=_HERE / "static"))
-    app.mount("/leaflet", StaticFiles(directory=Path(leaflet.__file__).parent / "dist"))
+def install(console: Console) -> None:
+    """Adds the pages and the stream."""
+    services = console.services
 
-    @app.get("/style.css", include_in_schema=False)
-    def style() -> HTMLResponse:
-        """Colours and parts that all pages share."""
-        return HTMLResponse((_HERE / "style.css").read_text("utf-8"), media_type="text/css")
+    def overview(context: PageContext) -> dict[str, object]:
+        return {"data": {"scene": _scene(services, context), "now": _now(services, context)}}
 
-    @app.get("/", include_in_schema=False)
-    async def overview(request: Request, site: str | None = None) -> HTMLResponse:
-        """The Overview."""
-
-        def fill(context: PageContext) -> dict[str, object]:
-            data = {"scene": _scene(services, context), "now": _now(services, context)}
-            return {"data": to_json(data).decode().replace("<", "\\u003c")}
-
-        return await _page(services, request, "", site, fill)
-
-    @app.get("/trends", include_in_schema=False)
-    async def trends(request: Request, site: str | None = None) -> HTMLResponse:
-        """Trends."""
-        return await _page(services, request, "trends", site, lambda context: _trends(services, context))
-
-    @app.get("/now", include_in_schema=False)
-    async def now(request: Request, site: str) -> StreamingResponse:
-        """What the Overview shows, every second, for as long as the session lasts."""
-        root, zone = str(request.scope.get("root_path", "")), zone_of(request.cookies.get(ZONE_COOKIE))
-        context = PageContext(root, "", await load(services.maps.chosen_site, site), zone)
-
-        def one() -> bytes:
-            is_signed_in = getattr(request.state, "operator", None) is not None
-            if is_signed_in and services.guard.identify(request.scope, uses=False) is None:
-                return b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
-            return b"data: %s\n\n" % to_json(_now(services, context))
-
-        async def events() -> AsyncIterator[bytes]:
-            while not await request.is_disconnected():
-                yield await load(one)
-                await asyncio.sleep(_EVERY_S)
-
-        return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
-
-
-async def _page(
-    services: Services,
-    request: Request,
-    page: str,
-    site: str | None,
-    fill: Callable[[PageContext], dict[str, object]],
-) -> HTMLResponse:
-    """The template of a page, filled; a FleetmapError becomes a notice within the frame."""
-    root, sites, chosen, found, status = str(request.scope.get("root_path", "")), [], site, {}, 200
-    try:
-        sites = await load(services.maps.sites)
-        chosen = await load(services.maps.chosen_site, site)
-        zone = zone_of(request.cookies.get(ZONE_COOKIE))
-        check_query(request, ("since", "until") if page else ())
-        found = await load(fill, PageContext(root, page, chosen, zone, request.query_params))
-        template = f"{page or 'overview'}.html"
-    except FleetmapError as error:
-        template, found, status = "problem.html", {"words": str(error)}, 404
-    imports = to_json({"imports": {"nicegui-leaflet": f"{root}/leaflet/index.js"}}).decode()
-    look = request.cookies.get(LOOK_COOKIE, "")
-    frame = {
-        "root": root,
-        "imports": Markup(imports),
-        "pages": PAGES,
-        "page": page,
-        "sites": sites,
-        "site": chosen,
-        "look": look if look in _THEMES else "",
-        "theme": _THEMES.get(look, "print"),
-        "person": person(request),
-        "warning": services.guard.warning,
-    }
-    policy = _POLICY.format(b64encode(sha256(imports.encode()).digest()).decode())
-    filled = _TEMPLATES.get_template(template).render(frame | found)
-    return HTMLResponse(filled, status, {"Content-Security-Policy": policy})
+    console.page("", "overview.html", overview)
+    console.page("trends", "trends.html", lambda context: _trends(services, context), knows=("since", "until"))
+    console.stream("now", lambda context: _now(services, context))
 
 
 def _scene(services: Services, context: PageContext) -> dict[str, object] | None:

@@ -1,0 +1,156 @@
+"""The frame of every page: templates filled from the same functions as the HTTP API, under a policy that runs no script of a page's text.
+
+What a page needs to know goes into `fill`; what moves from second to second comes by a stream of server-sent events, and what changes
+now and then is fetched anew by `static/renew.js`. Acts are requests to the HTTP API, by `static/acts.js`.
+"""
+
+import asyncio
+from base64 import b64encode
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from fastapi.responses import FileResponse, HTMLResponse, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from nicegui.elements import leaflet
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import FleetmapError
+from mapserver.api.guard import SIGN_IN
+from mapserver.api.moments import zone_of
+from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
+from mapserver.operators.roles import Scope
+
+PATH = "/dashboard"
+_HERE = Path(__file__).parent
+_EVERY_S = 1.0
+_THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
+# {}: the hash of the import map, the one script within a page.
+_POLICY = (
+    "default-src 'none'; script-src 'self' 'sha256-{}'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'self'; frame-ancestors 'none'"
+)
+
+
+def script_json(value: object) -> Markup:
+    """A value for a script element or an attribute: JSON without a character that HTML gives a meaning."""
+    text = to_json(value).decode()
+    return Markup(text.translate({ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&'"}))
+
+
+_TEMPLATES = Environment(loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined)
+_TEMPLATES.filters["script_json"] = script_json
+
+
+@dataclass(frozen=True, slots=True)
+class Console:
+    """Where pages are added."""
+
+    app: FastAPI
+    services: Services
+
+    def files(self) -> None:
+        """Adds what all pages load."""
+        self.app.mount("/static", StaticFiles(directory=_HERE / "static"))
+        self.app.mount("/leaflet", StaticFiles(directory=Path(leaflet.__file__).parent / "dist"))
+
+        @self.app.get("/style.css", include_in_schema=False)
+        def style() -> FileResponse:
+            """Colours and parts that all pages share."""
+            return FileResponse(_HERE / "style.css", media_type="text/css")
+
+    def page(
+        self,
+        path: str,
+        template: str,
+        fill: Callable[..., dict[str, object]],
+        *,
+        knows: Sequence[str] = (),
+        under_way: Callable[[], list[str]] = list,
+    ) -> None:
+        """Adds a page. fill: what its template needs, of a PageContext and the parts of `path` in braces; it may block.
+
+        A FleetmapError becomes a notice within the frame. knows: query parameters beside the site. under_way: sites that the page
+        knows though the store has no version of them.
+        """
+
+        @self.app.get(f"/{path}", include_in_schema=False)
+        async def shown(request: Request) -> HTMLResponse:
+            """A page."""
+            return await self._shown(request, path.partition("/")[0], template, fill, knows, under_way)
+
+    def stream(self, path: str, one: Callable[[PageContext], dict[str, object]]) -> None:
+        """Adds what a page follows: an event every second, for as long as the session lasts."""
+
+        @self.app.get(f"/{path}", include_in_schema=False)
+        async def followed(request: Request, site: str) -> StreamingResponse:
+            """A stream of server-sent events."""
+            chosen = await load(self.services.maps.chosen_site, site)
+            context = PageContext(
+                _root(request), "", chosen, zone_of(request.cookies.get(ZONE_COOKIE)), request.query_params
+            )
+            guard = self.services.guard
+
+            def event() -> bytes:
+                is_signed_in = getattr(request.state, "operator", None) is not None
+                if is_signed_in and guard.identify(request.scope, uses=False) is None:
+                    return b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
+                return b"data: %s\n\n" % to_json(one(context))
+
+            async def events() -> AsyncIterator[bytes]:
+                while not await request.is_disconnected():
+                    yield await load(event)
+                    await asyncio.sleep(_EVERY_S)
+
+            return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+    async def _shown(
+        self,
+        request: Request,
+        page: str,
+        template: str,
+        fill: Callable[..., dict[str, object]],
+        knows: Sequence[str],
+        under_way: Callable[[], list[str]],
+    ) -> HTMLResponse:
+        root, site, found, status = _root(request), request.query_params.get("site"), {}, 200
+        sites: list[str] = []
+        try:
+            growing = await load(under_way)
+            sites = sorted({*await load(self.services.maps.sites), *growing})
+            if site not in growing:
+                site = sites[0] if site is None and growing else await load(self.services.maps.chosen_site, site)
+            check_query(request, knows)
+            zone = zone_of(request.cookies.get(ZONE_COOKIE))
+            context = PageContext(root, page, site, zone, request.query_params)
+            found = await load(lambda: fill(context, **request.path_params))
+        except FleetmapError as error:
+            template, found, status = "problem.html", {"words": str(error)}, 404
+        imports = to_json({"imports": {"nicegui-leaflet": f"{root}/leaflet/index.js"}}).decode()
+        look, who = request.cookies.get(LOOK_COOKIE, ""), getattr(request.state, "operator", None)
+        frame = {
+            "root": root,
+            "api": f"{root.removesuffix(PATH)}/v1",
+            "imports": Markup(imports),
+            "pages": PAGES,
+            "page": page,
+            "sites": sites,
+            "site": site,
+            "look": look if look in _THEMES else "",
+            "theme": _THEMES.get(look, "print"),
+            "person": person(request),
+            "may_change": who is None or Scope.CHANGE in who.scopes,
+            "is_named": who is not None,
+            "warning": self.services.guard.warning,
+        }
+        policy = _POLICY.format(b64encode(sha256(imports.encode()).digest()).decode())
+        filled = _TEMPLATES.get_template(template).render(frame | found)
+        return HTMLResponse(filled, status, {"Content-Security-Policy": policy})
+
+
+def _root(request: Request) -> str:
+    return str(request.scope.get("root_path", ""))

@@ -1,0 +1,44 @@
+// Acts: a button names a request to the HTTP API; a dialog explains it and asks for the reason and, without sign-in, the name.
+// data-act: the address; data-body: more of the request's body, which a page may set; data-explains: what would change.
+// data-lacks: set by a page while something is missing; the dialog then says that instead.
+const dialog = document.createElement("dialog");
+dialog.className = "ask-box";
+dialog.innerHTML = `<form><h2></h2><p></p>
+<label class="name">Your name <input name="actor" maxlength="200" required autocomplete="name"></label>
+<label>Reason (kept in the history) <input name="reason" maxlength="2000"></label>
+<p class="notice bad" role="alert" hidden></p>
+<div class="actions"><button class="plain confirm"></button> <button class="plain" type="button">No, change nothing</button></div></form>`;
+document.body.append(dialog);
+const form = dialog.querySelector("form");
+const [title, explanation, refusal] = ["h2", "p", ".notice"].map((found) => form.querySelector(found));
+const [confirm, refuse] = form.querySelectorAll("button");
+const isNamed = document.body.dataset.named === "true";
+let asked;
+
+const refused = (words) => ((refusal.textContent = words), (refusal.hidden = !words));
+
+document.addEventListener("click", ({ target }) => {
+  const button = target.closest("[data-act]");
+  if (!button) return;
+  asked = button;
+  const words = button.textContent.trim();
+  const { lacks } = button.dataset;
+  [title.textContent, explanation.textContent] = [`${words}?`, lacks || button.dataset.explains];
+  confirm.textContent = `Yes: ${words}`;
+  confirm.hidden = Boolean(lacks);
+  form.actor.parentElement.hidden = form.actor.disabled = isNamed;
+  refused("");
+  dialog.showModal();
+});
+refuse.addEventListener("click", () => dialog.close());
+form.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const named = isNamed ? {} : { actor: form.actor.value };
+  const body = JSON.stringify({ ...JSON.parse(asked.dataset.body || "{}"), ...named, reason: form.reason.value });
+  confirm.disabled = true;
+  const answer = await fetch(asked.dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => undefined);
+  confirm.disabled = false;
+  if (answer?.ok) return location.reload();
+  const told = await answer?.json().catch(() => undefined);
+  refused(told?.detail ?? "The server does not answer; try again.");
+});
