@@ -28,6 +28,9 @@ from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
+_BEHIND_SIGMAS = (
+    1000.0  # what an observation counts as whose landmark is behind the camera: beyond every cutoff, and no way out
+)
 # What moves the measurements, and by how much for a difference: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
@@ -140,14 +143,18 @@ def image_rows(
 ) -> ImageRows:
     """Whitened rows at a state, a theta and what is `measured` there, zero where nothing is seen; with `fixed` also their derivatives.
 
+    A landmark behind the camera is as far off as can be.
+
     scales (4,): factors on the rows' sigmas.
     """
     view, views, positions = _view(seen, data, state, theta), seen.views(theta), state.map_from_body[:, :3, 3]
-    usable = (view.in_left[:, 2] > _MIN_DEPTH_M)[:, None] & np.isfinite(seen.row_sigmas)
+    is_ahead, is_seen = view.in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
+    usable = is_ahead[:, None] & is_seen
     off = np.where(usable, measured - _predicted(view, views), 0.0)
     factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)
+    residuals = np.where(is_ahead[:, None] | ~is_seen, off * factor, _BEHIND_SIGMAS)
     if fixed is None:
-        return ImageRows(off * factor, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
+        return ImageRows(residuals, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
     by_left = _projection_slopes(view.in_left, views[0])
     by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
     by_calibration = fixed.slopes.copy()
@@ -165,7 +172,7 @@ def image_rows(
     by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 2:] - off[:, :2]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
     by_point *= factor[:, :, None]
     by_calibration *= factor[:, :, None]
-    return ImageRows(off * factor, by_point, by_calibration, positions)
+    return ImageRows(residuals, by_point, by_calibration, positions)
 
 
 def _right_place_slopes(axes: RigAxes, theta: Array) -> Array:

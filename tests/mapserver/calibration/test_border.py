@@ -125,3 +125,13 @@ def test_the_information_of_the_calibration_is_what_the_rest_leaves(scene: Scene
     np.testing.assert_allclose(
         np.linalg.inv(information) / np.outer(scale, scale), cov / np.outer(scale, scale), atol=3e-3
     )
+
+
+def test_a_landmark_behind_the_camera_is_as_far_off_as_can_be(scene: Scene) -> None:
+    problem, state = scene.problem, scene.state
+    behind = np.where(problem.data.obs_landmark == 0)[0]
+    points = state.points_map.copy()
+    points[0] += 1e3 * (state.map_from_body[problem.data.obs_keyframe[behind[0]], :3, 3] - points[0])
+    rows = problem.rows(state.map_from_body.copy(), state.motions, points, scene.theta, True)
+    assert np.linalg.norm(rows.residuals[behind], axis=1).min() > SETTINGS.cutoff_sigmas
+    assert not rows.by_point[behind].any()
