@@ -1,0 +1,77 @@
+"""The memory of a robot that drives for an hour: laps of one recording, its stamps going on, in the map of another day.
+
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_laps.py [--minutes M] [--work FOLDER] [--out FILE.json]`; recording and map as in
+bench_localization.py. Resident megabytes, the recording's samples of the whole drive among them, are taken once a minute of the drive; the
+first five are left out.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+from pathlib import Path
+
+from benchmarks.common.laps import repeated
+from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, resident_mb, show, surveyed, write_results
+from benchmarks.robot.bench_localization import CASES
+from fleetmap.free_memory import give_back_free_memory
+from fleetmap.messages import Status
+from fleetmap.recordings import FrameSelection, open_recording
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.sensor_bundle import SensorBundle
+from locclient.identity import MapAddress
+from locclient.localization.settings import LocalizerSettings
+from locclient.maps.connection import connected
+from locclient.replay.replay import load_map
+from locclient.robot.robot import Robot
+from locclient.robot.version_trial import TrialSettings
+
+_SETTLED_MINUTES = 5
+
+
+def main() -> None:
+    """Drives, and writes the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=int, default=60)
+    parser.add_argument("--work", type=Path, default=kept_folder())
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    store, path = surveyed(arguments.work), recorded(arguments.work, CASES["next day"])
+    address, resident, tracking = MapAddress(site=SITE, robot="bench", store=str(store)), [], 0
+    with open_recording(path) as once, connected(address) as link:
+        laps = 2
+        while (laps_ns := repeated(once, laps).frame_stamps_ns)[-1] - laps_ns[0] < arguments.minutes * 60e9:
+            laps *= 2
+        source = ReplaySource.of(repeated(once, laps), FrameSelection.parse(":"), reverse=False)
+        rectifier = Rectifier(source.calibration)
+        robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), keeps_replay=True)
+        robot.use(load_map(link.source)[0])
+        for number, imu in enumerate(source.imu_before_each()):
+            raw = source.frame(number)
+            outcome = robot.handle(SensorBundle(raw, imu, source.wheel_before(number), source.priors_before(number)))
+            assert outcome is not None
+            tracking += outcome.estimate.status is Status.TRACKING
+            minute = (raw.stamp_ns - int(laps_ns[0])) // 60_000_000_000
+            if minute > len(resident):
+                give_back_free_memory()
+                resident.append(resident_mb()["resident"])
+                print(f"{minute} min: {resident[-1]:.1f} MB", flush=True)
+            if minute >= arguments.minutes:
+                break
+    settled = resident[_SETTLED_MINUTES - 1 :] or resident[-1:]
+    found = {
+        "minutes": len(resident),
+        "frames": number + 1,
+        "tracking_share": tracking / (number + 1),
+        "settled_mb": settled[0],
+        "last_mb": settled[-1],
+        "growth_share": max(settled) / settled[0] - 1.0,
+    }
+    show("laps", found)
+    write_results(arguments.out, found)
+
+
+if __name__ == "__main__":
+    main()
