@@ -16,7 +16,6 @@ from fastapi.responses import FileResponse, HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
-from nicegui.elements import leaflet
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError
@@ -28,6 +27,7 @@ from mapserver.operators.roles import Scope
 PATH = "/dashboard"
 _HERE = Path(__file__).parent
 _EVERY_S = 1.0
+_MODULES = {"leaflet": "leaflet/leaflet.js", "three": "three/three.module.min.js", "three/addons/": "three/"}
 _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 # {}: the hash of the import map, the one script within a page.
 _POLICY = (
@@ -56,7 +56,6 @@ class Console:
     def files(self) -> None:
         """Adds what all pages load."""
         self.app.mount("/static", StaticFiles(directory=_HERE / "static"))
-        self.app.mount("/leaflet", StaticFiles(directory=Path(leaflet.__file__).parent / "dist"))
 
         @self.app.get("/style.css", include_in_schema=False)
         def style() -> FileResponse:
@@ -130,7 +129,8 @@ class Console:
             found = await load(lambda: fill(context, **request.path_params))
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
-        imports = to_json({"imports": {"nicegui-leaflet": f"{root}/leaflet/index.js"}}).decode()
+        files = {name: f"{root}/static/vendor/{file}" for name, file in _MODULES.items()}
+        imports = to_json({"imports": files}).decode()
         look, who = request.cookies.get(LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,

@@ -7,7 +7,7 @@ export default {
   props: { scene: Object, resourcePath: String },
   async mounted() {
     await this.$nextTick(); // window.path_prefix is set by then
-    await loadResource(window.path_prefix + `${this.resourcePath}/leaflet/leaflet.css`);
+    await loadResource(window.path_prefix + `${this.resourcePath}/leaflet.css`);
     this.map = new SiteMap(this.$el, this.scene, { onPick: (x, y) => this.$emit("pick", { x, y }) });
   },
   unmounted() {

@@ -1,18 +1,17 @@
-"""The map of all pages: pan, zoom, layers and marks that move. Drawn by leaflet, which comes with the page library: nothing is loaded
-from elsewhere.
-"""
+"""The map of all pages: pan, zoom, layers and marks that move."""
 
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import nicegui.elements.leaflet  # gives the browser the library by its name
+from nicegui.dependencies import register_importmap_override
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from mapserver.dashboard.map_layers import Box, Item, Layer
 
-_STYLES = Path(nicegui.elements.leaflet.__file__).parent / "dist"
+_LEAFLET = Path(__file__).parent / "static" / "vendor" / "leaflet"
+register_importmap_override("leaflet", "/dashboard/static/vendor/leaflet/leaflet.js")
 
 
 class SiteMap(Element, component="site_map.js", esm={"fleetmap-map": "static/map"}, default_classes="site-map"):
@@ -25,7 +24,7 @@ class SiteMap(Element, component="site_map.js", esm={"fleetmap-map": "static/map
         self, label: str, box: Box, layers: Sequence[Layer], *, is_small: bool = False, follows: bool = False
     ) -> None:
         super().__init__()
-        self.add_resource(_STYLES)
+        self.add_resource(_LEAFLET)
         self._props["scene"] = {"label": label, "box": box, "layers": layers, "follows": follows}
         if is_small:
             self.classes("small")
