@@ -35,7 +35,7 @@ def report(
     config: ConfigFile = None,
 ) -> None:
     """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
-    from mapserver.dashboard.pages.shift_page import html_page
+    from mapserver.dashboard.shift_page import html_page
     from mapserver.fleet.shift_summary import summarise
 
     settings = settings_of(context)

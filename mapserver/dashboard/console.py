@@ -14,7 +14,6 @@ from pathlib import Path
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
@@ -22,6 +21,8 @@ from fleetmap.errors import FleetmapError
 from mapserver.api.guard import SIGN_IN
 from mapserver.api.moments import zone_of
 from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
+from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
+from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.operators.roles import Scope
 
 PATH = "/dashboard"
@@ -34,16 +35,6 @@ _POLICY = (
     "default-src 'none'; script-src 'self' 'sha256-{}'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'"
 )
-
-
-def script_json(value: object) -> Markup:
-    """A value for a script element or an attribute: JSON without a character that HTML gives a meaning."""
-    text = to_json(value).decode()
-    return Markup(text.translate({ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&'"}))
-
-
-_TEMPLATES = Environment(loader=FileSystemLoader(_HERE / "templates"), autoescape=True, undefined=StrictUndefined)
-_TEMPLATES.filters["script_json"] = script_json
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +139,24 @@ class Console:
             "warning": self.services.guard.warning,
         }
         policy = _POLICY.format(b64encode(sha256(imports.encode()).digest()).decode())
-        filled = _TEMPLATES.get_template(template).render(frame | found)
+        filled = TEMPLATES.get_template(template).render(frame | found)
         return HTMLResponse(filled, status, {"Content-Security-Policy": policy})
+
+
+def scene_of(
+    services: Services,
+    context: PageContext,
+    version: int,
+    over: Sequence[Layer],
+    *,
+    places_m: Sequence[tuple[float, float]] = (),
+) -> dict[str, object]:
+    """A version's map with layers over it, for `site_map` of templates. places_m: what is in sight first, everything without them."""
+    plan = services.maps.plan(context.site, version)
+    below = services.maps.underlays(context.site, version, context.root)
+    layers = [*ground(plan, context.plan_picture(version), services.maps.areas(context.site), below), *over]
+    box = box_around(places_m, box_of(plan))
+    return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}
 
 
 def _root(request: Request) -> str:

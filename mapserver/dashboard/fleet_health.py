@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import scipy
@@ -23,10 +23,10 @@ _log = logging.getLogger(__name__)
 DAY_H, WEEK_H = 24, 7 * 24
 DAYS_SHOWN = 14
 FAILURES_SHOWN = 50
+MANY_FAILURES = 5000
 _CACHED_NS = 5_000_000_000
 _ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
 _SIGNIFICANCE = 0.05
-_PLACES = 5000
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +49,6 @@ class SiteHealth:
     week_since_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class FilterChoices:
-    """Filters of the failures: keys with any counts."""
-
-    robots: list[str]
-    versions: list[str]
-    tiles: list[str]
-    areas: list[str]
-    causes: list[str]
-
-
 class HealthData:
     """Reads fleet health from an open store. Thread-safe; errors are the store's."""
 
@@ -80,9 +69,13 @@ class HealthData:
             self._cached[site] = (self._clock_ns(), found)
         return found
 
-    def failures(self, wanted: FailureFilter, before: int | None) -> list[FailureRow]:
-        """Failures, latest arrival first; one more than is shown if there are more."""
-        return self._store.fleet.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
+    def failures(self, wanted: FailureFilter, before: int | None, limit: int = FAILURES_SHOWN + 1) -> list[FailureRow]:
+        """Failures, latest arrival first; without a limit one more than is shown if there are more."""
+        return self._store.fleet.failures(wanted, before=before, limit=limit)
+
+    def first_pictures(self, numbers: Iterable[int]) -> dict[int, int]:
+        """For each failure with a picture of its camera the place of the first one."""
+        return self._store.fleet.first_pictures(numbers)
 
     def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
         """Where a robot was and what it said of itself, thinned, oldest first."""
@@ -100,7 +93,7 @@ class HealthData:
         if since_ns is None and until_ns is None:
             since_ns = self._clock_ns() - DAYS_SHOWN * DAY_H * HOUR_NS
         wanted = FailureFilter(site=site, since_ns=since_ns, until_ns=until_ns)
-        found = self._store.fleet.failures(wanted, limit=_PLACES)
+        found = self._store.fleet.failures(wanted, limit=MANY_FAILURES)
         return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
 
     def failure(self, number: int) -> FailureDetail:
@@ -109,7 +102,7 @@ class HealthData:
     def cameras(self, site: str) -> dict[str, CameraNote]:
         """The robots' cameras as the newest failure report of each tells it; robots without one are left out."""
         newest: dict[str, int] = {}
-        for row in self._store.fleet.failures(FailureFilter(site=site), limit=_PLACES):
+        for row in self._store.fleet.failures(FailureFilter(site=site), limit=MANY_FAILURES):
             newest.setdefault(row.robot, row.number)
         told = {robot: self._store.fleet.failure(number).report.camera for robot, number in newest.items()}
         return {robot: camera for robot, camera in told.items() if camera is not None}
@@ -124,24 +117,6 @@ class HealthData:
         except RecordingError as error:
             _log.warning("failure %d is shown without its recording: %s", number, error)
             return None
-
-    def choices(self, site: str) -> FilterChoices:
-        """Filters of the site's failures."""
-
-        def keys(axis: str) -> list[str]:
-            found = self._store.fleet.counters(site, axis)
-            return [key for (_, key), counts in found.items() if counts.failures or counts.suspected]
-
-        def numbers_first(key: str) -> tuple[int, str]:
-            return (int(key), "") if key.isdecimal() else (1 << 40, key)
-
-        return FilterChoices(
-            keys("robot"),
-            sorted(keys("version"), key=numbers_first),
-            keys("tile"),
-            self._store.areas(site).names,
-            keys("cause"),
-        )
 
     def _site(self, site: str) -> SiteHealth:
         now_ns = self._clock_ns()

@@ -1,19 +1,12 @@
-"""Parts of the page of trends and of the shift leader's page: figures, trials, failure rates, what got worse, tiles to survey again."""
+"""What the page of trends and that of the shift leader show of a fleet; templates/fleet_parts.html draws it."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from markupsafe import Markup
-
-from mapserver.dashboard import bar_chart
-from mapserver.dashboard.bar_chart import Bar
-from mapserver.dashboard.markup import badge, joined, link, share, table
-from mapserver.fleet_statistics.area_trend import AreaTrend, Verdict, trend_sentence
+from mapserver.dashboard.markup import share
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
-from mapserver.fleet_statistics.resurvey_decision import TileConcern
-from mapserver.fleet_statistics.robot_calibration import PARAMETERS, CalibrationFigure
-from mapserver.floor_plan.areas import OUTSIDE
+from mapserver.fleet_statistics.robot_calibration import CalibrationFigure
 from mapserver.store import CanaryRow
 
 _TRIAL_WORDS = {
@@ -22,13 +15,6 @@ _TRIAL_WORDS = {
     "rolled_back": ("bad", "was tried by {share} of the robots and rolled back at {when}"),
     "stopped": ("warn", "was tried by {share} of the robots until the trial was stopped at {when}"),
 }
-_TREND_TONES: dict[Verdict, str] = {
-    "worse": "bad",
-    "better": "good",
-    "no clear change": "quiet",
-    "too little driving to say": "quiet",
-}
-_TRENDS_SHOWN = 20
 
 
 class Figure(NamedTuple):
@@ -38,6 +24,31 @@ class Figure(NamedTuple):
     value: object
     remark: str
     tone: str = ""
+
+
+class Bar(NamedTuple):
+    """A rate with its interval; value None where nothing was driven."""
+
+    label: str
+    value: float | None
+    low: float | None
+    high: float | None
+    words: str
+
+
+class Bars(NamedTuple):
+    """Rates side by side."""
+
+    name: str
+    bars: list[Bar]
+
+    @property
+    def top(self) -> float:
+        """The end of the scale, the next of 1, 2, 5, 10, 20, ...; intervals that are very wide go beyond it."""
+        highest = max([0.5, *(bar.value for bar in self.bars if bar.value is not None)])
+        wanted = min(3 * highest, max([highest, *(bar.high for bar in self.bars if bar.high is not None)]))
+        steps = (digit * 10.0**power for power in range(-1, 9) for digit in (1, 2, 5))
+        return next((step for step in steps if step >= wanted), wanted)
 
 
 class Trial(NamedTuple):
@@ -52,14 +63,6 @@ class Trial(NamedTuple):
 def trial_of(canary: CanaryRow, found: CanaryFinding) -> Trial:
     """A trial as pages show it; the outcome of one that has ended stays what it was."""
     return Trial(canary, canary.outcome or found.reason, found.canary, found.others)
-
-
-def figures(found: Iterable[Figure]) -> Markup:
-    """Figures side by side."""
-    box = Markup('<div><div class="name">{}</div><div class="value {}">{}</div><div class="more">{}</div></div>')
-    return Markup('<div class="figures">{}</div>').format(
-        joined(box.format(figure.name, figure.tone, figure.value, figure.remark) for figure in found)
-    )
 
 
 def rate_figure(name: str, found: Rate, more: str) -> Figure:
@@ -82,7 +85,7 @@ def localised_figure(name: str, found: Kpis) -> Figure:
 
 
 def trial_words(trial: Trial, moment: Callable[[int | None], str | None]) -> tuple[str, str, str]:
-    """Tone, what became of a trial, and what was found, empty before."""
+    """Tone, what became of a trial, and what was found, empty before. moment: a stamp as people read it."""
     canary, finding = trial.canary, trial.finding
     tone, sentence = _TRIAL_WORDS[canary.state]
     when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
@@ -90,21 +93,26 @@ def trial_words(trial: Trial, moment: Callable[[int | None], str | None]) -> tup
     return tone, words, f"{finding[:1].upper()}{finding[1:]}." if finding else ""
 
 
-def trial_notices(trials: Iterable[Trial], moment: Callable[[int | None], str | None]) -> Markup:
-    """The running trial of a version, and how those before it ended; moment: a stamp as people read it."""
-    notice = Markup('<div class="notice {}" role="status"><strong>{}</strong><br>{}</div>')
-    parts = []
-    for trial in trials:
-        canary = trial.canary
-        parts.append(notice.format(*trial_words(trial, moment)))
-        sides = ((f"version {canary.version}", trial.tried), (f"others, version {canary.base_version}", trial.others))
-        name = f"Failures per robot-day with version {canary.version} and with the others"
-        if any(map(is_telling, (trial.tried, trial.others))):
-            drawn = bar_chart.bars([rate_bar(label, rate) for label, rate in sides], name)
-            parts.append(
-                Markup('<figure class="sides">{}<figcaption class="quiet">{}</figcaption></figure>').format(drawn, name)
-            )
-    return joined(parts)
+def trials_shown(
+    found: Iterable[Trial], moment: Callable[[int | None], str | None]
+) -> list[tuple[str, str, str, Bars | None]]:
+    """Of each trial the words, and the rates of both sides once they tell something."""
+    shown = []
+    for trial in found:
+        version, sides = trial.canary.version, (trial.tried, trial.others)
+        labels = f"version {version}", f"others, version {trial.canary.base_version}"
+        name = f"Failures per robot-day with version {version} and with the others"
+        drawn = Bars(name, [rate_bar(*side) for side in zip(labels, sides, strict=True)])
+        shown.append((*trial_words(trial, moment), drawn if any(map(is_telling, sides)) else None))
+    return shown
+
+
+def cameras(
+    robots: Iterable[tuple[str, Sequence[CalibrationFigure]]],
+) -> list[tuple[str, dict[str, CalibrationFigure]]]:
+    """What the map shows of the robots' cameras by parameter, those that drift first; robots that do not report it are left out."""
+    found = [(robot, {one.name: one for one in told}) for robot, told in robots if told]
+    return sorted(found, key=lambda item: (not any(one.is_drifted for one in item[1].values()), item[0]))
 
 
 def rate_bar(label: str, found: Rate) -> Bar:
@@ -113,88 +121,3 @@ def rate_bar(label: str, found: Rate) -> Bar:
     if not is_telling(found):
         return Bar(label, None, None, None, words)
     return Bar(label, found.per_robot_day, found.low, found.high, words)
-
-
-def rates(found: list[Bar], remark: str) -> Markup:
-    """Failure rates side by side."""
-    return Markup(
-        '<h2>Failures per robot-day</h2>{}<p class="quiet">A robot-day is 16 hours of driving. The thin line is the 95 % interval of '
-        "the true rate; periods with little driving have no bar. {}</p>"
-    ).format(bar_chart.bars(found, "Failures per robot-day"), remark)
-
-
-def got_worse(trends: Sequence[AreaTrend], area_address: Callable[[str], str], *, has_areas: bool) -> Markup:
-    """Areas of the last 7 days beside the 7 days before. has_areas: they have names, else they are tiles."""
-    head = (
-        "Area" if has_areas else "Tile", "Against the week before", "How often robots fail there now",
-        "Failures per robot-day, 7 days", "7 days before", "Localised while driving", "7 days before",
-    )  # fmt: skip
-    rows = [
-        (
-            trend.name if trend.name == OUTSIDE else link(area_address(trend.name), trend.name),
-            badge(_TREND_TONES[trend.verdict], trend.verdict),
-            trend.times_words,
-            _counted(trend.now),
-            _counted(trend.before),
-            share(trend.localised_now),
-            share(trend.localised_before),
-        )
-        for trend in trends[:_TRENDS_SHOWN]
-    ]
-    listed = table(head, rows, empty="Nothing was driven in these two weeks.", name="What got worse this week")
-    more = f" {len(trends) - _TRENDS_SHOWN} more are not shown." if len(trends) > _TRENDS_SHOWN else ""
-    named = "" if has_areas else " No area is named here; `mapserver areas import FILE` names them."
-    remark = (
-        "The last 7 days beside the 7 before. Worse and better are beyond chance: the intervals of how often hold all true values "
-        f"together with 95 %.{named}{more}"
-    )
-    answer = f"{trend_sentence(list(trends))}." if trends else ""
-    return Markup('<h2 id="worse">What got worse this week</h2><p>{}</p>{}<p class="quiet">{}</p>').format(
-        answer, listed, remark
-    )
-
-
-def _counted(found: Rate) -> str:
-    return f"{format_rate(found)}: {found.events} in {driven_words(found.robot_days)}"
-
-
-def resurvey(concerns: Sequence[TileConcern], tile_address: Callable[[str], str] | None = None) -> Markup:
-    """Tiles to survey again, with links to their failures where the page has any."""
-    if not concerns:
-        return Markup("<h2>Survey again</h2><p>{} No tile stands out.</p>").format(badge("good", "nothing"))
-    rows = [
-        (
-            concern.name if tile_address is None else link(tile_address(concern.tile), concern.name),
-            "; ".join(concern.reasons),
-            format_rate(concern.failures),
-            format_rate(concern.failures_before),
-        )
-        for concern in concerns
-    ]
-    head = ("Tile", "Why", "Recent failures per robot-day", "Before")
-    return Markup("<h2>Survey again</h2>{}").format(table(head, rows, empty="", name="Tiles to survey again"))
-
-
-def calibrations(robots: Sequence[tuple[str, Sequence[CalibrationFigure]]]) -> Markup:
-    """What the map shows of the robots' cameras, those that drift first; nothing where no robot reports it."""
-    if not robots:
-        return Markup("")
-    shown = [name for name in PARAMETERS if any(one.name == name for _, found in robots for one in found)]
-    rows = []
-    for robot, found in sorted(robots, key=lambda item: (not any(one.is_drifted for one in item[1]), item[0])):
-        by_name = {one.name: one for one in found}
-        drifted = any(one.is_drifted for one in found)
-        state = badge("bad", "drifts") if drifted else badge("good", "agrees")
-        rows.append((robot, state, *(_calibration_cell(by_name.get(name)) for name in shown)))
-    head = ("Robot", "Calibration", *(PARAMETERS[name] for name in shown))
-    return Markup(
-        "<h2>Cameras against the map</h2>{}"
-        '<p class="quiet">What the map shows minus what a robot\'s calibration says, with its standard deviation. A robot whose camera '
-        "drifts says DEGRADED: look at its mounting and calibrate it again.</p>"
-    ).format(table(head, rows, empty="", name="Calibration of the robots' cameras"))
-
-
-def _calibration_cell(found: CalibrationFigure | None) -> Markup | str:
-    if found is None:
-        return "–"
-    return badge("bad", found.words) if found.is_drifted else found.words

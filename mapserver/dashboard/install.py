@@ -12,7 +12,7 @@ from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
-from mapserver.dashboard import overview
+from mapserver.dashboard import failure, failures, overview
 from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
@@ -20,8 +20,6 @@ from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.pages import (
-    failure_page,
-    failures_page,
     live_page,
     map_page,
     robot_page,
@@ -47,12 +45,13 @@ def install_dashboard(
         surveys,
         RobotPlacing(store, fleet, bus),
     )
-    for page in (robot_page, map_page, space_page, failures_page, failure_page, survey_page, live_page):
+    for page in (robot_page, map_page, space_page, survey_page, live_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
     console = Console(pages, services)
     console.files()
-    overview.install(console)
+    for module in (overview, failures, failure):
+        module.install(console)
     _install_pictures(services, store)
 
     @app.get("/", include_in_schema=False)

@@ -20,7 +20,7 @@ from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
-from mapserver.dashboard.markup import address, joined, link, time_fields
+from mapserver.dashboard.markup import address, age, joined, link, time_fields
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.serving.robot_placing import RobotPlacing
@@ -74,6 +74,11 @@ class PageContext:
         """A stamp of the server's clock by the clock of whoever looks."""
         return moment_text(stamp_ns, self.zone)
 
+    def when(self, stamp_ns: int) -> Markup:
+        """How long ago a stamp of the server's clock is, and where the pointer is the moment."""
+        words = f"{age(max(0.0, time.time() - stamp_ns / 1e9))} ago"
+        return Markup('<time title="{}">{}</time>').format(self.moment(stamp_ns), words)
+
     def written_moment(self, text: str | None) -> str | None:
         """The same of ISO 8601 text."""
         return self.moment(read_moment(text, "time", UTC))
@@ -86,12 +91,10 @@ class PageContext:
         """Fields to choose that range by."""
         return time_fields(*("" if ns is None else self.written(ns) for ns in self.time_range()))
 
-    def range_form(
-        self, path: str, *, usual: str, chosen: Mapping[str, object] | None = None, fields: Markup | None = None
-    ) -> Markup:
+    def range_form(self, path: str, *, usual: str, chosen: Mapping[str, object] | None = None) -> Markup:
         """A form that shows a page for a range of time, and presets of one click that keep what is chosen beside it.
 
-        usual: names what is shown without a range. chosen: other query parameters; fields: where those are chosen in the same form.
+        usual: names what is shown without a range. chosen: other query parameters.
         """
         kept, now_ns = dict(chosen or {}), time.time_ns()
         day = self.written(now_ns)[:10]
@@ -101,18 +104,15 @@ class PageContext:
             ("Last 7 days", self.written(now_ns - _WEEK_NS)),
         )
         presets = [link(self.to(path, **kept | {"since": since}), words) for words, since in spans]
-        hidden = {"site": self.site} | (
-            {name: value for name, value in kept.items() if value} if fields is None else {}
-        )
+        hidden = {"site": self.site} | {name: value for name, value in kept.items() if value}
         return Markup(
-            '<form class="ask" method="get" action="{}">{}{}{}<button type="submit">Show</button>'
+            '<form class="ask" method="get" action="{}">{}{}<button type="submit">Show</button>'
             '<span class="presets">{}</span></form>'
         ).format(
             f"{self.root}/{path}",
             joined(Markup('<input type="hidden" name="{}" value="{}">').format(*pair) for pair in hidden.items()),
-            fields or "",
             self.range_fields(),
-            joined([*presets, link(self.to(path, **kept if fields is None else {}), usual)], " "),
+            joined([*presets, link(self.to(path, **kept), usual)], " "),
         )
 
     def written(self, stamp_ns: int) -> str:

@@ -5,20 +5,19 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 import time
 
 from mapserver.dashboard import fleet_parts
-from mapserver.dashboard.bar_chart import Bar
-from mapserver.dashboard.console import Console
+from mapserver.dashboard.console import Console, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
-from mapserver.dashboard.fleet_parts import Figure
+from mapserver.dashboard.fleet_parts import Bars, Figure
 from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot, LiveSite
-from mapserver.dashboard.map_layers import Layer, Mark, box_around, box_of, ground, heat
+from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.markup import age, share
 from mapserver.dashboard.pages.robot_page import where_words
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telling
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
-from mapserver.floor_plan.areas import Areas
+from mapserver.floor_plan.areas import OUTSIDE, Areas
 
 _SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
@@ -41,16 +40,13 @@ def _scene(services: Services, context: PageContext) -> dict[str, object] | None
     site, version = context.site, services.maps.current_version(context.site)
     if version is None:
         return None
-    plan, live = services.maps.plan(site, version), services.robots.look(site)
-    box, below = box_of(plan), services.maps.underlays(site, version, context.root)
+    live, box = services.robots.look(site), box_of(services.maps.plan(site, version))
     layers = [
-        *ground(plan, context.plan_picture(version), services.maps.areas(site), below),
         Layer("Failures", heat(services.health.places(site), box), shown=False),
         Layer("Robots", _marks(context, live)),
     ]
     places = [robot.place_m for robot in live.robots if robot.place_m is not None]
-    seen = box_around(places, box) if len(places) > _MANY else box
-    return {"label": f"Map of {site}, version {version}", "box": seen, "layers": layers, "follows": False}
+    return scene_of(services, context, version, layers, places_m=places if len(places) > _MANY else ())
 
 
 def _now(services: Services, context: PageContext) -> dict[str, object]:
@@ -177,27 +173,30 @@ def _trends(services: Services, context: PageContext) -> dict[str, object]:
         fleet_parts.rate_figure("Silent failures per robot-day, an estimate", day.silent_estimated, ""),
         Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
     ]
-    axis, since = ("area" if health.has_areas else "tile"), context.written(health.week_since_ns)
-    calibrations = [(robot.name, robot.calibration) for robot in live.robots if robot.calibration]
+    cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
     return {
+        "context": context,
         "range": context.range_form("trends", usual="Last 24 h"),
-        "trials": fleet_parts.trial_notices(health.trials, context.moment),
-        "figures": fleet_parts.figures(figures),
-        "worse": fleet_parts.got_worse(
-            health.areas,
-            lambda name: context.to("failures", **{axis: name, "since": since}),
-            has_areas=health.has_areas,
-        ),
-        "rates": fleet_parts.rates(_bars(health.days), _last_day(health)),
-        "calibrations": fleet_parts.calibrations(calibrations),
-        "resurvey": fleet_parts.resurvey(health.resurvey, lambda tile: context.to("failures", tile=tile)),
+        "tried": fleet_parts.trials_shown(health.trials, context.moment),
+        "kpis": figures,
+        "areas": health.areas,
+        "worse": trend_sentence(list(health.areas)) if health.areas else "",
+        "has_areas": health.has_areas,
+        "outside": OUTSIDE,
+        "since": context.written(health.week_since_ns),
+        "days": _bars(health.days),
+        "last_day": _last_day(health),
+        "cameras": cameras,
+        "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
+        "concerns": health.resurvey,
     }
 
 
-def _bars(days: tuple[Rate, ...]) -> list[Bar]:
+def _bars(days: tuple[Rate, ...]) -> Bars:
     """Failures per robot-day of the last days."""
     last = len(days) - 1
-    return [fleet_parts.rate_bar("24 h" if n == last else f"-{last - n} d", day) for n, day in enumerate(days)]
+    names = ["24 h" if n == last else f"-{last - n} d" for n in range(len(days))]
+    return Bars("Failures per robot-day", [fleet_parts.rate_bar(*day) for day in zip(names, days, strict=True)])
 
 
 def _last_day(health: SiteHealth) -> str:

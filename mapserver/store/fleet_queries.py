@@ -168,6 +168,13 @@ class FleetQueries:
             raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
         return bytes(rows[0]["jpeg"])
 
+    def first_pictures(self, numbers: Iterable[int]) -> dict[int, int]:
+        """The place of the first picture of a camera of each failure that has one."""
+        wanted = to_json(list(numbers)).decode()
+        query = """SELECT number, min(place) place FROM failure_pictures WHERE kind != 'matches'
+                   AND number IN (SELECT value FROM json_each(?)) GROUP BY number"""
+        return {row["number"]: row["place"] for row in self._transactions.query(query, (wanted,))}
+
     def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
         """The number of a robot's report, None where it is not kept."""
         query = "SELECT number FROM failures WHERE site = ? AND robot = ? AND failure_id = ?"

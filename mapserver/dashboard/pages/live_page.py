@@ -7,11 +7,11 @@ from nicegui import ui
 
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M
-from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Figure
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, notice, show
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.markup import badge, facts, joined, link, table
+from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurvey
 
@@ -104,19 +104,21 @@ def _figures(survey: LiveSurvey) -> Markup:
     answered = "as fast as it goes" if state.latency_ms is None else f"{state.latency_ms:.0f} ms"
     late = f"{state.late_frames} of {state.frames} frames later than the next one"
     covered = state.covered()
-    return fleet_parts.figures(
-        [
-            Figure("Recorded", f"{state.seconds:.0f} s", f"{state.frames} frames, {way_m:.0f} m"),
-            Figure("Frames answered within", answered, late),
-            Figure("Keyframes", str(state.keyframes), f"{state.behind} wait to be mapped"),
-            _where(survey),
-            Figure(
-                "Covered",
-                f"{len(covered) * COVERAGE_CELL_M**2:.0f} m²",
-                f"squares of {COVERAGE_CELL_M:g} m with landmarks",
-            ),
-            Figure("Revisits", str(state.loops), f"{sum(state.refused.values())} candidates refused"),
-        ]
+    return Markup(
+        TEMPLATES.get_template("fleet_parts.html").module.figures(  # type: ignore[attr-defined]
+            [
+                Figure("Recorded", f"{state.seconds:.0f} s", f"{state.frames} frames, {way_m:.0f} m"),
+                Figure("Frames answered within", answered, late),
+                Figure("Keyframes", str(state.keyframes), f"{state.behind} wait to be mapped"),
+                _where(survey),
+                Figure(
+                    "Covered",
+                    f"{len(covered) * COVERAGE_CELL_M**2:.0f} m²",
+                    f"squares of {COVERAGE_CELL_M:g} m with landmarks",
+                ),
+                Figure("Revisits", str(state.loops), f"{sum(state.refused.values())} candidates refused"),
+            ]
+        )
     )
 
 

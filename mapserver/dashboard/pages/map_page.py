@@ -9,12 +9,12 @@ from nicegui import ui
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from mapserver.dashboard.data import EVER, SiteHistory, VersionQuality
+from mapserver.dashboard.failures import failure_heat
 from mapserver.dashboard.layout import RESPONSE_TIMEOUT_S, PageContext, Services, html, load, number, show, version_map
 from mapserver.dashboard.map_layers import Layer, box_of, coverage, squares
 from mapserver.dashboard.markup import badge, choices, facts, joined, link, share, size, table
 from mapserver.dashboard.pages import survey_requests
 from mapserver.dashboard.pages.confirm import change_button
-from mapserver.dashboard.pages.failures_page import failure_heat
 from mapserver.dashboard.plan import Plan
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
@@ -181,7 +181,7 @@ async def _one_version(services: Services, context: PageContext, version: int) -
             requests = await load(maps.survey_requests, context.site)
             html(Markup('<p class="quiet">Time of the failures on this map (a layer) and of the history below:</p>'))
             html(context.range_form("map", usual="Last 14 days", chosen={"version": context.query.get("version")}))
-            failed = await failure_heat(services, context, box_of(plan))
+            failed = await load(failure_heat, services, context, box_of(plan))
             over = [Layer("Tiles", coverage(plan)), failed, *survey_requests.layers(requests)]
             drawn = await version_map(services, context, version, over)
             html(

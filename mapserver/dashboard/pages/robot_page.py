@@ -7,6 +7,7 @@ from markupsafe import Markup
 from nicegui import ui
 
 from fleetmap.errors import UsageError
+from mapserver.dashboard.failures import failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.layout import (
     RESPONSE_TIMEOUT_S,
@@ -22,7 +23,6 @@ from mapserver.dashboard.layout import (
 from mapserver.dashboard.live import STATUSES, LiveRobot
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.dashboard.markup import age, badge, facts, joined, link, table
-from mapserver.dashboard.pages.failures_page import failure_marks, failure_table
 from mapserver.dashboard.pages.placing import CHOSEN, place_form
 from mapserver.dashboard.robot_history import SILENT, Stretch, stretches
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
@@ -188,8 +188,27 @@ def _failures(context: PageContext, found: list[FailureRow], before: list[Failur
         else "No failures in this time, and none before it."
     )
     told = Markup('<p class="quiet">{}</p>').format(none) if not found else ""
-    listed = failure_table(context, (found or before)[:FAILURES_SHOWN], "")
+    listed = _failure_table(context, (found or before)[:FAILURES_SHOWN])
     return Markup("<h2>Failures</h2>{}{}").format(told, listed if found or before else "")
+
+
+def _failure_table(context: PageContext, shown: list[FailureRow]) -> Markup:
+    """Failures as a table."""
+    rows = [
+        (
+            link(context.to(f"failures/{row.number}"), f"Failure {row.number}"),
+            context.moment(row.happened_ns),
+            link(context.to(f"robots/{row.robot}"), row.robot),
+            row.cause.replace("_", " "),
+            badge(tone_of(row), row.kind.replace("_", " ")),
+            row.version,
+            row.where,
+            f"{row.duration_s:.0f} s",
+        )
+        for row in shown
+    ]
+    head = ("Failure", "When", "Robot", "Cause", "Kind", "Map version", "Where", "Duration")
+    return table(head, rows, empty="", name="Failures")
 
 
 def _last_pictures(context: PageContext, found: FailureDetail) -> Markup:

@@ -14,10 +14,10 @@ from playwright.sync_api import Page, expect
 from fleetmap.failure_summary import Moment
 from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, FailureReport, Placement
-from mapserver.dashboard.failure import story
+from mapserver.dashboard import failure_story as story
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
-from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving
+from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving, wait_until
 from support.fleet.failed_robot import send_replay, small_file
 from support.pages.browser import Chromium
 from support.pages.whole_page import assert_whole
@@ -98,15 +98,9 @@ def test_moments_and_pictures_of_another_time_are_left_out() -> None:
     far = PictureRow(9, "replay", 1 << 61, 10)
     near = [PictureRow(n, "replay", BEGAN_NS + k * 10**8, 10) for n, k in enumerate((-50, -9, -2, 4, 19, 23))]
     assert story.pictures_near([far, *near[::-1]], BEGAN_NS) == near
-
-    def chosen(found_ns: int | None, of: list[PictureRow]) -> list[tuple[str, int]]:
-        return [(title, each.place) for title, each in story.before_at_after(of, BEGAN_NS, found_ns)]
-
-    assert chosen(BEGAN_NS + 19 * 10**8, near) == [("Before", 0), ("As it began", 2), ("Found again", 4)]
-    assert chosen(None, near) == [("Before", 0), ("As it began", 2), ("After", 5)]
-    assert chosen(BEGAN_NS + 40 * 10**8, near)[-1] == ("After", 5)
-    assert chosen(None, near[2:3]) == [("As it began", 2)]
-    assert chosen(None, []) == []
+    assert story.steps(CARRIED, BEGAN_NS) == {"A second before": 40, "As it began": 50, "Found again": 69}
+    assert list(story.steps(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
+    assert story.steps((), BEGAN_NS) == {}
 
 
 def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
@@ -160,35 +154,29 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 def test_the_seconds_are_stepped_through(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/3")
-    expect(page.locator(".notice.bad")).to_contain_text(
-        re.compile(
-            r"^tug-3 failed at .* in tile 1,0: carried 5.0 m, by its own fixes, between .*, found again after 1.9 s\.$"
-        )
+    answer = page.get_by_role("status")
+    expect(answer).to_have_text(
+        re.compile(r"^tug-3 failed .* ago in tile 1,0: carried 5.0 m, by its own fixes, between .*again after 1.9 s\.$")
     )
-    expect(page.locator(".pictures.row figcaption")).to_have_text(
-        [
-            re.compile("^Before: 1.0 s before"),
-            re.compile("^As it began: 0.0 s after"),
-            re.compile("^Found again: 2.0 s after"),
-        ]
-    )
-    player = page.locator(".player")
-    expect(player.locator("p").first).to_have_text(
-        re.compile(r"^lost, odometry lost at \d\d:\d\d:\d\d\.\d, 0.0 s after")
-    )
-    slider = page.get_by_role("slider", name="Moment")
-    first = player.locator("img").get_attribute("src")
+    expect(answer.locator("time")).to_have_attribute("title", re.compile(r"^\d{4}-\d\d-\d\d "))
+    steps = page.locator("[data-at]")
+    expect(steps).to_have_text(["A second before", "As it began", "Found again"])
+    said, slider, seen_image = page.locator(".now"), page.get_by_role("slider", name="Moment"), page.locator("#seen")
+    expect(said).to_have_text(re.compile(r"^lost, odometry lost at \d\d:\d\d:\d\d\.\d, 0.0 s after .*no position$"))
+    first = seen_image.get_attribute("src")
     slider.press("ArrowLeft")
-    expect(player.locator("p").first).to_have_text(re.compile("^localised at .*, 0.1 s before"))
-    at = "document.querySelector('.site-map').marks().find(mark => mark.words.endsWith(': localised'))?.x"
-    page.wait_for_function(f"Math.abs({at} - 19.95) < 1e-6")
+    expect(said).to_have_text(
+        re.compile(r"^localised at .*, 0.1 s before .*at 19.95, 6.00 m, within 0.05 m with 95 %$")
+    )
+    at = "x => document.querySelector('.site-map').marks().some(m => m.words.endsWith(': localised') && Math.abs(m.x - x) < 1e-6)"
+    wait_until(page, at, 19.95)
     slider.press("End")
     expect(slider).to_have_attribute("aria-valuetext", re.compile("4.9 s after the beginning: localised$"))
-    page.wait_for_function(f"Math.abs({at} - 26.5) < 1e-6")
-    assert player.locator("img").get_attribute("src") != first
-    page.wait_for_function(
-        "[...document.querySelectorAll('.player img')].every(i => i.complete && i.naturalWidth === 320)"
-    )
+    wait_until(page, at, 26.5)
+    expect(seen_image).not_to_have_attribute("src", first)
+    wait_until(page, "document.getElementById('seen').naturalWidth === 320")
+    steps.first.click()
+    expect(said).to_contain_text("1.0 s before the beginning")
     assert page.locator("path.line.good").count() == 2
     assert_whole(page)
     with page.expect_download() as download:
@@ -200,31 +188,36 @@ def test_the_seconds_are_stepped_through(page: Page, served: Served) -> None:
 
 def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/1")
-    expect(page.locator(".pictures.row img")).to_have_count(1)
-    expect(page.locator(".nicegui-content")).to_contain_text("no recording of the seconds around it")
-    assert page.locator(".player").count() == 0
+    expect(page.locator("#seen")).to_be_visible()
+    expect(page.locator("main")).to_contain_text("no recording of the seconds around it")
+    expect(page.locator("main")).to_contain_text("No expected view: the report does not tell the robot's camera")
+    assert page.get_by_role("slider", name="Moment").count() == 0
     assert any(mark["shape"] == "cross" for mark in marks(page))
     assert seen.faults == []
 
 
+def test_one_or_many(page: Page, served: Served) -> None:
+    opened(page, served, "failures/3")
+    expect(page.locator("main")).to_contain_text(
+        "3 others began within 5 m of it, 1 with this cause, of 3 other robots; tug-3 never failed elsewhere."
+    )
+    near = page.get_by_role("list", name="Failures").get_by_role("listitem")
+    expect(near.first).to_contain_text("Failure 4")
+    expect(near).to_have_count(3)
+
+
 def test_the_expected_view_stands_beside_the_picture(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/5")
-    pair = page.locator(".pictures:not(.row)").first.locator("img")
-    expect(pair).to_have_count(2)
-    pair.nth(1).scroll_into_view_if_needed()
-    page.wait_for_function("document.querySelector('img[src*=expected]').naturalWidth === 320", timeout=90_000)
+    expect(page.locator(".views img")).to_have_count(2)
+    wait_until(page, "document.querySelector('img[src*=expected]').naturalWidth === 320", within_s=90)
     assert_whole(page)
     assert seen.faults == []
-    opened(page, served, "failures/1")
-    expect(page.locator(".nicegui-content")).to_contain_text(
-        "No expected view: the report does not tell the robot's camera"
-    )
 
 
 def test_a_recording_made_to_harm_is_shown_as_words(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/4")
     page.get_by_role("slider", name="Moment").press("Home")
-    expect(page.locator(".player strong")).to_have_text("localised, <b>y</b>")
-    assert page.locator(".player b").count() == 0
+    expect(page.locator("#now")).to_have_text("localised, <b>y</b>")
+    assert page.locator("#now b").count() == 0
     assert all(abs(mark["x"]) < 100 for mark in marks(page))
     assert seen.faults == []

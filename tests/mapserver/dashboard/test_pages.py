@@ -7,7 +7,7 @@ from zoneinfo import ZoneInfo
 
 import httpx
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from fleetmap.bus import Bus
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
@@ -119,46 +119,50 @@ def test_names_do_not_overlap(page: Page, served: Served) -> None:
         assert not overlapping(named)
 
 
+def listed(page: Page) -> Locator:
+    return page.get_by_role("list", name="Failures").get_by_role("listitem")
+
+
 def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures")
-    page.get_by_label("Cause").select_option("dark")
-    page.get_by_role("button", name="Show").click()
+    page.get_by_role("list", name="Cause").get_by_role("link", name="dark").click()
     expect(page).to_have_url(re.compile("cause=dark"))
-    expect(page.locator("tbody tr")).to_have_count(1)
+    expect(listed(page)).to_have_count(1)
+    page.get_by_role("list", name="Cause").get_by_role("link", name="dark").click()
+    expect(listed(page)).to_have_count(2)
+    page.get_by_role("group", name="Failures over time").get_by_role("link").first.click()
+    expect(page).to_have_url(re.compile("since=.*until="))
+    expect(listed(page)).to_have_count(2)
     page.get_by_role("link", name="Failure 1", exact=True).click()
     expect(page.locator("h1")).to_have_text("Failure 1 of tug-7")
     for words in ("dark", "tug-7", "1,0", "0.4 m", "too few matches"):
-        expect(page.locator(".nicegui-content")).to_contain_text(words)
-    pictures = page.locator(".pictures img")
-    expect(pictures).to_have_count(2)
-    expect(pictures.nth(1)).to_have_attribute("alt", re.compile("^The image, and the landmarks"))
-    expect(page.locator(".notice.bad")).to_contain_text(
-        re.compile(r"^tug-7 failed at .* in tile 1,0: dark, lost for 3.5 s")
+        expect(page.locator("main")).to_contain_text(words)
+    expect(page.get_by_role("status")).to_have_text(re.compile(r"^tug-7 failed .* in tile 1,0: dark, lost for 3.5 s"))
+    page.get_by_alt_text("The image, and the landmarks").scroll_into_view_if_needed()
+    wait_until(
+        page, "[...document.querySelectorAll('main figure img')].every(i => i.complete && i.naturalWidth === 160)"
     )
-    pictures.nth(1).scroll_into_view_if_needed()
-    page.wait_for_function(
-        "[...document.querySelectorAll('.pictures img')].every(i => i.complete && i.naturalWidth === 160)"
-    )
+    assert page.locator("main figure img").count() == 2
     assert seen.faults == []
 
 
 def test_what_robots_say_is_shown_as_words_and_never_runs(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures")
-    expect(page.locator("tbody")).to_contain_text("<b>bold</b>")
-    assert page.locator("tbody b").count() == 0
-    expect(page.locator("tbody")).to_contain_text("suspected")
+    expect(page.get_by_role("list", name="Cause")).to_contain_text("<b>bold</b>")
+    expect(listed(page).filter(has_text="suspected")).to_contain_text("<b>bold</b>")
+    assert page.locator("main b").count() == 0
     assert seen.faults == []
 
 
 def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures", robot="tug-12")
-    expect(page.locator(".nicegui-content")).to_contain_text("No failure")
+    expect(page.get_by_role("status")).to_have_text("No failures match.")
     with Bus.connect(served.zenoh) as bus:
         answer = bus.get(
             robot_key(SITE, "tug-12", "failures"), encode_message(failure("tug-12", "live", cause="glare"))
         )
         assert not decode_message(answer, FailureAck).refused
-    expect(page.locator("tbody")).to_contain_text("glare", timeout=8000)
+    expect(listed(page)).to_contain_text("glare")
     assert [mark["tone"] for mark in marks(page)] == ["bad"]
     assert seen.faults == []
 
@@ -208,7 +212,7 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("failures/77", "no failure 77"),
         ("surveys?job=99", "no job 99"),
         ("robots/nobody", "never heard of a robot"),
-        ("failures?sinc=2026-01-01", "this page knows site, robot"),
+        ("failures?sinc=2026-01-01", "this page knows site, cause"),
         ("failures?since=soon", "is no time; write"),
         ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
         ("surveys?since=soon", "is no time; write"),

@@ -21,7 +21,7 @@ from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver import releases
-from mapserver.dashboard import bar_chart, fleet_parts, map_layers
+from mapserver.dashboard import fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.layout import PageContext
@@ -54,7 +54,6 @@ EVIL = "<script>alert(1)</script>\"'&"
         facts([(EVIL, EVIL)]),
         link(address("x", site=EVIL), EVIL),
         choices(EVIL, EVIL, [EVIL], EVIL),
-        bar_chart.bars([bar_chart.Bar(EVIL, 1.0, 0.5, 2.0, EVIL)], EVIL),
     ],
 )
 def test_words_from_elsewhere_never_become_markup(made: Markup) -> None:
@@ -323,9 +322,7 @@ def test_health_of_a_site(store: MapStore) -> None:
     assert (found.day.failures.events, found.day.silent_estimated.events) == (1, 1)
     assert len(found.days) == 14
     assert found.days[-1].events == 1
-    known = health.choices(SITE)
-    assert (known.robots, known.versions, known.tiles) == (["tug-7", "tug-9"], ["2"], ["1,0"])
-    assert "dark" in known.causes
+    assert health.first_pictures([1, 2, 99]) == {1: 0, 2: 0}
     assert health.site(SITE) is found
     now_ns = time.time_ns()
     assert health.span(SITE, None, None).failures.events == 1
@@ -337,14 +334,12 @@ def test_health_of_a_site(store: MapStore) -> None:
 
 def test_presets_of_time_keep_what_else_is_chosen() -> None:
     context = PageContext("/dashboard", "failures", SITE, UTC, {"since": "2026-01-02", "area": "aisle 2"})
-    form = context.range_form(
-        "failures", usual="Show all", chosen={"area": "aisle 2", "robot": None}, fields=Markup("")
-    )
+    form = context.range_form("failures", usual="All", chosen={"area": "aisle 2", "robot": None})
     named = dict(re.findall(r'<a href="/dashboard/failures[?]([^"]*)">([^<]*)</a>', form))
     now = datetime.now(UTC)
-    assert list(named.values()) == ["Last hour", "Today", "Last 7 days", "Show all"]
+    assert list(named.values()) == ["Last hour", "Today", "Last 7 days", "All"]
     asked = [dict(parse_qsl(unescape(query))) for query in named]
-    assert [each.get("area") for each in asked] == ["aisle 2"] * 3 + [None]
+    assert [each.get("area") for each in asked] == ["aisle 2"] * 4
     ages_h = [
         (now - datetime.fromisoformat(each["since"]).replace(tzinfo=UTC)).total_seconds() / 3600 for each in asked[:3]
     ]
@@ -369,14 +364,13 @@ def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
 def test_both_rates_of_a_trial_are_drawn_once_they_tell_something(store: MapStore) -> None:
     canary = releases.start_canary(store, SITE, 3, 0.5)
 
-    def shown(tried: tuple[int, float], others: tuple[int, float]) -> Markup:
+    def shown(tried: tuple[int, float], others: tuple[int, float]) -> fleet_parts.Bars | None:
         trial = fleet_parts.Trial(canary, "it is early", rate(*tried), rate(*others))
-        return fleet_parts.trial_notices([trial], str)
+        ((*_, sides),) = fleet_parts.trials_shown([trial], str)
+        return sides
 
-    assert "<svg" not in shown((0, 0.001), (0, 0.001))
-    drawn = shown((12, 4.0), (30, 20.0))
-    assert drawn.count('class="bar"') == 2
-    assert "version 3" in drawn
-    assert "others, version 2" in drawn
-    assert "12 in " in drawn
-    assert "30 in " in drawn
+    assert shown((0, 0.001), (0, 0.001)) is None
+    sides = shown((12, 4.0), (30, 20.0))
+    assert [bar.label for bar in sides.bars] == ["version 3", "others, version 2"]
+    assert [bar.words[:6] for bar in sides.bars] == ["12 in ", "30 in "]
+    assert sides.top == 10.0

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver import releases
 from mapserver.cli import app
-from mapserver.dashboard.pages.shift_page import html_page
+from mapserver.dashboard.shift_page import html_page
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.shift_summary import summarise
 from mapserver.fleet_statistics.kpis import driven_words

@@ -18,7 +18,6 @@ from mapserver.dashboard.map_layers import Line
 from mapserver.store import FailureDetail, PictureRow
 
 _NEAR_NS = 60_000_000_000
-_BEFORE_NS, _AFTER_NS = 1_000_000_000, 2_000_000_000  # of the pictures, where the robot did not find itself again
 _JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot drives so
 _FARTHEST_M = 1e5
 
@@ -130,25 +129,23 @@ def status_words(status: str) -> str:
     return STATUSES.get(status, (status.lower(), ""))[0]
 
 
-def before_at_after(
-    pictures: Sequence[PictureRow], began_ns: int, found_ns: int | None
-) -> list[tuple[str, PictureRow]]:
-    """The pictures a second before the beginning, nearest to it, and where the robot was found again or two seconds later, with titles."""
-    if not pictures:
-        return []
-    at = min(pictures, key=lambda each: abs(each.stamp_ns - began_ns))
-    before = [each for each in pictures if each.stamp_ns <= min(began_ns - _BEFORE_NS, at.stamp_ns - 1)]
-    wanted_ns = began_ns + _AFTER_NS if found_ns is None else found_ns
-    later = [each for each in pictures if each.stamp_ns > at.stamp_ns]
-    after = [each for each in later if each.stamp_ns >= wanted_ns] or later[-1:]
-    is_found = bool(after) and found_ns is not None and after[0].stamp_ns >= found_ns
-    title = "Found again" if is_found else "After"
-    return [*(("Before", each) for each in before[-1:]), ("As it began", at), *((title, each) for each in after[:1])]
+def steps(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
+    """Moments to look at first, by number: a second before the beginning, at it, and where the robot was found again."""
+    if not moments:
+        return {}
+    blind = blind_time(moments, began_ns)
+    found_ns = None if blind is None else blind.found_ns
+    wanted = {"A second before": began_ns - 10**9, "As it began": began_ns, "Found again": found_ns}
+    return {
+        name: min(range(len(moments)), key=lambda n: abs(moments[n].stamp_ns - stamp_ns))
+        for name, stamp_ns in wanted.items()
+        if stamp_ns is not None
+    }
 
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """A moment as the player shows it. x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none."""
+    """A moment as its page shows it. x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none."""
 
     clock: str
     since: str
@@ -158,6 +155,7 @@ class Instant:
     y: float | None
     heading_rad: float | None
     picture: int
+    belief: str
 
 
 def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[Instant]:
@@ -169,9 +167,10 @@ def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: F
         words = ", ".join(filter(None, (status_words(each.status), each.cause.replace("_", " "))))
         x, y = _place(each) or (None, None)
         tone = STATUSES.get(each.status, ("", "warn"))[1]
-        found.append(
-            Instant(clock.at(each.stamp_ns), clock.since(each.stamp_ns), words, tone, x, y, each.heading_rad, picture)
-        )
+        belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
+        belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
+        times = clock.at(each.stamp_ns), clock.since(each.stamp_ns)
+        found.append(Instant(*times, words, tone, x, y, each.heading_rad, picture, belief))
     return found
 
 

@@ -1,0 +1,218 @@
+"""The list of failures: what fails, and is it one or many? Causes over time, counts by cause, place, version and robot, cards."""
+
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+from fleetmap.messages import Cause, FailureKind
+from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.data import EVER
+from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
+from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.map_layers import Box, Layer, Mark, box_of, heat
+from mapserver.store import FailureFilter, FailureRow
+
+_AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
+_SHADES = 6  # of causes; the last is that of all others
+_HOUR_NS = 3_600_000_000_000
+_STEPS_NS = {
+    _HOUR_NS // 12: "5 minutes",
+    _HOUR_NS: "an hour",
+    6 * _HOUR_NS: "6 hours",
+    24 * _HOUR_NS: "a day",
+    168 * _HOUR_NS: "a week",
+    28 * 24 * _HOUR_NS: "4 weeks",
+    364 * 24 * _HOUR_NS: "52 weeks",
+}
+_BARS = 42
+Chosen = Mapping[str, str]
+"""Values by axis; none of those that everything may have."""
+
+
+class Choice(NamedTuple):
+    """A value, how many failures choosing it shows, and the address that does so; of a chosen one, that which takes the choice back."""
+
+    value: str
+    failures: int
+    to: str
+
+
+class Facet(NamedTuple):
+    """An axis by which failures are chosen."""
+
+    axis: str
+    title: str
+    chosen: str | None
+    choices: list[Choice]
+
+
+ADVICE: dict[str, str] = {
+    Cause.CARRIED: "The robot was carried: what it sees ended between two images, and its fixes agree on another place.",
+    Cause.ALIASED: "Several places of the map look like what the robot sees. Something that differs, a dock or a coarse position tells "
+    "them apart.",
+    Cause.MAP_CHANGED: "Images and odometry are sound, but far fewer landmarks are there than the map holds: survey this place again.",
+    Cause.CALIBRATION: "The cameras do not agree with the map any more: check their mounting, then calibrate the robot.",
+    Cause.DARK: "The images are dark: check the light and the lenses.",
+    Cause.NO_MATCH: "Nothing in the map agrees: not mapped, or mapped in the other direction only.",
+}
+"""What a cause means and what to do, where there is more to say than its name."""
+
+
+def install(console: Console) -> None:
+    """Adds the page."""
+    knows = (*_AXES, "since", "until", "before")
+    console.page("failures", "failures.html", lambda context: _page(console.services, context), knows=knows)
+
+
+def _page(services: Services, context: PageContext) -> dict[str, object]:
+    kept = {name: value for name, value in context.query.items() if name not in {"site", "before"}}
+    version = number(kept.get("version"), "version")
+    chosen = {axis: kept[axis] for axis in _AXES if kept.get(axis)}
+    if version is not None:
+        chosen["version"] = str(version)  # 07 is 7
+    since_ns, until_ns = context.time_range()
+    in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
+    named = {axis: value for axis, value in chosen.items() if axis != "version"}
+    wanted = replace(in_time, version=version, **named)  # type: ignore[arg-type]  # texts, all of them
+    found = services.health.failures(wanted, number(context.query.get("before"), "failure"))
+    shown = found[:FAILURES_SHOWN]
+    rows = services.health.failures(in_time, None, MANY_FAILURES)
+    matching = [row for row in rows if _fits(row, chosen)]
+    facets = _facets(context, rows, chosen, kept, services.maps.areas(context.site).names)
+    causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
+    shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
+    return {
+        "context": context,
+        "answer": _answer(matching),
+        "is_chosen": any(kept.values()),
+        "range": context.range_form("failures", usual="All", chosen=chosen),
+        "facets": facets,
+        "shades": shades,
+        "advice": ADVICE,
+        "chart": _chart(context, matching, shades, chosen) if matching else None,
+        "scene": _scene(services, context, shown, matching, version),
+        "rows": shown,
+        "pictures": services.health.first_pictures(row.number for row in shown),
+        "older": context.to("failures", **kept, before=shown[-1].number) if len(found) > len(shown) else None,
+    }
+
+
+def _value(row: FailureRow, axis: str) -> str:
+    return str(getattr(row, axis) or "")
+
+
+def _fits(row: FailureRow, chosen: Chosen, but: str = "") -> bool:
+    """Whether a failure has what is chosen on all axes but one."""
+    return all(axis == but or _value(row, axis) == value for axis, value in chosen.items())
+
+
+def _answer(found: Sequence[FailureRow]) -> str:
+    """One or many: what most of them share; empty for none."""
+    if not found:
+        return ""
+    suspected = sum(row.kind == FailureKind.SUSPECTED for row in found)
+    told = f"{'The last ' * (len(found) >= MANY_FAILURES)}{len(found)} failure{'s' * (len(found) > 1)}"
+    told += f", {suspected} of them suspected" if suspected else ""
+    robots, parts = len({row.robot for row in found}), []
+    for values in (
+        [row.cause.replace("_", " ") for row in found],
+        [row.where for row in found],
+        [row.robot for row in found],
+    ):
+        ((most, count),) = Counter(value or "unknown" for value in values).most_common(1)
+        parts += [f"{most} ({count})"] if count > 1 else []
+    told += f", of {robots} robots" if robots > 1 else ""
+    return f"{told}. Most: {', '.join(parts)}." if parts else f"{told}."
+
+
+def _facets(
+    context: PageContext, rows: Sequence[FailureRow], chosen: Chosen, kept: Chosen, areas: Sequence[str]
+) -> list[Facet]:
+    """For each axis its values, those with most failures first. kept: query parameters."""
+    found = []
+    for axis, title in _AXES.items():
+        own = chosen.get(axis)
+        counts = Counter(dict.fromkeys(areas if axis == "area" else (), 0))
+        counts.update([] if own is None else {own: 0})
+        counts.update(value for row in rows if _fits(row, chosen, axis) and (value := _value(row, axis)))
+        if not counts or (axis == "tile" and areas and not own):
+            continue
+        choices = [
+            Choice(value, count, context.to("failures", **{**kept, axis: None if value == own else value}))
+            for value, count in counts.most_common()
+        ]
+        found.append(Facet(axis, title, own, choices))
+    return found
+
+
+def _chart(
+    context: PageContext, rows: Sequence[FailureRow], shades: Mapping[str, int], chosen: Chosen
+) -> dict[str, object]:
+    """Failures over time in bars, parted by cause; in percent of the highest. A bar leads to its time."""
+    since_ns, until_ns = context.time_range()
+    times = [row.happened_ns for row in rows]
+    first_ns, end_ns = since_ns or min(times), until_ns or max(time.time_ns(), max(times) + 1)
+    step_ns = next((step for step in _STEPS_NS if (end_ns - first_ns) / step < _BARS), max(_STEPS_NS))
+    offset = datetime.fromtimestamp(first_ns / 1e9, UTC).astimezone(context.zone).utcoffset()
+    offset_ns = int(offset.total_seconds()) * 10**9 if offset else 0  # days begin at midnight where one looks
+    begin_ns = (first_ns + offset_ns) // step_ns * step_ns - offset_ns
+    counts = [Counter[str]() for _ in range(-((begin_ns - end_ns) // step_ns))]
+    for row in rows:
+        counts[(row.happened_ns - begin_ns) // step_ns][row.cause] += 1
+    most, bars = max(count.total() for count in counts), []
+    for n, count in enumerate(counts):
+        start_ns, parts, below = begin_ns + n * step_ns, [], 0
+        for cause, part in sorted(count.items(), key=lambda item: shades.get(item[0], _SHADES - 1)):
+            below += part
+            parts.append(
+                {"shade": shades.get(cause, _SHADES - 1), "top": 100 - 100 * below / most, "height": 100 * part / most}
+            )
+        told = ", ".join(f"{part} {cause.replace('_', ' ') or 'unknown'}" for cause, part in count.most_common())
+        span = {"since": context.written(start_ns), "until": context.written(start_ns + step_ns)}
+        words = f"{context.moment(start_ns)}, {_STEPS_NS[step_ns]}: {told or 'none'}"
+        bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
+    ends = [context.written(ns).replace("T", " ") for ns in (begin_ns, end_ns)]
+    return {"bars": bars, "most": most, "step": _STEPS_NS[step_ns], "ends": ends}
+
+
+def _scene(
+    services: Services,
+    context: PageContext,
+    shown: Sequence[FailureRow],
+    matching: Sequence[FailureRow],
+    wanted: int | None,
+) -> dict[str, object] | None:
+    """The map with the failures that are listed, and where all that match are dense; None before the first version."""
+    version = wanted if wanted and services.maps.has_version(context.site, wanted) else None
+    version = version or services.maps.current_version(context.site)
+    if version is None:
+        return None
+    places = [(row.x_map_m, row.y_map_m) for row in matching if row.x_map_m is not None and row.y_map_m is not None]
+    dense = heat(places, box_of(services.maps.plan(context.site, version)))
+    layers = [Layer("Density", dense, shown=False), Layer("Failures", failure_marks(context, shown))]
+    return scene_of(services, context, version, layers)
+
+
+def failure_marks(context: PageContext, shown: Sequence[FailureRow]) -> list[Mark]:
+    """Crosses at the failures that have a position."""
+    found = []
+    for row in reversed(shown):
+        if row.x_map_m is not None and row.y_map_m is not None:
+            words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
+            found.append(Mark(row.x_map_m, row.y_map_m, tone_of(row), "cross", words, to_failure))
+    return found
+
+
+def failure_heat(services: Services, context: PageContext, box: Box) -> Layer:
+    """Where failures of the range in the address are dense, without one those of the last days; not shown until it is chosen."""
+    span_ns = context.time_range()
+    name = "Failures of the last days" if span_ns == EVER else "Failures of the chosen time"
+    return Layer(name, heat(services.health.places(context.site, *span_ns), box), shown=False)
+
+
+def tone_of(row: FailureRow) -> str:
+    """The tone of a failure: a suspected one is an estimate."""
+    return "warn" if row.kind == FailureKind.SUSPECTED else "bad"
