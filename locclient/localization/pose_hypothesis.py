@@ -72,6 +72,11 @@ class PoseHypothesis:
         return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken)
 
     @property
+    def evidence(self) -> str:
+        """What speaks for it, in words."""
+        return f"{self.mean_inliers:.0f} matches, {self.mean_recall:.0%} of what should be seen"
+
+    @property
     def mean_inliers(self) -> float:
         return self.inlier_sum / max(self.queries, 1.0)
 

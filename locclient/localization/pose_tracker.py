@@ -279,11 +279,14 @@ class PoseTracker:
             return NO_AGREEMENT
         (best, *_), competitors = candidates.ranking()
         if competitors:
-            return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen")
+            told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))
+            return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen: {told}")
         moved_m = None
         has_prior = self.prior is not None and self.prior.confirms(best)
         if not has_prior and candidates.may_be_lookalike(best):
-            return QueryResult(None, "a place that is not in the map may look as much like this one")
+            assert self.lookalikes is not None
+            told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
+            return QueryResult(None, f"a place that is not in the map may look as much like this one: {told}")
         if has_prior or candidates.is_confirmed(best, fixes):
             moved_m = candidates.moved_m(best)
             candidates.reset()

@@ -52,7 +52,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "landmark_seen": ("<u4", ("N",)),
     "landmark_missed": ("<u4", ("N",)),
 }
-_HISTORY = frozenset(list(_ARRAYS)[-5:])  # format 1 knew none
+_HISTORY = frozenset(_ARRAYS.keys() & History.__dataclass_fields__.keys())  # format 1 knew none
 
 
 class _ArrayHead(msgspec.Struct, frozen=True):

@@ -2,14 +2,15 @@
 
 | stage | takes | gives |
 |---|---|---|
-| `follow` | frames, IMU, wheels, or given poses | odometry of all frames, keyframes with their features |
-| `adjust_chain` | odometry | keyframes matched with their neighbours, landmarks, both adjusted; of a long recording segment by segment |
-| `close_loops` | the chain, vocabulary, zones, position priors | revisits, and keyframes where the pose graph with them says |
-| `adjust_globally` | keyframes after loops | all views matched anew, adjusted together; the stereo pair's error of yaw |
-| `keep_largest` | the adjusted state | the connected component that becomes the map |
+| `follow` | frames, IMU, wheels, or given poses | `OdometryPass`: odometry of all frames, keyframes with their features |
+| `adjust_chain` | that | `AdjustedChain`: keyframes matched with their neighbours, landmarks, both adjusted |
+| `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` with keyframes where the pose graph says, and the `Loops` |
+| `adjust_globally` | keyframes after loops, pairs that are matched | all views matched anew and adjusted; the pair's error of yaw |
+| `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
 | `place_frames`, `assemble` | the state that is kept | all frames, and the map; observations that do not fit are culled |
 
-`mapserver build` calls `survey` from drafting/survey_recordings.py; drafting/draft.py goes on with its map: the site's current map, tiles.
+Of a long recording, the first two go segment by segment. `mapserver build` calls `begin_survey`, measures the calibration by what that
+has found, and calls `finish_survey` (drafting/survey_recordings.py); drafting/draft.py goes on with the map: the site's current map, tiles.
 Settings are given to every stage; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each of them.
 """
 
@@ -123,14 +124,6 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
     return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
-
-
-def keep_largest(
-    state: SurveyState, odometry: OdometryPass, loops: Loops, settings: SurveySettings
-) -> tuple[SurveyState, OdometryPass, Loops, Components]:
-    """The largest connected component, which becomes the map, and what all components are."""
-    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
-    return *only_kept(state, odometry, loops, components.kept), components
 
 
 def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
@@ -268,6 +261,14 @@ def adjust_globally(
         if round_number == 0:
             yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
     return odometry, state, yaw
+
+
+def keep_largest(
+    state: SurveyState, odometry: OdometryPass, loops: Loops, settings: SurveySettings
+) -> tuple[SurveyState, OdometryPass, Loops, Components]:
+    """The largest connected component, which becomes the map, and what all components are."""
+    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
+    return *only_kept(state, odometry, loops, components.kept), components
 
 
 def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
