@@ -17,7 +17,7 @@ def script_json(value: object) -> Markup:
 
 
 def _counted(found: Rate) -> str:
-    return f"{format_rate(found)}: {found.events} in {driven_words(found.robot_days)}"
+    return f"{found.events} in {driven_words(found.robot_days)}"
 
 
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")

@@ -42,19 +42,21 @@ def _moment(stamp_ns: int | None) -> str | None:
 
 
 def _figures(summary: FleetSummary) -> list[Figure]:
+    """Those that are known."""
     total = summary.total
-    lost = f"{_number(total.frame_ms_mean, 'ms')} of CPU per frame"
-    return [
+    before = f"; before: {_rate(summary.before.failures)}"
+    first_fix, frame = total.first_fix_mean_s, total.frame_ms_mean
+    found = [
         fleet_parts.localised_figure("Localised while driving", total),
-        fleet_parts.rate_figure(
-            "Failures per robot-day", total.failures, f"; before: {_rate(summary.before.failures)}"
-        ),
+        fleet_parts.rate_figure("Failures per robot-day", total.failures, before),
         fleet_parts.rate_figure("Silent failures per robot-day, an estimate", total.silent_estimated, ""),
-        Figure("Time with a usable position", _share(total.availability), f"of {total.observed_h:.1f} h observed"),
-        Figure("Localised after the first fix", _share(total.localised_share), "of the time since then"),
-        Figure("Time to the first fix", _number(total.first_fix_mean_s, "s"), "mean"),
-        Figure("Frames lost", _share(total.frame_drop_share), lost),
+        Figure("Time with a usable position", share(total.availability), f"of {total.observed_h:.1f} h observed"),
+        Figure("Localised after the first fix", share(total.localised_share), "of the time since then"),
+        Figure("Time to the first fix", None if first_fix is None else f"{first_fix:.1f} s", "mean"),
+        Figure("CPU of a frame", None if frame is None else f"{frame:.1f} ms", "mean"),
+        Figure("Frames lost", share(total.frame_drop_share), ""),
     ]
+    return [figure for figure in found if figure.value is not None]
 
 
 def _by_hour(summary: FleetSummary, step: int) -> Bars:
@@ -77,7 +79,3 @@ def _rate(found: Rate) -> str:
 
 def _share(value: float | None) -> str:
     return share(value) or _UNKNOWN
-
-
-def _number(value: float | None, unit: str) -> str:
-    return _UNKNOWN if value is None else f"{value:.1f} {unit}"
