@@ -30,8 +30,8 @@ from mapserver.store import Actor
 
 _log = logging.getLogger(__name__)
 
-SIGN_IN, SIGN_OUT = "/sign-in", "/sign-out"
-_OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT}
+SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
+_OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
 _SOCKET = "/_nicegui_ws/"
 _LEVEL = 5
 _SCRIPT = re.compile(rb"<script\b(?![^>]*\bnonce=)")

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from fastapi import FastAPI, Request
-from fastapi.responses import FileResponse, HTMLResponse, StreamingResponse
+from fastapi.responses import HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from markupsafe import Markup
 
@@ -48,11 +48,6 @@ class Console:
         """Adds what all pages load."""
         self.app.mount("/static", StaticFiles(directory=_HERE / "static"))
 
-        @self.app.get("/style.css", include_in_schema=False)
-        def style() -> FileResponse:
-            """Colours and parts that all pages share."""
-            return FileResponse(_HERE / "style.css", media_type="text/css")
-
     def page(
         self,
         path: str,
@@ -73,13 +68,19 @@ class Console:
             """A page."""
             return await self._shown(request, path.partition("/")[0], template, fill, knows, under_way)
 
-    def stream(self, path: str, one: Callable[[PageContext], dict[str, object]]) -> None:
-        """Adds what a page follows: an event every second, for as long as the session lasts."""
+    def stream(
+        self,
+        path: str,
+        one: Callable[[PageContext], dict[str, object]],
+        *,
+        under_way: Callable[[], list[str]] = list,
+    ) -> None:
+        """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts."""
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def followed(request: Request, site: str) -> StreamingResponse:
             """A stream of server-sent events."""
-            chosen = await load(self.services.maps.chosen_site, site)
+            chosen = site if site in await load(under_way) else await load(self.services.maps.chosen_site, site)
             context = PageContext(
                 _root(request), "", chosen, zone_of(request.cookies.get(ZONE_COOKIE)), request.query_params
             )
@@ -92,8 +93,11 @@ class Console:
                 return b"data: %s\n\n" % to_json(one(context))
 
             async def events() -> AsyncIterator[bytes]:
+                told = b""
                 while not await request.is_disconnected():
-                    yield await load(event)
+                    found = await load(event)
+                    yield b":\n\n" if found == told else found
+                    told = found
                     await asyncio.sleep(_EVERY_S)
 
             return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
@@ -113,7 +117,7 @@ class Console:
             growing = await load(under_way)
             sites = sorted({*await load(self.services.maps.sites), *growing})
             if site not in growing:
-                site = sites[0] if site is None and growing else await load(self.services.maps.chosen_site, site)
+                site = growing[0] if site is None and growing else await load(self.services.maps.chosen_site, site)
             check_query(request, knows)
             zone = zone_of(request.cookies.get(ZONE_COOKIE))
             context = PageContext(root, page, site, zone, request.query_params)

@@ -12,7 +12,7 @@ from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
-from mapserver.dashboard import failure, failures, overview
+from mapserver.dashboard import failure, failures, live_page, overview, sign_in_page, space_page
 from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
@@ -20,11 +20,8 @@ from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.pages import (
-    live_page,
     map_page,
     robot_page,
-    sign_in_page,
-    space_page,
     survey_page,
 )
 from mapserver.fleet.fleet import Fleet
@@ -45,12 +42,12 @@ def install_dashboard(
         surveys,
         RobotPlacing(store, fleet, bus),
     )
-    for page in (robot_page, map_page, space_page, survey_page, live_page):
+    for page in (robot_page, map_page, survey_page):
         page.install(services)
     sign_in_page.install(app, settings.guard)
     console = Console(pages, services)
     console.files()
-    for module in (overview, failures, failure):
+    for module in (overview, failures, failure, space_page, live_page):
         module.install(console)
     _install_pictures(services, store)
 

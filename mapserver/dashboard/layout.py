@@ -220,7 +220,7 @@ def number(text: str | None, name: str) -> int | None:
 
 @cache
 def _style() -> str:
-    return f"<style>{Path(__file__).with_name('style.css').read_text('utf-8')}</style>"
+    return f"<style>{(Path(__file__).parent / 'static' / 'style.css').read_text('utf-8')}</style>"
 
 
 def _set_look(request: Request) -> None:

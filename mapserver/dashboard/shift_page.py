@@ -13,7 +13,7 @@ from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.fleet.shift_summary import FleetSummary
 from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, format_rate, is_telling
 
-_STYLE = Path(__file__).with_name("style.css")
+_STYLE = Path(__file__).parent / "static" / "style.css"
 _ROWS = 15
 _BARS = 24
 _UNKNOWN = "not known"

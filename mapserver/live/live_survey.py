@@ -15,8 +15,10 @@ from rich.console import Console
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse, skew
-from fleetmap.live_survey import LiveSurveyState
+from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement
+from fleetmap.recordings.images import jpeg_image
+from fleetmap.sensors.samples import Image
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
@@ -31,6 +33,7 @@ Tell = Callable[[LiveSurveyState], None]
 See = Callable[[Tracked], None]
 
 _TELL_EVERY_S = 0.5
+_PICTURE_PX, _PICTURE_QUALITY = 320, 50  # of its longer side; 10 kB
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,7 @@ class _Survey:
         self._qualities: list[float] = []  # of each keyframe, the worst since the one before
         self._worst = 1.0
         self._sketch = NO_SKETCH
+        self._seen: Image | None = None  # the newest keyframe
         self._behind, self._failed, self._lag_s = 0, "", 0.0
         # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
@@ -178,6 +182,7 @@ class _Survey:
         if tracked.keyframe is not None:
             mapping.put(due.frame, tracked.keyframe)
             self._qualities.append(self._worst)
+            self._seen = due.frame.left
             self._worst = 1.0
 
     def _look(self, mapping: MappingProcess) -> None:
@@ -241,10 +246,20 @@ class _Survey:
                 missing=sketch.missing,
                 estimate=self._estimate(sketch.estimate),
                 scale_known=self._scale_known,
+                picture=self._picture(),
                 version=version,
                 words=(words or self._failed)[:2000],
             )
         )
+
+    def _picture(self) -> bytes:
+        """What the camera saw last, small."""
+        if self._seen is None:
+            return b""
+        height, width = (-(-_PICTURE_PX * side // max(self._seen.shape)) for side in self._seen.shape)
+        small = cv2.resize(self._seen, (width, height), interpolation=cv2.INTER_AREA)
+        data = jpeg_image(np.asarray(small, np.uint8), _PICTURE_QUALITY).data
+        return data if len(data) <= MAX_ARRAY_BYTES else b""
 
     def _estimate(self, found: LiveEstimate | None) -> EstimateMessage | None:
         """As robots say it: of the base, with the odometry's continuous frame in the place of `odom`."""

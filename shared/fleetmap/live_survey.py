@@ -55,7 +55,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
     verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
     estimate: where the newest keyframe is in this map, odometry's frame in the place of `odom`.
-    scale_known: False for one camera: the map that grows is in a unit of its own, with an IMU too.
+    scale_known: False for one camera: the map that grows is in a unit of its own, with an IMU too. picture: JPEG of the newest keyframe.
     """
 
     site: Name
@@ -81,6 +81,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     missing: Annotated[list[LiveMissing], msgspec.Meta(max_length=64)] = []
     estimate: EstimateMessage | None = None
     scale_known: bool = True
+    picture: _Bytes = b""
     version: Version | None = None
     words: Text = ""
 

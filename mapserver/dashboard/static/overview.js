@@ -1,5 +1,6 @@
 // The Overview: the map, and beside it the robots; the server's stream keeps both up to date.
 import { SiteMap } from "./map/index.js";
+import { follow } from "./stream.js";
 
 const NEAR_ZOOM = 5;
 const { scene, now } = JSON.parse(document.getElementById("data").textContent);
@@ -94,10 +95,11 @@ function update() {
 
 update();
 search.addEventListener("input", update);
-const stream = new EventSource(`now?site=${encodeURIComponent(document.querySelector("header select[name=site]").value)}`);
-stream.onmessage = ({ data }) => {
-  state = JSON.parse(data);
-  update();
-};
-stream.addEventListener("ended", ({ data }) => location.assign(data));
-stream.onerror = () => say({ words: "The server does not answer; trying again.", tone: "bad" });
+follow(
+  "now",
+  (told) => {
+    state = told;
+    update();
+  },
+  () => say({ words: "The server does not answer; trying again.", tone: "bad" }),
+);

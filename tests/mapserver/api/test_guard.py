@@ -22,7 +22,7 @@ from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
-from mapserver.dashboard.pages.sign_in_page import install as install_sign_in
+from mapserver.dashboard.sign_in_page import install as install_sign_in
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
 from support.fleet.quick_passwords import use_quick_passwords

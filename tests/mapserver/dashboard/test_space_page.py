@@ -1,6 +1,7 @@
 """The map in space, in a real browser: everything that the version holds is drawn, robots move in it, colours mean what the scale says."""
 
 import math
+import re
 
 import cv2
 import msgspec
@@ -15,7 +16,8 @@ from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message,
 from mapserver.dashboard.space import points
 from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.space.robot_views import robot_views
-from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, talking
+from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, talking, wait_until
+from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
 from support.storage.map_samples import random_tile
 
@@ -29,7 +31,7 @@ def tiles() -> list[Tile]:
 
 def inked(page: Page) -> tuple[int, Array]:
     """How many pixels of the view are painted, and their mean colour."""
-    png = page.locator(".space-view canvas").screenshot()
+    png = page.locator(".views canvas").screenshot()
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).astype(float)[3:-3, 3:-3]
     painted = np.abs(picture - picture[0, 0]).max(axis=2) > 30
     return int(painted.sum()), picture[painted].mean(axis=0)
@@ -67,9 +69,9 @@ def test_an_empty_version_is_empty() -> None:
 def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) -> None:
     seen = opened(page, served, "space")
     expect(page.locator("h1")).to_have_text("Map of hall in space")
-    page.wait_for_function(f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
     assert page.evaluate(SEEN)["landmarks"] > 50
-    page.wait_for_timeout(500)
+    page.get_by_role("checkbox", name="floor").uncheck()
     page.get_by_role("checkbox", name="robots").uncheck()
     page.wait_for_timeout(500)
     amount, by_height = inked(page)
@@ -84,7 +86,7 @@ def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) ->
     with talking(served.zenoh, ROBOTS) as moved:
         moved["tug-4"] = (40.0, 14.0)
         at_new_place = f"{SEEN}.robots.some(r => r.name === 'tug-4' && r.x === 40 && r.y === 14 && r.tone === 'bad')"
-        page.wait_for_function(at_new_place, timeout=15_000)
+        wait_until(page, at_new_place)
     page.get_by_role("button", name="From above").click()
     page.wait_for_timeout(300)
     across = {robot["name"]: robot["page"][0] for robot in page.evaluate(SEEN)["robots"]}
@@ -94,6 +96,31 @@ def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) ->
     assert_whole(page)
     assert seen.faults == []
     assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+def test_robots_and_places_are_opened_with_the_pointer(page: Page, served: Served) -> None:
+    seen = opened(page, served, "space")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    expect(page.locator(".bar")).to_have_text(re.compile(r"^[125]0* m$"))
+    page.get_by_role("button", name="From above").click()
+    page.get_by_role("checkbox", name="robots").uncheck()
+    page.wait_for_timeout(300)
+    robots = page.evaluate(SEEN)["robots"]
+    robot = max(robots, key=lambda one: sorted(math.dist(one["page"], other["page"]) for other in robots)[1])
+    box = box_of(page.locator(".views canvas"))
+    there = box["x"] + robot["page"][0] * box["width"], box["y"] + robot["page"][1] * box["height"]
+    page.mouse.click(*there)
+    expect(page.locator(".where")).to_have_text(re.compile("^Place "))
+    assert page.evaluate(SEEN)["camera"][:2] == pytest.approx((robot["x"], robot["y"]), abs=1.0), (
+        "the place beside the robot"
+    )
+    page.get_by_role("button", name="Leave the walk").click()
+    page.get_by_role("button", name="From above").click()
+    page.get_by_role("checkbox", name="robots").check()
+    page.wait_for_timeout(300)
+    page.mouse.click(*there)
+    expect(page.locator("h1")).to_have_text(robot["name"])
+    assert seen.faults == []
 
 
 def told_camera(**changes: object) -> CameraNote:
@@ -131,10 +158,8 @@ def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Serve
         ack = decode_message(bus.get(robot_key(SITE, "tug-3", "failures"), encode_message(report)), FailureAck)
     assert not ack.refused
     seen = opened(page, served, "space")
-    expect(page.locator(".nicegui-content")).to_contain_text(
-        "Robots that told their camera in a failure report (1) have its view"
-    )
-    page.wait_for_function(f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    expect(page.locator("main")).to_contain_text("1 with the view of their own camera")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
     views = {robot["name"]: np.reshape(robot["view"], (-1, 3)) for robot in page.evaluate(SEEN)["robots"]}
     np.testing.assert_allclose(views["tug-3"].min(axis=0), [0.3, -1, -0.4], atol=1e-3)
     np.testing.assert_allclose(views["tug-3"].max(axis=0), [1.3, 1, 1.1], atol=1e-3)

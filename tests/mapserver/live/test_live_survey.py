@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -65,6 +66,7 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(
     assert last.covered()[:, 2].sum() > 100
     assert (last.path()[:, 2] > 0.5).all()
     assert len(last.landmarks()) > 100
+    assert max(cv2.imdecode(np.frombuffer(last.picture, np.uint8), cv2.IMREAD_GRAYSCALE).shape) == 320
 
 
 def test_its_phases_are_told_in_order_and_end_with_the_draft(
@@ -223,6 +225,6 @@ def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
     full = bytes(MAX_ARRAY_BYTES)
     state = LiveSurveyState(
         site="s" * 64, recording="r", stamp_ns=1, phase="tracking", seconds=1.0, frames=1, keyframes=1,
-        path_m=full, quality=full[: MAX_ARRAY_BYTES // 8], landmarks_m=full, loops_m=full,
+        path_m=full, quality=full[: MAX_ARRAY_BYTES // 8], landmarks_m=full, loops_m=full, picture=full,
     )  # fmt: skip
     assert len(encode_message(state)) < MAX_MESSAGE_BYTES

@@ -1,35 +1,16 @@
-"""Sign-in and sign-out: a page without scripts, outside of the page library, so that nobody needs to be known for it."""
+"""Sign-in and sign-out: a page without scripts, for those whom nobody knows yet."""
 
-from pathlib import Path
 from urllib.parse import parse_qs
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
-from markupsafe import Markup
 from starlette.responses import Response
 
-from mapserver.api.guard import (
-    SIGN_IN,
-    SIGN_OUT,
-    GuardSettings,
-    address_of,
-    set_session,
-)
+from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
+from mapserver.dashboard.rendering import TEMPLATES
 
 _MAX_ADDRESS = 300  # percent-encoded it must fit into the sign-in's body, beside name and password
-_STYLE = Path(__file__).parents[1] / "style.css"
-_PAGE = Markup(
-    '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Sign in – fleetmap</title><link rel="icon" href="data:,">'
-    '<meta name="viewport" content="width=device-width"><style>{style}</style></head>'
-    '<body class="print"><main class="nicegui-content sign-in"><h1>fleetmap</h1>{notice}'
-    '<form method="post" action="{action}"><input type="hidden" name="next" value="{then}">'
-    '<label>Name<input name="name" value="{name}" required maxlength="64" autocapitalize="none" autocomplete="username" {focus}></label>'
-    '<label>Password<input name="password" type="password" required maxlength="1000" autocomplete="current-password"></label>'
-    '<button type="submit">Sign in</button></form>'
-    '<p class="quiet">No account yet? An administrator makes one on the server with <code>mapserver operators add</code>.</p>'
-    "</main></body></html>\n"
-)
 
 
 def install(app: FastAPI, settings: GuardSettings) -> None:
@@ -40,7 +21,7 @@ def install(app: FastAPI, settings: GuardSettings) -> None:
         """The form; whoever needs none goes on."""
         if not settings.is_sign_in_on or settings.identify(request.scope) is not None:
             return RedirectResponse(_local(next), 303)
-        return _page(settings, next)
+        return _page(next)
 
     @app.post(SIGN_IN, include_in_schema=False)
     async def sign_in(request: Request) -> Response:
@@ -53,7 +34,7 @@ def install(app: FastAPI, settings: GuardSettings) -> None:
             return RedirectResponse(_local(then), 303)
         found = await to_thread.run_sync(operators.sign_in, name, given.get("password", ""), address_of(request.scope))
         if not found.session:
-            page = _page(settings, then, name, found.refusal, 429 if found.retry_s else 401)
+            page = _page(then, name, found.refusal, 429 if found.retry_s else 401)
             if found.retry_s:
                 page.headers["Retry-After"] = str(found.retry_s)
             return page
@@ -72,10 +53,9 @@ def install(app: FastAPI, settings: GuardSettings) -> None:
         return response
 
 
-def _page(settings: GuardSettings, then: str, name: str = "", refusal: str = "", status: int = 200) -> HTMLResponse:
-    notice = Markup('<p class="notice bad" role="alert">{}</p>').format(refusal) if refusal else ""
-    style, focus = Markup(_STYLE.read_text("utf-8")), "" if name else "autofocus"
-    page = _PAGE.format(style=style, notice=notice, action=SIGN_IN, then=_local(then), name=name, focus=focus)
+def _page(then: str, name: str = "", refusal: str = "", status: int = 200) -> HTMLResponse:
+    shown = {"style": STYLE, "action": SIGN_IN, "then": _local(then), "name": name, "refusal": refusal}
+    page = TEMPLATES.get_template("sign_in.html").render(shown)
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
 
 

@@ -1,0 +1,174 @@
+"""The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
+
+from base64 import b64encode
+from hashlib import sha256
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
+from fleetmap.messages import encode_message
+from mapserver.dashboard.console import Console
+from mapserver.dashboard.layout import PageContext
+from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
+from mapserver.serving.live_surveys import LiveSurvey, LiveSurveys
+
+_MARGIN_M = 4.0
+_SHOWN_LANDMARKS = 4000
+_BEYOND_M = 12.0  # landmarks of far walls would shrink everything else
+_PHASES = {
+    "tracking": ("", "The survey drives."),
+    "adjusting": ("", "The drive is over; the finished map is made."),
+    "stored": ("good", "The finished map is stored as a draft."),
+    "failed": ("bad", "No map could be made of it."),
+}
+_VERDICTS = {
+    "accepted": ("good", "accepted"),
+    "ambiguous": ("warn", "several places fit"),
+    "gated_out": ("bad", "too far away by odometry"),
+    "rejected": ("bad", "refused"),
+}
+
+
+def install(console: Console) -> None:
+    """Adds the page and what it follows."""
+    surveys = console.services.surveys
+    console.page("live", "live.html", lambda context: _page(surveys, context), under_way=surveys.sites)
+    console.stream("live/now", lambda context: _heard(surveys.of(context.site)), under_way=surveys.sites)
+
+
+def _heard(survey: LiveSurvey | None) -> dict[str, object]:
+    """Changes when the page does."""
+    if survey is None:
+        return {"heard": None}
+    return {"heard": sha256(encode_message(survey.state)).hexdigest(), "silent": survey.is_silent}
+
+
+def _page(surveys: LiveSurveys, context: PageContext) -> dict[str, object]:
+    survey = surveys.of(context.site)
+    if survey is None:
+        return {"state": None}
+    state = survey.state
+    tone, words = _PHASES.get(state.phase, ("warn", state.phase))
+    if survey.is_silent:
+        tone = "bad"
+        words = f"Nothing was heard of it for {survey.seconds_since:.0f} s; look at the survey robot."
+    drafted = state.version if state.phase == "stored" else None
+    return {
+        "state": state,
+        "tone": tone,
+        "words": words if drafted is not None or not state.words else f"{words} {state.words}",
+        "drafted": drafted,
+        "draft": context.to("map", version=drafted),
+        "figures": _figures(state),
+        "picture": b64encode(state.picture).decode(),
+        "scene": {
+            "label": f"Survey of {state.site} so far",
+            "box": _box(state.path()),
+            "layers": _layers(state),
+            "follows": True,
+        },
+        "hues": [_hue(number) for number in range(len(state.parts))],
+        "verdicts": _VERDICTS,
+    }
+
+
+def _figures(state: LiveSurveyState) -> list[tuple[str, str, str]]:
+    """Names, values and remarks."""
+    way, covered = state.path(), state.covered()
+    way_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum()) if len(way) > 1 else 0.0
+    answered = "as fast as it goes" if state.latency_ms is None else f"{state.latency_ms:.0f} ms"
+    late = f"{state.late_frames} of {state.frames} frames later than the next one"
+    area = f"{len(covered) * COVERAGE_CELL_M**2:.0f} m²"
+    return [
+        ("Recorded", f"{state.seconds:.0f} s", f"{state.frames} frames, {way_m:.0f} {_units(state)}"),
+        ("Localization", *_placed(state)),
+        ("Frames answered within", answered, late),
+        ("Keyframes", str(state.keyframes), f"{state.behind} wait to be mapped"),
+        ("Covered", area, f"squares of {COVERAGE_CELL_M:g} m with landmarks"),
+        ("Revisits", str(state.loops), f"{sum(state.refused.values())} candidates refused"),
+    ]
+
+
+def _placed(state: LiveSurveyState) -> tuple[str, str]:
+    """Status of the newest keyframe; where it is in this map and how exactly, as far as that is known."""
+    estimate, units = state.estimate, _units(state)
+    if estimate is None:
+        return "–", "in this map"
+    found = [estimate.cause] if estimate.cause else []
+    if estimate.map_from_odom is not None:
+        placed = estimate.map_from_odom.target_from_source @ estimate.odom_from_base.target_from_source
+        heading_deg = np.degrees(np.arctan2(placed[1, 0], placed[0, 0]))
+        found.append(f"at {placed[0, 3]:.2f}, {placed[1, 3]:.2f} {units}, heading {heading_deg:.1f}°")
+    if estimate.cov_rot_trans is not None:
+        variances = np.diag(np.reshape(estimate.cov_rot_trans, (6, 6)))
+        found.append(f"σ {np.sqrt(variances[3:5].max()):.2f} {units}, {np.degrees(np.sqrt(variances[2])):.1f}°")
+    return STATUSES.get(estimate.status, (estimate.status.lower(), ""))[0], "; ".join(found) or "place unknown"
+
+
+def _units(state: LiveSurveyState) -> str:
+    return "m" if state.scale_known else "units"
+
+
+def _hue(number: int) -> int:
+    """Degrees, as different as can be from those of the parts before."""
+    return round(250 + number * 137.5) % 360
+
+
+def _box(way: Array) -> list[float]:
+    """What is in sight first."""
+    low, high = (way[:, :2].min(axis=0), way[:, :2].max(axis=0)) if len(way) else (np.zeros(2), np.zeros(2))
+    return [*(low - _MARGIN_M).tolist(), *(high + _MARGIN_M).tolist()]
+
+
+def _layers(state: LiveSurveyState) -> list[Layer]:
+    """Landmarks, revisits and the path, coloured by how well it was tracked."""
+    way, marks = state.path(), state.landmarks()
+    if len(way):
+        low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
+        marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
+    return [
+        Layer("Covered", _covered(state.covered())),
+        Layer("Landmarks", [Dots(np.round(marks, 2).ravel().tolist())] if len(marks) else []),
+        Layer(
+            "Revisits", [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in state.loop_lines().tolist()]
+        ),
+        Layer("Way", [*_part_trails(way, state), *trail(way)]),
+        Layer("Now", _now(state, way)),
+    ]
+
+
+def _covered(cells: Array) -> list[Square]:
+    """Squares with landmarks, the fuller the darker."""
+    size, most = COVERAGE_CELL_M, max(1.0, float(cells[:, 2].max(initial=1.0)))
+    return [
+        Square((x * size, y * size, (x + 1) * size, (y + 1) * size), "tile", f"{n:.0f} landmarks", round(n / most, 3))
+        for x, y, n in cells.tolist()
+    ]
+
+
+def _now(state: LiveSurveyState, way: Array) -> list[Mark]:
+    """The newest keyframe, and where directions are missing."""
+    lacking = [
+        Mark(
+            m.x_m, m.y_m, "warn", "triangle", f"nothing looks {m.heading}: {m.places} places were passed the other way"
+        )
+        for m in state.missing
+    ]
+    if not len(way):
+        return lacking
+    tone = "good" if way[-1, 2] > 0 else "bad"
+    return [*lacking, Mark(float(way[-1, 0]), float(way[-1, 1]), tone, "circle", "newest keyframe")]
+
+
+def _part_trails(way: Array, state: LiveSurveyState) -> list[Line]:
+    """A wide line below each part's path, in its colour, where there are several."""
+    if len(state.parts) < 2:
+        return []
+    numbers = state.part_numbers()
+    found = []
+    for n in range(len(state.parts)):
+        places = way[numbers == n, :2]
+        found += trail(np.column_stack([places, np.ones(len(places))]), 9, hue=_hue(n))
+    return found

@@ -1,0 +1,58 @@
+"""The page that shows a version in three dimensions, with the robots in it, and a walk through it beside the plan."""
+
+import math
+
+from fleetmap.errors import StateError, UsageError
+from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.map_layers import Layer
+from mapserver.dashboard.space.points import COARSEST_M, FINEST_M
+from mapserver.dashboard.space.robot_views import robot_views
+
+
+def install(console: Console) -> None:
+    """Adds the page."""
+    console.page("space", "space.html", lambda context: _space(console.services, context), knows=("version", "x", "y"))
+
+
+def _space(services: Services, context: PageContext) -> dict[str, object]:
+    maps, site = services.maps, context.site
+    version = number(context.query.get("version"), "version")
+    if version is None:
+        version = maps.current_version(site)
+    if version is None:
+        raise StateError(f"site {site} has no published version; publish one, or name a draft")
+    camera = maps.quality(site, version).manifest.camera  # a version that is not there is named here
+    lacks, loops, views = maps.lacks_surfels(site, version), maps.loops(site, version), services.health.cameras(site)
+    cameras = {name: [*view.tangents, *view.base_from_cam] for name, view in robot_views(views).items()}
+    return {
+        "version": version,
+        "scene": {
+            "address": f"{context.root}/spaces/{site}/{version}.bin",
+            "view": None if lacks else f"../v1/sites/{site}/versions/{version}/view.png",
+            "tangents": [side / 2 / camera.focal_px for side in (camera.width_px, camera.height_px)],
+            "cameras": cameras,
+            "loops": [[*loop.start_map_m, *loop.end_map_m, int(loop.is_accepted)] for loop in loops],
+            "start": _start(context),
+        },
+        "plan": scene_of(services, context, version, [Layer("Where you stand")]),
+        "lacks": lacks,
+        "own": len(cameras),
+        "absent": {"loops", "refused loops"} - {"loops" if loop.is_accepted else "refused loops" for loop in loops},
+        "exactness": f"{1e3 * FINEST_M:g} mm or better|{1e3 * COARSEST_M:g} mm or worse",
+        "above": context.to("map", version=version),
+    }
+
+
+def _start(context: PageContext) -> tuple[float, float] | None:
+    """Where the walk begins by the address; UsageError for what is no place."""
+    given = [context.query.get(axis) for axis in "xy"]
+    if given == [None, None]:
+        return None
+    try:
+        x, y = (float(text or "") for text in given)
+    except ValueError:
+        x = y = math.nan
+    if not math.isfinite(x) or not math.isfinite(y):
+        raise UsageError(f"x={given[0]} and y={given[1]} are no place; write metres of the map")
+    return x, y
