@@ -138,14 +138,6 @@ class MapData:
         manifest = self._store.manifest(site, version)
         return space_bytes([decode_tile(self._store.blob(entry.sha256)) for entry in manifest.tiles])
 
-    def has_surfels(self, site: str, version: int) -> bool:
-        """Whether views of a version can be drawn."""
-        try:
-            index_address(self._store.manifest(site, version))
-        except StateError:
-            return False
-        return True
-
     def loops(self, site: str, version: int) -> list[Loop]:
         """Loops of the build that made a version, as far as a job that is kept tells them."""
         return loops_of_version((job.report for job in self._store.jobs(site, limit=_JOBS_SHOWN)), version)

@@ -7,13 +7,13 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from nicegui import app as pages
 from nicegui import ui
+from starlette.middleware.gzip import GZipMiddleware
 
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard import failure, failures, live_page, overview, sign_in_page, space_page
-from mapserver.dashboard.compression_cache import CompressionCache
 from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -66,7 +66,7 @@ def install_dashboard(
         reconnect_timeout=10.0,
         binding_refresh_interval=None,
         show_welcome_message=False,
-        gzip_middleware_factory=CompressionCache,
+        gzip_middleware_factory=lambda app: GZipMiddleware(app, compresslevel=5),
     )
 
 
