@@ -9,7 +9,7 @@ from math import hypot
 from fleetmap.messages import FailureReport
 from mapserver.dashboard import failure_story as story
 from mapserver.dashboard.console import Console, scene_of
-from mapserver.dashboard.failures import ADVICE, tone_of
+from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES
 from mapserver.dashboard.layout import PageContext, Services, number
 from mapserver.dashboard.map_layers import Layer, Line, Mark
@@ -33,7 +33,7 @@ def _page(services: Services, context: PageContext, failure: str) -> dict[str, o
     clock = story.FailureClock(began_ns, row.happened_ns, context.zone)
     recorded = story.pictures_near(detail.pictures, began_ns)
     seen = recorded or [picture for picture in detail.pictures if picture.kind == "frame"]
-    instants = story.instants(moments, recorded, clock)
+    pictures = [(picture.place, clock.at(picture.stamp_ns)) for picture in recorded]
     near, words = _nearby(services, row)
     return {
         "context": context,
@@ -46,7 +46,7 @@ def _page(services: Services, context: PageContext, failure: str) -> dict[str, o
         "seen": min(seen, key=lambda picture: abs(picture.stamp_ns - began_ns), default=None),
         "clock": clock,
         "lacks_view": services.maps.lacks_view(report),
-        "seconds": {"instants": instants, "pictures": [picture.place for picture in recorded]},
+        "seconds": {"instants": story.instants(moments, recorded, clock), "pictures": pictures},
         "steps": story.steps(moments, began_ns),
         "scene": _scene(services, context, row, report, story.path(moments, clock)),
         "nearby": near[:_LISTED],
@@ -70,8 +70,7 @@ def _scene(
         for fix in report.fixes
         if fix.position_map_m is not None
     ]
-    if row.x_map_m is not None and row.y_map_m is not None:
-        found.append(Mark(row.x_map_m, row.y_map_m, tone_of(row), "cross", "believed position"))
+    found += failure_marks(context, [row])
     layers = [Layer("Path", way), Layer("Failure", found), Layer("Chosen moment")]
     places_m = [(mark.x, mark.y) for mark in found] + [place for line in way for place in line.points]
     return scene_of(services, context, version, layers, places_m=places_m)

@@ -1,15 +1,16 @@
 // Steps through the seconds around a failure: picture, state, belief and place of the chosen moment. Words of robots are text here.
 const { instants, pictures } = JSON.parse(document.getElementById("seconds").textContent);
 const [moment, seen, caption, now, when, belief, map] = ["moment", "seen", "seen-when", "now", "when", "belief", "map"].map((id) => document.getElementById(id));
-const address = (n) => seen.src.replace(/\d+$/, pictures[n]);
+const address = ([place]) => seen.src.replace(/\d+$/, place);
 
 function show() {
   const { x, y, tone, words, clock, since, heading_rad, picture, belief: believed } = instants[moment.value];
   moment.setAttribute("aria-valuetext", `${clock}, ${since}: ${words}`);
   [now.textContent, now.className, when.textContent, belief.textContent] = [words, tone, `at ${clock}, ${since}`, believed];
   if (pictures.length) {
-    seen.src = address(Math.max(0, picture));
-    caption.textContent = `Left camera image of ${clock}`;
+    const last = pictures[Math.max(0, picture)];
+    seen.src = address(last);
+    caption.textContent = `Left camera image of ${last[1]}`;
   }
   const mark = { kind: "mark", shape: "circle", address: null, name: "", words: `${clock}: ${words}`, x, y, tone, heading_rad };
   map?.map?.show("Chosen moment", x === null ? [] : [mark], false);
@@ -23,5 +24,5 @@ for (const step of document.querySelectorAll("[data-at]"))
   });
 // Before somebody steps: a picture that comes late would be that of another moment.
 for (const begins of ["pointerenter", "focus"])
-  moment.addEventListener(begins, () => pictures.forEach((_, n) => (new Image().src = address(n))), { once: true });
+  moment.addEventListener(begins, () => pictures.forEach((each) => (new Image().src = address(each))), { once: true });
 show();

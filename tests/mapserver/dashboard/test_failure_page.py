@@ -2,8 +2,10 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import httpx
 import msgspec
@@ -15,7 +17,10 @@ from fleetmap.failure_summary import Moment
 from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.dashboard import failure_story as story
+from mapserver.dashboard import failures
+from mapserver.dashboard.layout import PageContext
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, marks, opened, picture, serving, wait_until
 from support.fleet.failed_robot import send_replay, small_file
@@ -115,6 +120,20 @@ def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
     assert "corrected by 5.1 m" in lines[1].words
 
 
+def test_causes_over_time_are_all_in_the_bars_and_a_bar_leads_to_its_time() -> None:
+    query = {"since": "2026-09-21T16:13", "until": "2026-10-05T00:00", "robot": "r"}
+    context = PageContext("", "failures", SITE, ZoneInfo("Africa/Cairo"), query)
+    found = [("dark", 0), ("dark", 0), ("glare", 0), ("new", 1), ("dark", 13)]
+    rows = [replace(detail().failure, cause=cause, happened_ns=AT_NS + day * 24 * HOUR_NS) for cause, day in found]
+    chart = failures._chart(context, rows, {"dark": 0, "glare": 1}, {"robot": "r"})
+    assert (len(chart["bars"]), chart["most"], chart["step"]) == (14, 3, "a day")
+    first, second, *_, last = chart["bars"]
+    assert [(p["shade"], round(p["top"]), round(p["height"])) for p in first["parts"]] == [(0, 33, 67), (1, 0, 33)]
+    assert first["to"] == "/failures?site=hall&robot=r&since=2026-09-21T00%3A00&until=2026-09-22T00%3A00"
+    assert second["parts"][0]["shade"] == 5, "a cause without a shade of its own"
+    assert last["words"] == "2026-10-04 00:00:00 EEST, a day: 1 dark"
+
+
 def report(name: str, **changes: object) -> FailureReport:
     return msgspec.structs.replace(failure(name, f"of-{name}"), **changes)
 
@@ -170,6 +189,7 @@ def test_the_seconds_are_stepped_through(page: Page, served: Served) -> None:
     )
     at = "x => document.querySelector('.site-map').marks().some(m => m.words.endsWith(': localised') && Math.abs(m.x - x) < 1e-6)"
     wait_until(page, at, 19.95)
+    assert page.locator("#seen-when").inner_text()[-10:] not in said.inner_text(), "a picture is half a second older"
     slider.press("End")
     expect(slider).to_have_attribute("aria-valuetext", re.compile("4.9 s after the beginning: localised$"))
     wait_until(page, at, 26.5)

@@ -2,12 +2,8 @@
 
 import base64
 import math
-import re
 from dataclasses import replace
-from datetime import UTC, datetime
-from html import unescape
 from pathlib import Path
-from urllib.parse import parse_qsl
 
 import cv2
 import msgspec
@@ -24,7 +20,6 @@ from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
-from mapserver.dashboard.layout import PageContext
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
@@ -330,23 +325,6 @@ def test_health_of_a_site(store: MapStore) -> None:
     assert health.span(SITE, None, now_ns - 2 * HOUR_NS).failures.events == 0
     assert len(health.places(SITE)) == 2
     assert health.places(SITE, None, now_ns - HOUR_NS) == []
-
-
-def test_presets_of_time_keep_what_else_is_chosen() -> None:
-    context = PageContext("/dashboard", "failures", SITE, UTC, {"since": "2026-01-02", "area": "aisle 2"})
-    form = context.range_form("failures", usual="All", chosen={"area": "aisle 2", "robot": None})
-    named = dict(re.findall(r'<a href="/dashboard/failures[?]([^"]*)">([^<]*)</a>', form))
-    now = datetime.now(UTC)
-    assert list(named.values()) == ["Last hour", "Today", "Last 7 days", "All"]
-    asked = [dict(parse_qsl(unescape(query))) for query in named]
-    assert [each.get("area") for each in asked] == ["aisle 2"] * 4
-    ages_h = [
-        (now - datetime.fromisoformat(each["since"]).replace(tzinfo=UTC)).total_seconds() / 3600 for each in asked[:3]
-    ]
-    assert ages_h[0] == pytest.approx(1, abs=0.02)
-    assert 0 <= ages_h[1] < 24.02
-    assert ages_h[2] == pytest.approx(168, abs=0.02)
-    assert 'name="since" value="2026-01-02T00:00"' in form
 
 
 def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
