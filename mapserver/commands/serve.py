@@ -242,7 +242,7 @@ def _run(
 
     api = ApiSettings(guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
-    install_dashboard(app, maps, fleet, api, bus_service.surveys, bus)
+    install_dashboard(app, maps, fleet, api, bus_service.surveys)
     # Around the middleware that puts the client's address in the place of the proxy's.
     served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
     config = uvicorn.Config(

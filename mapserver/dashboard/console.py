@@ -57,7 +57,7 @@ class Console:
         knows: Sequence[str] = (),
         under_way: Callable[[], list[str]] = list,
     ) -> None:
-        """Adds a page. fill: what its template needs, of a PageContext and the parts of `path` in braces; it may block.
+        """Adds a page. fill: what its template needs beside `context`, of that and the parts of `path` in braces; it may block.
 
         A FleetmapError becomes a notice within the frame. knows: query parameters beside the site. under_way: sites that the page
         knows though the store has no version of them.
@@ -71,11 +71,14 @@ class Console:
     def stream(
         self,
         path: str,
-        one: Callable[[PageContext], dict[str, object]],
+        one: Callable[..., dict[str, object]],
         *,
         under_way: Callable[[], list[str]] = list,
     ) -> None:
-        """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts."""
+        """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts.
+
+        one: as `fill` of a page.
+        """
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def followed(request: Request, site: str) -> StreamingResponse:
@@ -90,7 +93,7 @@ class Console:
                 is_signed_in = getattr(request.state, "operator", None) is not None
                 if is_signed_in and guard.identify(request.scope, uses=False) is None:
                     return b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
-                return b"data: %s\n\n" % to_json(one(context))
+                return b"data: %s\n\n" % to_json(one(context, **request.path_params))
 
             async def events() -> AsyncIterator[bytes]:
                 told = b""
@@ -121,7 +124,7 @@ class Console:
             check_query(request, knows)
             zone = zone_of(request.cookies.get(ZONE_COOKIE))
             context = PageContext(root, page, site, zone, request.query_params)
-            found = await load(lambda: fill(context, **request.path_params))
+            found = {"context": context} | await load(lambda: fill(context, **request.path_params))
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
         files = {name: f"{root}/static/vendor/{file}" for name, file in _MODULES.items()}

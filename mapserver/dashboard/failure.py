@@ -36,7 +36,6 @@ def _page(services: Services, context: PageContext, failure: str) -> dict[str, o
     pictures = [(picture.place, clock.at(picture.stamp_ns)) for picture in recorded]
     near, words = _nearby(services, row)
     return {
-        "context": context,
         "site": row.site,
         "row": row,
         "report": report,

@@ -85,7 +85,6 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
     shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
     return {
-        "context": context,
         "answer": _answer(matching),
         "is_chosen": any(kept.values()),
         "range": context.range_form("failures", usual="All", chosen=chosen),

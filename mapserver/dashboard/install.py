@@ -9,30 +9,22 @@ from nicegui import app as pages
 from nicegui import ui
 from starlette.middleware.gzip import GZipMiddleware
 
-from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
-from mapserver.dashboard import failure, failures, live_page, overview, sign_in_page, space_page
+from mapserver.dashboard import failure, failures, live_page, overview, robot, sign_in_page, space_page, survey_jobs
 from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.pages import (
-    map_page,
-    robot_page,
-    survey_page,
-)
+from mapserver.dashboard.pages import map_page
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
-from mapserver.serving.robot_placing import RobotPlacing
 from mapserver.store import MapStore
 
 
-def install_dashboard(
-    app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys, bus: Bus
-) -> None:
+def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
     """Adds the pages to `app`. Once in a process: NiceGUI keeps its pages in the module."""
     services = Services(
         MapData(store, settings.gate, settings.canary.share),
@@ -40,14 +32,12 @@ def install_dashboard(
         LiveRobots(fleet, time.monotonic),
         settings.guard,
         surveys,
-        RobotPlacing(store, fleet, bus),
     )
-    for page in (robot_page, map_page, survey_page):
-        page.install(services)
+    map_page.install(services)
     sign_in_page.install(app, settings.guard)
     console = Console(pages, services)
     console.files()
-    for module in (overview, failures, failure, space_page, live_page):
+    for module in (overview, failures, failure, space_page, live_page, robot, survey_jobs):
         module.install(console)
     _install_pictures(services, store)
 

@@ -23,7 +23,6 @@ from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
 from mapserver.dashboard.markup import address, age, joined, link, time_fields
 from mapserver.dashboard.site_map import SiteMap
 from mapserver.serving.live_surveys import LiveSurveys
-from mapserver.serving.robot_placing import RobotPlacing
 
 T = TypeVar("T")
 
@@ -50,14 +49,13 @@ _SESSION_EVERY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way, robots to be told."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
     guard: GuardSettings
     surveys: LiveSurveys
-    placing: RobotPlacing
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +72,9 @@ class PageContext:
         """A stamp of the server's clock by the clock of whoever looks."""
         return moment_text(stamp_ns, self.zone)
 
-    def when(self, stamp_ns: int) -> Markup:
-        """How long ago a stamp of the server's clock is, and where the pointer is the moment."""
+    def when(self, moment: int | str) -> Markup:
+        """How long ago a stamp of the server's clock or ISO 8601 text is, and where the pointer is the moment."""
+        stamp_ns = moment if isinstance(moment, int) else read_moment(moment, "time", UTC) or 0
         words = f"{age(max(0.0, time.time() - stamp_ns / 1e9))} ago"
         return Markup('<time title="{}">{}</time>').format(self.moment(stamp_ns), words)
 
@@ -157,8 +156,6 @@ async def show(
     try:
         sites = await load(services.maps.sites)
         under_way = services.surveys.sites() if page == "live" else []
-        if page == "surveys":
-            under_way = await load(services.maps.sites_with_jobs)
         if site is None and under_way and (page == "live" or not sites):
             site = under_way[0]
         chosen = site if site in under_way else await load(services.maps.chosen_site, site)
@@ -280,8 +277,3 @@ def _head(services: Services, request: Request, page: str, site: str | None, sit
     )
     if services.guard.warning:
         html(notice("bad", services.guard.warning))
-
-
-def back_link(context: PageContext, path: str, words: str) -> Markup:
-    """A link to the page above."""
-    return Markup("<p>{}</p>").format(link(context.to(path), words))

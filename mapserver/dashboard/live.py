@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleetmap.messages import Status
+from mapserver.dashboard.map_layers import Mark
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure, calibration_figures
+from mapserver.floor_plan.areas import Areas
 
 SILENT_S = 10.0  # robots report every second
 _LEFT_S = 3.0
 _CACHED_S = 0.9
 
-# Words and tone of a status. Robots may send others, which are shown as they are.
+# Words and tone of a status.
 STATUSES: dict[str, tuple[str, str]] = {
     Status.TRACKING: ("localised", "good"),
     Status.DEGRADED: ("unsure", "warn"),
@@ -23,6 +25,12 @@ STATUSES: dict[str, tuple[str, str]] = {
     Status.LOST: ("lost", "bad"),
 }
 SILENT = ("silent", "quiet")
+_SHAPES = {"warn": "triangle", "bad": "square"}
+
+
+def words_of(status: str) -> tuple[str, str]:
+    """Words and tone of a status; of one that is none of ours the robot's own word."""
+    return STATUSES.get(status, (status.lower(), "warn"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +63,20 @@ class LiveRobot:
     def is_behind(self) -> bool:
         """Whether it runs another version than it should."""
         return self.version != self.wanted_version
+
+    def where(self, areas: Areas) -> str:
+        """Where it was last, as people know it; empty where it never said."""
+        if self.place_m is None:
+            return ""
+        return areas.at(*self.place_m) or "at {:.1f}, {:.1f} m".format(*self.place_m)
+
+    def marks(self, address: str | None = None) -> list[Mark]:
+        """It on a map, if it ever sent a position."""
+        if self.place_m is None:
+            return []
+        x, y = (round(value, 2) for value in self.place_m)
+        shape, words = _SHAPES.get(self.tone, "circle"), f"{self.name}: {self.words}"
+        return [Mark(x, y, self.tone, shape, words, address, self.name, self.heading_rad)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +123,7 @@ def live_robot(status: RobotStatus) -> LiveRobot:
     """A robot as a page shows it."""
     estimate, health = status.last_pose or {}, status.last_health or {}
     sent = health.get("status") or estimate.get("status")
-    words, tone = STATUSES.get(str(sent), (str(sent).lower(), "warn")) if sent else ("not started", "quiet")
+    words, tone = words_of(str(sent)) if sent else ("not started", "quiet")
     # A robot that withdraws its liveliness token has left; one without a token is judged by its messages.
     if status.seconds_since > (SILENT_S if status.is_present is not False else _LEFT_S):
         words, tone = SILENT

@@ -13,13 +13,11 @@ from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.markup import age, share
-from mapserver.dashboard.pages.robot_page import where_words
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telling
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
-_SHAPES = {"good": "circle", "warn": "triangle", "bad": "square", "quiet": "circle"}
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
 
 
@@ -117,21 +115,14 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
         "state": robot.words,
         "since": since,
         "exact": exact,
-        "about": " · ".join(filter(None, [where_words(robot, areas), ", ".join(words).replace("_", " ")])),
+        "about": " · ".join(filter(None, [robot.where(areas), ", ".join(words).replace("_", " ")])),
         "place": robot.place_m,
     }
 
 
 def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
     """Robots that ever sent a position, those in trouble on top."""
-    found = []
-    for robot in reversed(live.robots):
-        if robot.place_m is not None:
-            shape, words = _SHAPES.get(robot.tone, "circle"), f"{robot.name}: {robot.words}"
-            address, (x, y) = context.to(f"robots/{robot.name}"), robot.place_m
-            place = round(x, 2), round(y, 2)
-            found.append(Mark(*place, robot.tone, shape, words, address, robot.name, robot.heading_rad))
-    return found
+    return [mark for robot in reversed(live.robots) for mark in robot.marks(context.to(f"robots/{robot.name}"))]
 
 
 def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
@@ -175,7 +166,6 @@ def _trends(services: Services, context: PageContext) -> dict[str, object]:
     ]
     cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
     return {
-        "context": context,
         "range": context.range_form("trends", usual="Last 24 h"),
         "tried": fleet_parts.trials_shown(health.trials, context.moment),
         "kpis": figures,

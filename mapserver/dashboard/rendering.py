@@ -6,7 +6,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
-from mapserver.dashboard.markup import share
+from mapserver.dashboard.markup import age, share
 from mapserver.fleet_statistics.kpis import Rate, driven_words, format_rate
 
 
@@ -22,4 +22,4 @@ def _counted(found: Rate) -> str:
 
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")
 TEMPLATES = Environment(loader=_LOADER, autoescape=True, undefined=StrictUndefined)
-TEMPLATES.filters |= {"script_json": script_json, "share": share, "rate": format_rate, "counted": _counted}
+TEMPLATES.filters |= {"script_json": script_json, "age": age, "share": share, "rate": format_rate, "counted": _counted}

@@ -73,7 +73,7 @@ from mapserver.tiles.landmark_budget import choose_landmarks
 from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
 from mapserver.trust.signing import check_base
 
-_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "culled", "directions", "starts")
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "starts")
 
 
 @dataclass(frozen=True, slots=True)

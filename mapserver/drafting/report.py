@@ -52,6 +52,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     scale_error: float | None
     peak_rss_mb: float
     findings: dict[str, list[str]]
+    checks: dict[str, str]
     corrections: dict[str, dict[str, float]] = {}
     culled: dict[str, int]
     sessions: list[dict[str, Any]]
@@ -141,6 +142,7 @@ def make_report(
         peak_rss_mb=round(peak_rss_mb, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
+        checks={s.entry.name: s.checks for s in recordings},
         corrections={s.entry.name: s.corrections for s in taken if s.corrections},
         sessions=sessions_report([s.entry.name for s in recordings], joined),
         joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},

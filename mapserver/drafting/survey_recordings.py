@@ -25,8 +25,9 @@ from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
+from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
+from mapserver.drafting.admission import DECISIVE, SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
 from mapserver.drafting.draft_evidence import HeldOut, held_out_of
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.report import check_truth
@@ -49,8 +50,8 @@ _log = logging.getLogger(__name__)
 class Surveyed:
     """One recording and its survey.
 
-    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements. calibration: what it says of
-    the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
+    map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements; checks: all of them in one line.
+    calibration: what it says of the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
     """
 
     entry: RecordingEntry
@@ -61,6 +62,7 @@ class Surveyed:
     survey: Survey
     map_from_survey: Array | None
     findings: tuple[str, ...]
+    checks: str
     calibration: RigEvidence
     corrections: dict[str, float]
     held_out: list[HeldOut]
@@ -342,6 +344,7 @@ def survey_recording(
             survey=done,
             map_from_survey=map_from_survey,
             findings=(*found.statements(), *said),
+            checks=summary(found.findings, DECISIVE),
             calibration=found.calibration,
             corrections=found.corrections,
             held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),

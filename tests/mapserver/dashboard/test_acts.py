@@ -11,7 +11,7 @@ from fleetmap.bus import Bus
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from mapserver import releases
 from mapserver.store import MapStore
-from support.fleet.dashboard_scene import SITE, Served, change, fill_store, opened, serving, talking
+from support.fleet.dashboard_scene import SITE, Served, change, fill_store, marks, opened, serving, talking
 
 
 def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
@@ -23,13 +23,11 @@ def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
         )
         seen = opened(page, served, "robots/tug-5")
         page.get_by_role("button", name="tug-5 is here").click()
-        expect(page.locator(".q-dialog")).to_contain_text("Click into the map")
+        expect(page.get_by_role("dialog")).to_contain_text("Click into the map")
         page.get_by_role("button", name="No, change nothing").click()
-        page.locator(".site-map").click()
+        page.locator(".site-map").click(position={"x": 150, "y": 150})
         expect(page.get_by_label("x (m)")).not_to_have_value("")
-        page.wait_for_function(
-            "document.querySelector('.site-map').marks().some(mark => mark.words === 'chosen place')"
-        )
+        assert "chosen place" in [mark["words"] for mark in marks(page)]
         page.get_by_label("Heading (°)").fill("90")
         x, y = (float(page.get_by_label(f"{axis} (m)").input_value()) for axis in "xy")
         change(page, "tug-5 is here")

@@ -66,9 +66,10 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         page.get_by_role("list", name="Robots, problems first").get_by_role("link").first.click()
         lost = page.url.rpartition("/")[2].partition("?")[0]
         expect(page.locator("h1")).to_have_text(lost)
-        expect(page.locator(".notice.bad")).to_contain_text(re.compile(r"^Lost since \d{4}-"))
+        expect(page.get_by_role("status")).to_contain_text(re.compile(r"^Lost for \d+ "))
+        expect(page.get_by_role("status")).to_have_attribute("title", re.compile(r"^since \d{4}-"))
         assert [mark["name"] for mark in marks(page)] == [lost]
-        expect(page.get_by_role("table", name="States, the last one first")).to_contain_text("lost")
+        expect(page.get_by_role("list", name="States, the last one first")).to_contain_text("lost")
         opened(page, served, "")
         before = page.evaluate("performance.timeOrigin")
         page.get_by_label("Find a robot").fill("tug-4")
@@ -164,28 +165,38 @@ def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
 
 def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> None:
     seen = opened(page, served, "surveys")
-    content = page.locator(".nicegui-content")
-    for words in (
-        "cameras are swapped",
-        "camera 1 is blurred",
-        "saw nothing that the map has",
-        "its neighbours disagree",
-    ):
-        expect(content).to_contain_text(words)
+    jobs, recordings = page.get_by_role("list", name="Jobs"), page.get_by_role("list", name="Recordings")
+    expect(jobs).to_contain_text("recording tuesday: cameras are swapped")
+    told = [re.sub(r"\s+", " ", row) for row in recordings.locator("> li").all_inner_texts()]
+    assert told == [
+        "sunday left out saw nothing that the map has 24 ok, 2 not judged: good enough to build",
+        "saturday.mcap refused no images",
+        "monday in the map found in the map 25 ok, 1 warn: good enough to build",
+        "friday.mcap waits it is not whole yet",
+    ]
+    recordings.get_by_text("24 ok, 2 not judged: good enough to build").click()
+    expect(recordings).to_contain_text("not judged gyro scale, gyro axes: it hardly turns; drive a curve")
+    recordings.get_by_text("25 ok, 1 warn").click()
+    expect(recordings.get_by_text("camera 1 is blurred")).to_be_visible()
+    page.get_by_text("Why 2 candidates were refused").click()
+    expect(page.get_by_role("table", name="Refused loops")).to_contain_text("its neighbours disagree")
     assert [page.locator(f".line.{tone}").count() for tone in ("good", "bad", "quiet")] == [1, 1, 1]
     with MapStore.open(served.folder) as store:
         job = store.begin_job(SITE, "convert")
-        expect(page.locator("tbody").first).to_contain_text("convert", timeout=8000)
+        expect(jobs).to_contain_text("convert", timeout=15_000)
         store.tell_progress(job, {"stage": "matching", "done": 30, "total": 120, "stage_s": 60.0})
-        expect(page.locator("tbody").first).to_contain_text("matching: 30 of 120, about 3 min more", timeout=8000)
-        assert page.locator("tbody progress").evaluate("bar => bar.value / bar.max") == 0.25
+        expect(jobs).to_contain_text("matching: 30 of 120, about 3 min more", timeout=15_000)
+        assert jobs.locator("progress").evaluate("bar => bar.value / bar.max") == 0.25
+        expect(recordings.get_by_text("camera 1 is blurred")).to_be_visible()
         store.update_job(job, "done", "converted", {})
         new = store.begin_job("yard", "build")
         store.tell_progress(new, {"stage": "odometry", "done": 1, "total": 10, "stage_s": 1.0})
+        of_yard = httpx.get(f"{served.http}/dashboard/surveys?site=hall&job={new}", timeout=60).text
+        assert f"job {new} is of site yard" in of_yard
         opened(page, served, "surveys", site="yard")
-        expect(page.locator("tbody")).to_contain_text("odometry: 1 of 10")
+        expect(jobs).to_contain_text("odometry: 1 of 10")
         store.update_job(new, "failed", "no frames", {})
-        expect(page.locator("tbody")).to_contain_text("no frames")
+        expect(jobs).to_contain_text("no frames", timeout=15_000)
     assert seen.faults == []
 
 
@@ -206,6 +217,7 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("map?version=x", "not a number"),
         ("failures/77", "no failure 77"),
         ("surveys?job=99", "no job 99"),
+        ("surveys?site=hall&job=x", "not a number"),
         ("robots/nobody", "never heard of a robot"),
         ("failures?sinc=2026-01-01", "this page knows site, cause"),
         ("failures?since=soon", "is no time; write"),

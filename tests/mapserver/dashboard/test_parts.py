@@ -23,9 +23,8 @@ from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
-from mapserver.dashboard.pages.robot_page import way
 from mapserver.dashboard.plan import make_plan
-from mapserver.dashboard.robot_history import SILENT, stretches
+from mapserver.dashboard.robot_history import curve, stretches, way
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.drafting.job_lock import recorded_job
 from mapserver.fleet.fleet import Fleet, RobotStatus
@@ -238,20 +237,20 @@ def traced(at_s: float, status: str, **more: object) -> TraceRow:
     return TraceRow(SITE, "r", 0, ns, status, 2, 1.0 + at_s, 2.0, 0.1, **({"heard_ns": ns} | more))  # type: ignore[arg-type]
 
 
-def test_traces_become_stretches_of_one_state() -> None:
+def test_traces_become_stretches_of_one_state_and_curves_that_break() -> None:
     rows = [traced(10 * n, "TRACKING", frame_ms=10.0 + n) for n in range(4)]
-    rows += [traced(33, "LOST", flags="dark"), traced(43, "LOST", flags="dark"), traced(300, "TRACKING")]
-    found = stretches(rows, 0, 320_000_000_000)
-    told = [(s.status, s.flags, s.since_ns // 10**9, s.until_ns // 10**9) for s in found]
+    rows += [traced(33, "LOST", flags="dark"), traced(43, "LOST", flags="dark"), traced(300, "TRACKING", frame_ms=26.0)]
+    told = [(s.status, s.flags, s.since_ns // 10**9, s.until_ns // 10**9) for s in stretches(rows, 320_000_000_000)]
     assert told == [
         ("TRACKING", "", 0, 33),
         ("LOST", "dark", 33, 54),
-        (SILENT, "", 54, 300),
+        ("", "", 54, 300),
         ("TRACKING", "", 300, 320),
     ]
-    assert found[0].frame_ms == 11.5
-    assert [s.status for s in stretches(rows, 20 * 10**9, 40 * 10**9)] == ["TRACKING", "LOST"]
-    assert stretches([], 0, 10) == []
+    assert stretches([], 10) == []
+    drawn = curve(rows, "frame_ms", (0, 450_000_000_000))
+    assert (drawn.low, drawn.high, drawn.path) == (11.5, 26.0, "M0.0 60h100.0M600.0 10h100.0")
+    assert curve(rows, "exposure", (0, 450_000_000_000)) is None
 
 
 def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:

@@ -92,7 +92,7 @@ def test_which_robots_need_a_person_now(operator: Operator) -> None:
 def test_why_did_tug_7_fail_at_14_03(operator: Operator) -> None:
     page = operator.page
     operator.follow(page.get_by_role("link", name="tug-7", exact=True).last, "**/robots/tug-7*")
-    failed = page.get_by_role("table", name="Failures").get_by_role("row", name=re.compile(r" \d\d:03:07 "))
+    failed = page.get_by_role("list", name="Failures").locator("li", has=page.get_by_title(re.compile(r" \d\d:03:07 ")))
     operator.click(failed.get_by_role("link", name=re.compile("^Failure")))
     expect(page.get_by_role("status")).to_contain_text(
         re.compile(r"^tug-7 failed .* in aisle 2: carried 5.0 m, by its own fixes, .*found again after 1.9 s")

@@ -92,7 +92,7 @@ def test_loops_are_those_of_the_build_that_made_the_version() -> None:
     night = {"builds": [build_report() | {"version": 2, "loop_places": []}, build_report()]}
     found = loops_of_version([{}, {"builds": "none"}, night], 3)
     assert [loop.is_accepted for loop in found] == [True, False, False]
-    assert found[0] == Loop((10.0, 6.0), (12.0, 6.5), "accepted")
+    assert found[0] == Loop((10.0, 6.0), (12.0, 6.5), "accepted", "", "monday", 0.4)
     assert loops_of_version([night], 2) == loops_of_version([night], 9) == []
     broken = build_report() | {"loop_places": [{"from_map_m": [1], "to_map_m": [2.0, "x"]}, "none", None]}
     assert loops_of_version([broken], 3) == []

@@ -98,7 +98,12 @@ def fill_store(folder: Path) -> None:
             if number < 3:
                 releases.publish(store, SITE, number, actor=ada)
         done = store.begin_job(SITE, "nightly")
-        store.update_job(done, "done", "draft 3 of 403 keyframes", {"builds": [build_report()]})
+        fates = [
+            {"name": "monday.mcap", "fate": "done"},
+            {"name": "saturday.mcap", "fate": "bad", "reason": "no images"},
+        ]
+        night = {"recordings": fates, "waiting": [{"name": "friday.mcap", "reason": "it is not whole yet"}]}
+        store.update_job(done, "done", "draft 3 of 403 keyframes", {"builds": [build_report()]} | night)
         failed = store.begin_job(SITE, "build")
         store.update_job(failed, "failed", "recording tuesday: cameras are swapped", {})
         fleet = Fleet(store)
@@ -123,7 +128,14 @@ def build_report() -> dict[str, object]:
     ]  # fmt: skip
     return {
         "version": 3,
-        "findings": {"monday": ["camera 1 is blurred in 3 % of the frames"], "sunday": []},
+        "findings": {
+            "monday": ["blur: camera 1 is blurred in 3 % of the frames"],
+            "sunday": [f"{name}: not judged: it hardly turns; drive a curve" for name in ("gyro scale", "gyro axes")],
+        },
+        "checks": {
+            "monday": "25 ok, 1 warn: good enough to build",
+            "sunday": "24 ok, 2 not judged: good enough to build",
+        },
         "sessions": [
             {"recording": "monday", "joined": True, "reason": "found in the map"},
             {"recording": "sunday", "joined": False, "reason": "saw nothing that the map has"},
@@ -350,7 +362,7 @@ def overlapping(
 def change(page: Page, words: str, *, name: str | None = "ada") -> None:
     """Asks for a change and confirms it."""
     page.get_by_role("button", name=words, exact=True).click()
-    dialog = page.locator(".q-dialog")
+    dialog = page.get_by_role("dialog")
     if name is not None:
         dialog.get_by_label("Your name").fill(name)
     dialog.get_by_label("Reason").fill("robots lose themselves in aisle 3")

@@ -101,6 +101,7 @@ export class SiteMap {
   }
   show(name, items, isMoving = true) {
     const group = this.layers[name];
+    if (!group) return; // of a version that was published while the page is open
     this.fill(group, items, isMoving);
     this.nameAreas();
     if (this.follows && !this.touched) this.grow(items);

@@ -1,0 +1,150 @@
+"""The page of surveys: what was built, what failed? Jobs with their progress, what became of every recording, loops on the map."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import PurePath
+from typing import Any, NamedTuple
+
+from fleetmap.errors import UsageError
+from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
+from mapserver.dashboard.space.loops import Loop, builds_of, dicts, loops_of
+from mapserver.store import JobInfo
+
+_TELLING_S = 4.0  # of a stage, before what is left of it can be said
+_LONG_H = 12.0  # a job that is killed cannot say so
+_VERDICTS = {
+    "accepted": ("good", "accepted"),
+    "rejected": ("bad", "refused by what is seen"),
+    "ambiguous": ("bad", "refused as ambiguous"),
+    "gated_out": ("quiet", "refused by position"),
+}
+_LEFT_OUT = {"foreign": "another place", "undecided": "held", "bad": "refused"}
+
+
+class _Recording(NamedTuple):
+    """A recording of a job. checks: the doctor in one line; found: what was wanting; unjudged: by what they lack, checks not judged."""
+
+    name: str
+    tone: str
+    result: str
+    reason: str | None
+    checks: str | None = None
+    figures: str = ""
+    found: Sequence[str] = ()
+    unjudged: Mapping[str, Sequence[str]] = {}
+
+
+def install(console: Console) -> None:
+    """Adds the page."""
+    services = console.services
+
+    def page(context: PageContext) -> dict[str, object]:
+        return _page(services, context)
+
+    under_way = services.maps.sites_with_jobs
+    console.page("surveys", "surveys.html", page, knows=("job", "since", "until"), under_way=under_way)
+
+
+def _page(services: Services, context: PageContext) -> dict[str, object]:
+    jobs, wanted = services.maps.jobs(context.site, context.time_range()), number(context.query.get("job"), "job")
+    newest = next((job for job in jobs if job.report and job.state != "running"), None)
+    chosen = newest if wanted is None else services.maps.job(wanted)
+    shown: dict[str, object] = {
+        "range": context.range_form("surveys", usual="All jobs"),
+        "jobs": [(job, _state(job), _progress(job)) for job in jobs],
+        "chosen": chosen,
+    }
+    if chosen is None:
+        return shown
+    if chosen.site != context.site:
+        raise UsageError(f"job {chosen.id} is of site {chosen.site}; choose that site above")
+    return shown | _loops(services, context, builds_of(chosen.report)[-1]) | {"recordings": _recordings(chosen)}
+
+
+def _state(job: JobInfo) -> str:
+    hours = (datetime.now(UTC) - datetime.fromisoformat(job.started)).total_seconds() / 3600
+    return "running or killed" if job.state == "running" and hours >= _LONG_H else job.state
+
+
+def _progress(job: JobInfo) -> dict[str, object] | None:
+    """The stage of a running job, how far it is, and how many seconds that stage takes still."""
+    told = job.report.get("progress")
+    if job.state != "running" or not isinstance(told, dict):
+        return None
+    done, total, stage_s = (float(told.get(name) or 0) for name in ("done", "total", "stage_s"))
+    left_s = stage_s * (total - done) / done if done > 0 and stage_s >= _TELLING_S else None
+    return {"stage": told.get("stage"), "done": done, "total": total, "left_s": left_s}
+
+
+def _recordings(job: JobInfo) -> list[_Recording]:
+    """What became of every recording, those that are left out first; a later build of a night has the last word."""
+    rows: dict[str, _Recording] = {}
+    for build in builds_of(job.report):
+        for session in dicts(build.get("sessions")):
+            name, left = str(session.get("recording")), _LEFT_OUT.get(str(session.get("verdict")), "left out")
+            tone, result = ("good", "in the map") if session.get("joined") else ("bad", left)
+            found, checks = ((build.get(key) or {}).get(name) for key in ("findings", "checks"))
+            said = checks, _figures(session.get("evidence")), *_remarks(found or ())
+            rows[name] = _Recording(name, tone, result, session.get("reason"), *said)
+    waiting = [entry | {"fate": "waits"} for entry in dicts(job.report.get("waiting"))]
+    for entry in [*dicts(job.report.get("recordings")), *waiting]:
+        name, fate = str(entry.get("name")), str(entry.get("fate"))
+        if fate != "done":
+            tone = "quiet" if fate == "waits" else "bad"
+            rows.setdefault(PurePath(name).stem, _Recording(name, tone, _LEFT_OUT.get(fate, fate), entry.get("reason")))
+    return sorted(rows.values(), key=lambda row: row.tone != "bad")
+
+
+def _remarks(words: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """Remarks of the doctor, and by what they lack the checks that could not be judged."""
+    found: list[str] = []
+    unjudged: dict[str, list[str]] = {}
+    for remark in words:
+        name, is_unjudged, missing = remark.partition(": not judged: ")
+        (unjudged.setdefault(missing, []) if is_unjudged else found).append(name)
+    return found, unjudged
+
+
+def _figures(evidence: Any) -> str:
+    """By what it was joined; empty for the recording that began a map and for old reports."""
+    if not isinstance(evidence, dict) or not evidence.get("fixes"):
+        return ""
+    words = f"{evidence['fixes']} fixes agree, at {evidence['places']} places"
+    if not evidence.get("cells_expected"):
+        return words
+    low, share, high = (round(100 * evidence[name]) for name in ("share_low", "seen_share", "share_high"))
+    return f"{words}; it sees {share} % ({low} to {high} %) of {evidence['cells_expected']} parts of the map"
+
+
+def _loops(services: Services, context: PageContext, build: dict[str, Any]) -> dict[str, object]:
+    """Loops of a build on the map that it made, on the current one where that was removed."""
+    found: list[Loop] = loops_of(build)
+    version: Any = build.get("version")
+    if found and not services.maps.has_version(context.site, version):
+        version = services.maps.current_version(context.site)
+    items: list[Item] = []
+    for loop in reversed(found):  # accepted ones on top
+        tone, words = _told(loop)
+        ends = [loop.start_map_m, loop.end_map_m]
+        items.append(Line(ends, tone, words))
+        items += [Mark(*end, tone, "circle", words) for end in ends if loop.is_accepted]
+    refused = [(loop, *_told(loop)) for loop in found if not loop.is_accepted]
+    drawn = None if not found or version is None else scene_of(services, context, version, [Layer("Loops", items)])
+    reasons = Counter(loop.reason or words for loop, _, words in refused).most_common()
+    return {
+        "scene": drawn,
+        "version": version,
+        "counts": build.get("loops"),
+        "loops": found,
+        "refused": refused,
+        "reasons": reasons,
+    }
+
+
+def _told(loop: Loop) -> tuple[str, str]:
+    """Tone and words of what became of a loop."""
+    tone, words = _VERDICTS.get(loop.verdict, ("quiet", loop.verdict))
+    return tone, f"{words}: {loop.reason}" if loop.reason else words
