@@ -28,7 +28,7 @@ def install(console: Console) -> None:
 def _page(services: Services, context: PageContext, failure: str) -> dict[str, object]:
     detail = services.health.failure(number(failure, "failure") or 0)
     row, report, began_ns = detail.failure, detail.report, detail.report.stamp_ns
-    context = replace(context, site=row.site)
+    context = replace(context, site=row.site)  # whatever site the address names, or none
     moments = story.moments_near(services.health.replay(row.number), began_ns)
     clock = story.FailureClock(began_ns, row.happened_ns, context.zone)
     recorded = story.pictures_near(detail.pictures, began_ns)
@@ -36,6 +36,7 @@ def _page(services: Services, context: PageContext, failure: str) -> dict[str, o
     pictures = [(picture.place, clock.at(picture.stamp_ns)) for picture in recorded]
     near, words = _nearby(services, row)
     return {
+        "context": context,
         "site": row.site,
         "row": row,
         "report": report,

@@ -39,7 +39,7 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     console.files()
     for module in (overview, failures, failure, space_page, live_page, robot, survey_jobs):
         module.install(console)
-    _install_pictures(services, store)
+    _install_pictures(services)
 
     @app.get("/", include_in_schema=False)
     def to_dashboard(request: Request) -> RedirectResponse:
@@ -60,7 +60,7 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     )
 
 
-def _install_pictures(services: Services, store: MapStore) -> None:
+def _install_pictures(services: Services) -> None:
     @pages.get("/plans/{site}/{version}.png", include_in_schema=False)
     def plan(site: str, version: int) -> Response:
         """The picture of a version's plan; versions do not change."""
@@ -88,14 +88,6 @@ def _install_pictures(services: Services, store: MapStore) -> None:
         if found is None:
             return Response(f"version {version} of {site} has no {kind}", 404, media_type="text/plain")
         return _picture(found[0], "image/png", "private, no-cache")
-
-    @pages.get("/pictures/{failure}/{place}.jpg", include_in_schema=False)
-    def picture(failure: int, place: int) -> Response:
-        """A picture of a failure."""
-        try:
-            return _picture(store.fleet.picture(failure, place), "image/jpeg", "private, max-age=86400")
-        except FleetmapError as error:
-            return Response(str(error), 404, media_type="text/plain")
 
 
 def _picture(data: bytes, media_type: str, cache_control: str) -> Response:

@@ -105,7 +105,6 @@ def test_moments_and_pictures_of_another_time_are_left_out() -> None:
     assert story.pictures_near([far, *near[::-1]], BEGAN_NS) == near
     assert story.steps(CARRIED, BEGAN_NS) == {"A second before": 40, "As it began": 50, "Found again": 69}
     assert list(story.steps(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
-    assert story.steps((), BEGAN_NS) == {}
 
 
 def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
@@ -158,6 +157,7 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
             given = {"site": SITE, "robot": name, "id": f"of-{name}", "began_ns": BEGAN_NS, "stamps_ns": stamps_ns}
             file = small_file(folder / "failure.mcap", jpegs=jpegs, moments=moments, **given)
             send_replay(fleet, SITE, name, f"of-{name}", file)
+        save_surfel_draft(store, wall(), site="annex")  # which an address without a site means
         version = save_surfel_draft(store, wall(), site=SITE)
         optical = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
         camera = CameraNote(
@@ -208,6 +208,8 @@ def test_the_seconds_are_stepped_through(page: Page, served: Served) -> None:
 
 def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/1")
+    expect(page.get_by_label("Site")).to_have_value(SITE)
+    expect(page.get_by_role("link", name="All failures")).to_have_attribute("href", re.compile(f"site={SITE}$"))
     expect(page.locator("#seen")).to_be_visible()
     expect(page.locator("main")).to_contain_text("no recording of the seconds around it")
     expect(page.locator("main")).to_contain_text("No expected view: the report does not tell the robot's camera")
@@ -221,14 +223,12 @@ def test_one_or_many(page: Page, served: Served) -> None:
     expect(page.locator("main")).to_contain_text(
         "3 others began within 5 m of it, 1 with this cause, of 3 other robots; tug-3 never failed elsewhere."
     )
-    near = page.get_by_role("list", name="Failures").get_by_role("listitem")
-    expect(near.first).to_contain_text("Failure 4")
-    expect(near).to_have_count(3)
+    expect(page.get_by_role("list", name="Failures").get_by_role("listitem")).to_have_count(3)
 
 
 def test_the_expected_view_stands_beside_the_picture(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures/5")
-    expect(page.locator(".views img")).to_have_count(2)
+    expect(page.locator(".seen-expected img")).to_have_count(2)
     wait_until(page, "document.querySelector('img[src*=expected]').naturalWidth === 320", within_s=90)
     assert_whole(page)
     assert seen.faults == []
