@@ -79,7 +79,8 @@ class HealthData:
 
     def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
         """Where a robot was and what it said of itself, thinned, oldest first."""
-        found = self._store.fleet.trace(site, robot, since_hour=hour_of(since_ns))
+        hours = {"since_hour": hour_of(since_ns), "until_hour": hour_of(until_ns - 1) + 1}
+        found = self._store.fleet.trace(site, robot, **hours)
         return [row for row in found if since_ns <= row.heard_ns < until_ns]
 
     def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:

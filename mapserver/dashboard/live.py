@@ -94,7 +94,7 @@ class LiveSite:
         return next((robot for robot in self.robots if robot.name == name), None)
 
 
-_ORDER = {"bad": 0, "warn": 1, "quiet": 2, "good": 3}
+ORDER = {"bad": 0, "warn": 1, "quiet": 2, "good": 3}
 
 
 class LiveRobots:
@@ -113,7 +113,7 @@ class LiveRobots:
             if cached is not None and self._clock_s() - cached[0] < _CACHED_S:
                 return cached[1]
             robots = [live_robot(status) for status in self._fleet.robots(site)]
-            robots.sort(key=lambda robot: (_ORDER.get(robot.tone, 1), robot.name))
+            robots.sort(key=lambda robot: (ORDER.get(robot.tone, 1), robot.name))
             found = LiveSite(tuple(robots))
             self._cached[site] = (self._clock_s(), found)
         return found

@@ -1,7 +1,6 @@
 """The page of a robot: what has it been doing? A band of its states, its way and its figures in a time; a stream tells what it is now."""
 
 import time
-from itertools import pairwise
 
 from fleetmap.errors import UsageError
 from mapserver.dashboard.console import Console, scene_of
@@ -11,12 +10,12 @@ from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot
 from mapserver.dashboard.map_layers import Layer
 from mapserver.dashboard.markup import age
-from mapserver.dashboard.robot_history import curve, stretches, way
+from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter
 
 _USUAL_NS = 24 * 3_600_000_000_000
-_TICKS = 5
+_TICKS, _BAND_PARTS = 5, 400
 _FIGURES = (
     ("CPU of a frame, mean", "frame_ms_mean", "{:.1f} ms"),
     ("CPU of a frame, slowest of a hundred", "frame_ms_p99", "{:.1f} ms"),
@@ -27,9 +26,9 @@ _FIGURES = (
     ("Failure reports that wait", "spool_waiting", "{:.0f}"),
 )
 _CURVES = (
-    ("CPU of a frame", "frame_ms", "{:.1f}", " ms"),
-    ("Brightness of the image (0 to 1)", "exposure", "{:.2f}", ""),
-    ("Sharpness (1 is usual)", "sharpness", "{:.2f}", ""),
+    ("CPU of a frame", "frame_ms", "{:.1f} ms"),
+    ("Brightness of the image (0 to 1)", "exposure", "{:.2f}"),
+    ("Sharpness (1 is usual)", "sharpness", "{:.2f}"),
 )
 
 
@@ -60,15 +59,15 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
     span_ns = until_ns - since_ns
     rows = sorted(services.health.trace(context.site, robot.name, since_ns, until_ns), key=lambda row: row.heard_ns)
     parts = stretches(rows, until_ns)
-    known = [part for part in parts if part.version is not None]
+    shown = band(parts, span_ns // _BAND_PARTS)
     wanted = FailureFilter(site=context.site, robot=robot.name, until_ns=end_ns)
     failures = services.health.failures(wanted, None)[:FAILURES_SHOWN]
     within = [row for row in failures if row.happened_ns >= since_ns]
-    curves = [(name, form, unit, curve(rows, field, (since_ns, until_ns))) for name, field, form, unit in _CURVES]
+    curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
     version = robot.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
-        trail = way(rows)
+        trail = way(rows, shown)
         layers = [
             Layer("Way", trail),
             Layer("Failures", failure_marks(context, within)),
@@ -86,10 +85,8 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
         "ticks": [since_ns + n * span_ns // (_TICKS - 1) for n in range(_TICKS)],
         "is_day": span_ns <= 1.5 * _USUAL_NS,
         "parts": parts,
-        "changes": [
-            part for was, part in pairwise([None, *known]) if part and (was is None or was.version != part.version)
-        ],
-        "curves": [(name, form, unit, found) for name, form, unit, found in curves if found],
+        "band": shown,
+        "curves": [(words, form, *found) for words, form, found in curves if found],
         "failures": failures,
         "pictures": services.health.first_pictures(row.number for row in failures),
         "within": within,

@@ -2,11 +2,11 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from itertools import pairwise
+from math import dist
 from statistics import fmean
 from typing import NamedTuple
 
-from mapserver.dashboard.live import SILENT, words_of
+from mapserver.dashboard.live import ORDER, SILENT, words_of
 from mapserver.dashboard.map_layers import Line
 from mapserver.store import TraceRow
 
@@ -14,31 +14,32 @@ GAP_NS = 45_000_000_000
 """Robots report every second, of which one in ten seconds is kept: after so long without one it was silent."""
 
 _COLUMNS = 300  # of a curve
+_STEP_M = 0.5
 Range = tuple[int, int]
 """From when until before when, nanoseconds since 1970."""
 
 
 class Stretch(NamedTuple):
-    """From when until when a robot had one status, version and set of flags; status "" where nothing was heard."""
+    """From when until when a robot had one status, version and set of flags; status "" where nothing was heard.
+
+    is_mixed: others were between, too short to be seen.
+    """
 
     since_ns: int
     until_ns: int
     status: str
     version: int | None = None
     flags: str = ""
+    is_mixed: bool = False
+
+    @property
+    def length_ns(self) -> int:
+        return self.until_ns - self.since_ns
 
     @property
     def state(self) -> tuple[str, str]:
         """The status in words, and its tone."""
         return words_of(self.status) if self.status else SILENT
-
-
-class Curve(NamedTuple):
-    """How a figure went: from low to high, and an SVG path 1000 wide and 100 high, from 0 at its foot, broken where nothing was heard."""
-
-    low: float
-    high: float
-    path: str
 
 
 def stretches(rows: Sequence[TraceRow], until_ns: int) -> list[Stretch]:
@@ -56,27 +57,45 @@ def stretches(rows: Sequence[TraceRow], until_ns: int) -> list[Stretch]:
     return found
 
 
-def way(rows: Sequence[TraceRow]) -> list[Line]:
-    """Where it drove, by tone; nothing joins what lies apart in time."""
-    found: list[Line] = []
-    for before, row in pairwise(rows):
-        start, end = _place(before), _place(row)
-        if start is None or end is None or row.heard_ns - before.heard_ns > GAP_NS:
-            continue
-        tone = words_of(row.status)[1]
-        if found and found[-1].tone == tone and found[-1].points[-1] == start:
-            found[-1].points.append(end)
+def band(parts: Sequence[Stretch], least_ns: int) -> list[Stretch]:
+    """Stretches that can be told apart: neighbours shorter than `least_ns` are one, as the worst of them."""
+    found: list[Stretch] = []
+    for part in parts:
+        if found and max(found[-1].length_ns, part.length_ns) < least_ns:
+            worst = min(found[-1], part, key=lambda each: ORDER[each.state[1]])
+            found[-1] = worst._replace(since_ns=found[-1].since_ns, until_ns=part.until_ns, is_mixed=True)
         else:
-            found.append(Line([start, end], tone))
+            found.append(part)
     return found
 
 
-def _place(row: TraceRow) -> tuple[float, float] | None:
-    return None if row.x_map_m is None or row.y_map_m is None else (round(row.x_map_m, 2), round(row.y_map_m, 2))
+def way(rows: Sequence[TraceRow], parts: Sequence[Stretch]) -> list[Line]:
+    """Where it drove, in the tones of the stretches, the worst on top. Nothing joins what lies apart in time; who stands adds nothing."""
+    found: list[Line] = []
+    remaining, before_ns = iter(parts), None
+    part = next(remaining, None)
+    for row in rows:
+        if row.x_map_m is None or row.y_map_m is None:
+            before_ns = None
+            continue
+        while part is not None and part.until_ns <= row.heard_ns:
+            part = next(remaining, None)
+        here, tone = (round(row.x_map_m, 2), round(row.y_map_m, 2)), "quiet" if part is None else part.state[1]
+        if before_ns is None or row.heard_ns - before_ns > GAP_NS:
+            found.append(Line([here], tone))
+        elif tone != found[-1].tone:
+            found.append(Line([found[-1].points[-1], here], tone))
+        elif dist(found[-1].points[-1], here) >= _STEP_M:
+            found[-1].points.append(here)
+        before_ns = row.heard_ns
+    return sorted((line for line in found if len(line.points) > 1), key=lambda line: -ORDER[line.tone])
 
 
-def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> Curve | None:
-    """How a figure of the traces went, as means of equal parts of a range; None where it was never reported."""
+def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, float, str] | None:
+    """How a figure of the traces went, in means of equal parts of a range: lowest, highest, and the path of an SVG 1000 wide and 100 high.
+
+    It begins at 0 and is broken where nothing was heard; None where the figure was never reported.
+    """
     part_ns = max((shown[1] - shown[0]) // _COLUMNS, GAP_NS)
     parts: dict[int, list[float]] = defaultdict(list)
     for row in rows:
@@ -90,4 +109,4 @@ def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> Curve | None:
         f"{'L' if n - 1 in means else 'M'}{n * width:.1f} {100 - 90 * mean / (high or 1):.0f}h{width:.1f}"
         for n, mean in means.items()
     )
-    return Curve(min(means.values()), high, path)
+    return min(means.values()), high, path

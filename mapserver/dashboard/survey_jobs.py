@@ -2,11 +2,11 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from fleetmap.errors import UsageError
 from mapserver.dashboard.console import Console, scene_of
 from mapserver.dashboard.layout import PageContext, Services, number
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
@@ -39,28 +39,27 @@ class _Recording(NamedTuple):
 
 def install(console: Console) -> None:
     """Adds the page."""
-    services = console.services
-
-    def page(context: PageContext) -> dict[str, object]:
-        return _page(services, context)
-
-    under_way = services.maps.sites_with_jobs
-    console.page("surveys", "surveys.html", page, knows=("job", "since", "until"), under_way=under_way)
+    services, knows = console.services, ("job", "since", "until")
+    sites = services.maps.sites_with_jobs
+    console.page("surveys", "surveys.html", lambda context: _page(services, context), knows=knows, under_way=sites)
 
 
 def _page(services: Services, context: PageContext) -> dict[str, object]:
-    jobs, wanted = services.maps.jobs(context.site, context.time_range()), number(context.query.get("job"), "job")
-    newest = next((job for job in jobs if job.report and job.state != "running"), None)
-    chosen = newest if wanted is None else services.maps.job(wanted)
+    wanted = number(context.query.get("job"), "job")
+    chosen = None if wanted is None else services.maps.job(wanted)
+    if chosen is not None:
+        context = replace(context, site=chosen.site)  # whatever site the address names, or none
+    jobs = services.maps.jobs(context.site, context.time_range())
+    chosen = chosen or next((job for job in jobs if job.report and job.state != "running"), None)
     shown: dict[str, object] = {
+        "context": context,
+        "site": context.site,
         "range": context.range_form("surveys", usual="All jobs"),
         "jobs": [(job, _state(job), _progress(job)) for job in jobs],
         "chosen": chosen,
     }
     if chosen is None:
         return shown
-    if chosen.site != context.site:
-        raise UsageError(f"job {chosen.id} is of site {chosen.site}; choose that site above")
     return shown | _loops(services, context, builds_of(chosen.report)[-1]) | {"recordings": _recordings(chosen)}
 
 

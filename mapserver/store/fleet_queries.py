@@ -210,13 +210,17 @@ class FleetQueries:
             )
         return bytes(rows[0]["mcap"])
 
-    def trace(self, site: str, robot: str, *, since_hour: int = 0) -> list[TraceRow]:
+    def trace(self, site: str, robot: str, *, since_hour: int = 0, until_hour: int = 1 << 60) -> list[TraceRow]:
+        """What is kept of a robot, oldest first. Hour by hour: in the order of the table an hour's other robots lie between."""
         return self._transactions.rows(
             TraceRow,
-            f"""SELECT k.site, k.key robot, {_TRACE_COLUMNS}
-               FROM traces t JOIN tally_keys k ON k.id = t.key_id
-               WHERE t.hour >= ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
-            (since_hour, site, robot),
+            f"""WITH RECURSIVE asked(at, last) AS (
+                    SELECT max(?1, (SELECT min(hour) FROM traces)), min(?2 - 1, (SELECT max(hour) FROM traces))
+                    UNION ALL SELECT at + 1, last FROM asked WHERE at < last)
+               SELECT k.site, k.key robot, {_TRACE_COLUMNS}
+               FROM tally_keys k CROSS JOIN asked CROSS JOIN traces t ON t.hour = at AND t.key_id = k.id
+               WHERE at <= last AND k.site = ?3 AND k.axis = 'robot' AND k.key = ?4 ORDER BY t.hour, t.stamp_ns""",
+            (since_hour, until_hour, site, robot),
         )
 
     def prune(self, retention: FleetRetention) -> int:

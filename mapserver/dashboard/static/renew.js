@@ -1,5 +1,6 @@
-// Shows what is marked `data-renew` anew from time to time, as it would be loaded, unless somebody writes into it; and what lies on maps.
-const EVERY_MS = 5000;
+// Shows what is marked `data-renew` anew every 5 or so many seconds, as it would be loaded,
+// unless somebody writes into it; and what lies on maps.
+const EVERY_MS = 1000 * (document.querySelector("[data-renew]")?.dataset.renew || 5);
 const shown = new Map([...document.querySelectorAll("[data-renew]")].map((part) => [part, part.innerHTML]));
 
 export async function renew() {

@@ -1,6 +1,7 @@
 // The page of a robot: what it is now, from second to second, and a person's word of where it stands.
 import "./maps.js";
 import "./renew.js";
+import { follow } from "./stream.js";
 
 const element = document.getElementById("map");
 const map = element?.map;
@@ -44,7 +45,4 @@ if (place) {
   choose();
 }
 show(JSON.parse(document.getElementById("now").textContent));
-const stream = new EventSource(line.dataset.follows);
-stream.onmessage = ({ data }) => show(JSON.parse(data));
-stream.addEventListener("ended", ({ data }) => location.assign(data));
-stream.onerror = () => say({ words: "The server does not answer; trying again.", tone: "bad", exact: "" });
+follow(`${robot}/now`, show, () => say({ words: "The server does not answer; trying again.", tone: "bad", exact: "" }));

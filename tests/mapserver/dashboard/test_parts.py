@@ -24,7 +24,7 @@ from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
 from mapserver.dashboard.pages.map_page import one_way
 from mapserver.dashboard.plan import make_plan
-from mapserver.dashboard.robot_history import curve, stretches, way
+from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.drafting.job_lock import recorded_job
 from mapserver.fleet.fleet import Fleet, RobotStatus
@@ -248,14 +248,28 @@ def test_traces_become_stretches_of_one_state_and_curves_that_break() -> None:
         ("TRACKING", "", 300, 320),
     ]
     assert stretches([], 10) == []
-    drawn = curve(rows, "frame_ms", (0, 450_000_000_000))
-    assert (drawn.low, drawn.high, drawn.path) == (11.5, 26.0, "M0.0 60h100.0M600.0 10h100.0")
+    assert curve(rows, "frame_ms", (0, 450_000_000_000)) == (11.5, 26.0, "M0.0 60h100.0M600.0 10h100.0")
     assert curve(rows, "exposure", (0, 450_000_000_000)) is None
 
 
 def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:
     rows = [traced(0, "TRACKING"), traced(10, "TRACKING"), traced(20, "LOST"), traced(300, "LOST"), traced(310, "LOST")]
-    assert [(line.tone, len(line.points)) for line in way(rows)] == [("good", 2), ("bad", 2), ("bad", 2)]
+    parts = stretches(rows, 320_000_000_000)
+    assert [(line.tone, len(line.points)) for line in way(rows, parts)] == [("good", 2), ("bad", 2), ("bad", 2)]
+    assert way([replace(traced(n, "TRACKING"), x_map_m=0.1) for n in range(9)], parts) == [], (
+        "who stands does not drive"
+    )
+
+
+def test_a_robot_that_wavers_is_drawn_in_few_parts() -> None:
+    rows = [traced(10 * n, "LOST" if n % 2 else "TRACKING") for n in range(1000)]
+    rows += [traced(10_000 + 10 * n, "TRACKING") for n in range(100)]
+    parts = stretches(rows, 11_000_000_000_000)
+    drawn = band(parts, 100_000_000_000)
+    assert (len(parts), len(drawn)) == (1001, 101)
+    assert {part.state[1] for part in drawn[:-1]} == {"bad"}
+    assert (drawn[-1].state[1], drawn[-1].length_ns) == ("good", 1_000_000_000_000)
+    assert sum(part.length_ns for part in drawn) == 11_000_000_000_000
 
 
 def test_a_place_that_is_no_number_is_no_place() -> None:

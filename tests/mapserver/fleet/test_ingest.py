@@ -259,6 +259,7 @@ def test_old_and_many_things_go(site: Site) -> None:
     site.run(made(site, 1), 20, START_NS + 10 * HOUR_NS)
     fleet.prune(replace(usual, trace_rows=3))
     assert {row.hour for row in fleet.trace("lab", "r0")} == {490_010}
+    assert fleet.trace("lab", "r0", until_hour=490_010) == fleet.trace("lab", "r0", since_hour=490_011) == []
     site.set_ns(START_NS + 500 * 24 * HOUR_NS)
     assert fleet.prune(usual) > 0
     assert fleet.counters("lab", "site") == {}
