@@ -1,4 +1,4 @@
-"""What the demo shows: whether a recording has a truth, the robots that the server knows, the table of results."""
+"""Output of the demo: ground truth of a recording (yes or no), robots of the server, table of results."""
 
 import json
 import sys
@@ -22,7 +22,7 @@ BUILD_ROWS = (
     ("keyframes", "keyframes", 1, "{:d}"),
     ("landmarks", "landmarks", 1, "{:d}"),
     ("map that a robot downloads", "map_bytes", 1e-3, "{:.0f} kB"),
-    ("loops looked at", "loops.candidates", 1, "{:d}"),
+    ("loop candidates", "loops.candidates", 1, "{:d}"),
     ("loops refused by position", "loops.gated_out", 1, "{:d}"),
     ("loops refused by geometry", "loops.rejected", 1, "{:d}"),
     ("loops accepted", "loops.accepted", 1, "{:d}"),
@@ -33,7 +33,7 @@ REPLAY_ROWS = (
     ("map version", "map_version", 1, "{:d}"),
     ("frames", "frames", 1, "{:d}"),
     ("first fix after", "first_fix_s", 1, "{:.2f} s"),
-    ("localised, of all", "localised_share_of_all", 100, "{:.1f} %"),
+    ("localized, of all", "localised_share_of_all", 100, "{:.1f} %"),
     ("position error, median", "error_m.median", 1, "{:.3f} m"),
     ("position error, 95 %", "error_m.p95", 1, "{:.3f} m"),
     ("position error, 99 %", "error_m.p99", 1, "{:.3f} m"),
@@ -48,7 +48,7 @@ REPLAY_ROWS = (
 
 
 def value_at(report: Report, path: str) -> Any:
-    """The value at a dotted path; None where it, or what should hold it, is null."""
+    """Return the value at a dotted path; None if it or one of its parents is null."""
     value: Any = report
     for key in path.split("."):
         if value is None:
@@ -71,7 +71,7 @@ def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tu
 
 
 def has_truth(recording: Path) -> bool:
-    """Whether the recording carries ground truth."""
+    """Return True if the recording carries ground truth."""
     from fleetmap.recordings import open_recording
 
     with open_recording(recording) as source:
@@ -79,7 +79,7 @@ def has_truth(recording: Path) -> bool:
 
 
 def show_robots(console: Console, url: str) -> None:
-    """One line for each robot; no robot is an error, because one has just reported."""
+    """Print one line for each robot; SystemExit without any, because one has just reported."""
     with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
         robots = json.load(answer)["robots"]
     if not robots:
@@ -90,13 +90,13 @@ def show_robots(console: Console, url: str) -> None:
             Text(
                 f"robot {robot['robot']} on site {robot['site']}: runs version {robot['version']}, "
                 f"should run {robot['wanted_version']}, last status {health.get('status')}, "
-                f"flags {', '.join(health.get('flags') or ()) or 'none'}, heard {robot['seconds_since']:.1f} s ago"
+                f"flags {', '.join(health.get('flags') or ()) or 'none'}, last report {robot['seconds_since']:.1f} s ago"
             )
         )
 
 
 def main(arguments: list[str]) -> None:
-    """Runs one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json...."""
+    """Run one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json...."""
     console = Console(width=78)
     match arguments:
         case ["has-truth", recording]:

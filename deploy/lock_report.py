@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def locked(report: dict) -> list[str]:
-    """A line for each library but the project itself; SystemExit for a file whose hash the index did not say."""
+    """Return a line for each library except the project itself; SystemExit for a file without a hash in the index."""
     lines = []
     for entry in report["install"]:
         name, version = entry["metadata"]["name"], entry["metadata"]["version"]

@@ -12,7 +12,7 @@ from mapserver import Actor, build_map, open_map
 
 
 def main(recording: str, store: str, site: str, picture: str | None = None, rig: str = "") -> None:
-    """Builds, publishes and reads a map."""
+    """Build, publish and read a map."""
     # Odometry, keyframes, loops, bundle adjustment, and a draft in the store.
     draft = build_map([recording], store, site)
     print(draft.sentence)
@@ -21,10 +21,10 @@ def main(recording: str, store: str, site: str, picture: str | None = None, rig:
     print(f"{len(positions_m)} frames over {length_m:.1f} m")
     if picture is not None:
         draft.save_picture(picture)
-    # The gate judges the draft; one that it refuses raises GateRefusedError with the reasons. A drive that is short or straight
-    # cannot judge its rig's calibration: whoever knows that to be right says so.
+    # The gate checks the draft; GateRefusedError has the reasons if it refuses. A short or straight drive does not verify the rig's
+    # calibration: pass `known-rig` if it is known to be right.
     draft.publish(trust_calibration=rig == "known-rig", actor=Actor("example", "the rig is known"))
-    # The published version as robots get it.
+    # Read the published version as robots receive it.
     published = open_map(store, site)
     print(f"version {published.version}: {len(published.points_map)} landmarks in {len(published.tiles)} tiles")
 

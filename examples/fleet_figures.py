@@ -1,6 +1,6 @@
 """Figures of the robots that report to a store: python examples/fleet_figures.py STORE SITE [HOURS]
 
-Failures per robot-day (16 h of driving) with the interval that holds the true rate with 95 %, by robot and by map version:
+Failures per robot-day (16 h of driving) with the 95 % confidence interval of the rate, by robot and by map version:
 the numbers behind the dashboard and `mapserver fleet report`, as Python values. Robots send them to `mapserver serve`.
 """
 
@@ -14,7 +14,7 @@ from mapserver.fleet_statistics.kpis import Kpis
 
 
 def in_words(figures: Kpis) -> str:
-    """A line of a table."""
+    """Return a line of a table."""
     failures = figures.failures
     if failures.per_robot_day is None:
         return f"{figures.observed_h:7.1f} h, not driven"
@@ -22,12 +22,12 @@ def in_words(figures: Kpis) -> str:
     share = figures.localised_share_of_all
     localised = "-" if share is None else f"{share:.1%} of the driving"
     return (
-        f"{figures.driving_h:7.1f} h, {failures.per_robot_day:.2f} failures a day ({interval}), localised {localised}"
+        f"{figures.driving_h:7.1f} h, {failures.per_robot_day:.2f} failures a day ({interval}), localized {localised}"
     )
 
 
 def main(store: str, site: str, hours: str = "24") -> None:
-    """Prints the tables, the worst robots and versions first."""
+    """Print the tables, the worst robots and versions first."""
     with open_store(store) as maps:
         summary = summarise(maps, site, int(hours), time.time_ns())
     print(f"{site}, version {summary.current_version}, last {hours} h: {in_words(summary.total)}")

@@ -1,4 +1,4 @@
-"""A drive localized in a published map: python examples/localize_in_it.py RECORDING STORE SITE [OUT.tum [PICTURE.png]]
+"""Localize a drive in a published map: python examples/localize_in_it.py RECORDING STORE SITE [OUT.tum [PICTURE.png]]
 
 STORE is the folder of a map store, or the endpoint of a server such as tcp/127.0.0.1:7447. The frames of the recording
 pass through the same object that runs on a robot.
@@ -13,13 +13,13 @@ from locclient import localize
 
 
 def main(recording: str, store: str, site: str, out: str | None = None, picture: str | None = None) -> None:
-    """Localizes the recording and prints what came of it."""
+    """Localize the recording and print the result."""
     result = localize(recording, store, site)
-    # A status for every frame: the robot says when it is sure, when places look alike, and when it is lost.
+    # A status for every frame: TRACKING, AMBIGUOUS where places look alike, LOST and so on.
     for status, count in Counter(result.statuses).most_common():
         print(f"{status}: {count} frames")
     report = result.report
-    print(f"localised {report['localised_share_of_all']:.0%} of the frames, first fix after {report['first_fix_s']} s")
+    print(f"localized {report['localised_share_of_all']:.0%} of the frames, first fix after {report['first_fix_s']} s")
     if report.get("error_m"):
         print(f"position error against ground truth: {report['error_m']}")
     if out is not None:

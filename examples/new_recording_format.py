@@ -1,4 +1,4 @@
-"""A recording format of one's own: python examples/new_recording_format.py FOLDER
+"""Add a recording format: python examples/new_recording_format.py FOLDER
 
 The format is a folder of numbered stereo pairs, NNN_left.png and NNN_right.png at 10 Hz, with `calibration.yaml` (a
 Kalibr camchain). Every program of the project reads it once it is in RECORDING_FORMATS.
@@ -31,39 +31,39 @@ PERIOD_NS = 100_000_000
 
 @dataclass(frozen=True)
 class NumberedPairs:
-    """Access to the images, still encoded or decoded, in any order (a FrameSource)."""
+    """Random access to the images, encoded or decoded (a FrameSource)."""
 
     lefts: list[Path]
     stamps_ns: NDArray[np.int64]
 
     def stored(self, index: int) -> StoredFrame:
-        """A pair as it is stored."""
+        """Return an encoded pair."""
         left = self.lefts[index]
         right = left.with_name(left.name.replace("left", "right"))
         images = [StoredImage("file", file.read_bytes(), str(file)) for file in (left, right)]
         return StoredFrame(int(self.stamps_ns[index]), *images)
 
     def frame(self, index: int) -> CameraFrame:
-        """A pair, decoded."""
+        """Return a decoded pair."""
         return decode_frame(self.stored(index))
 
     def part(self, indices: NDArray[np.int64]) -> "NumberedPairs":
-        """Some of the pairs, for a process that reads them beside others."""
+        """Return a subset of the pairs, for a process that reads it in parallel to others."""
         return NumberedPairs([self.lefts[int(index)] for index in indices], self.stamps_ns[indices])
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
-        """Feeds every byte that was read to the recording's content hash."""
+        """Feed every input byte to the recording's content hash."""
         for index in range(len(self.lefts)):
             frame = self.stored(index)
             for image in (frame.left, frame.right):
                 digest.update(b"" if image is None else image.data)
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file is open."""
 
 
 def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a folder of numbered pairs."""
+    """Open a folder of numbered pairs."""
     log, lefts = ReadLog(), sorted(path.glob("*_left.png"))
     calibration = read_calibration(options.calibration_file or path / "calibration.yaml")
     stamps_ns = np.arange(len(lefts), dtype=np.int64) * PERIOD_NS

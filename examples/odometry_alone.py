@@ -1,7 +1,7 @@
-"""Odometry over a recording, without a map: python examples/odometry_alone.py RECORDING OUT.tum
+"""Run the odometry over a recording, without a map: python examples/odometry_alone.py RECORDING OUT.tum
 
-Any cameras, with or without IMU. The trajectory is written as TUM text; where evo is installed and the recording has
-ground truth, the error is printed and a plot is saved beside it.
+Works with any cameras, with or without IMU. Writes the trajectory as TUM text. If evo is installed and the recording has
+ground truth, prints the error and saves a plot beside the trajectory.
 """
 
 import sys
@@ -17,21 +17,21 @@ LEAD_NS = 30_000_000  # IMU and wheels are fed a little ahead of each frame
 
 
 def run_odometry(recording: Recording) -> Trajectory:
-    """The estimated odom_from_body at every frame."""
+    """Return the estimated odom_from_body at every frame."""
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
     camera, shift_s = rectifier.camera, rectifier.imu_minus_cam_s
     odometry = make_odometry(recording.calibration, camera, rectifier.body_from_cam, shift_s, OdometrySettings())
     odom_from_body, fed_ns = [], -(2**62)
     for index in range(len(recording)):
         frame = recording.read_frame(index)
-        # 1. The inertial samples and wheel odometry up to the frame, on the IMU's clock.
+        # 1. Feed the inertial samples and wheel odometry up to the frame, on the IMU's clock.
         until_ns = frame.stamp_ns + int(shift_s * 1e9) + LEAD_NS
         odometry.handle_imu(recording.imu.between(fed_ns, until_ns))
         odometry.handle_wheel(wheel_between(recording.wheel, fed_ns, until_ns))
         fed_ns = until_ns
-        # 2. The frame itself.
+        # 2. Feed the frame.
         estimate = odometry.handle_stereo(rectifier.rectify(frame))
-        # 3. When gravity is found, the frame `odom` turns: earlier estimates turn with it.
+        # 3. Once gravity is estimated, the frame `odom` is rotated: rotate earlier estimates with it.
         if estimate.new_odom_from_old_odom is not None:
             odom_from_body = [estimate.new_odom_from_old_odom @ earlier for earlier in odom_from_body]
         odom_from_body.append(estimate.odom_from_body)
@@ -41,7 +41,7 @@ def run_odometry(recording: Recording) -> Trajectory:
 
 
 def compare_with_evo(estimated: Path) -> None:
-    """Prints the absolute trajectory error after alignment and saves a plot of both trajectories."""
+    """Print the absolute trajectory error after alignment and save a plot of both trajectories."""
     try:
         import matplotlib
 
@@ -64,7 +64,7 @@ def compare_with_evo(estimated: Path) -> None:
 
 
 def main(path: str, out: str) -> None:
-    """Runs the odometry, writes the trajectory, compares it with the truth."""
+    """Run the odometry, write the trajectory, compare it with the ground truth."""
     with open_recording(path) as recording:
         trajectory = run_odometry(recording)
         write_tum(Path(out), trajectory)

@@ -1,6 +1,6 @@
 """Localization of camera robots in the maps of their fleet.
 
-A whole recording, as `locclient replay` does it:
+Localize a whole recording, as `locclient replay` does:
 
     from locclient import localize
 
@@ -8,9 +8,9 @@ A whole recording, as `locclient replay` does it:
     result.report["localised_share_of_all"], result.map_from_body, result.statuses
     result.save_picture("drive.png")
 
-`Localizer` takes samples one by one and gives an `Estimate` for each frame; `Robot` adds failures and new map versions to it.
+`Localizer` takes samples one by one and returns an `Estimate` for each frame; `Robot` adds failure detection and map updates.
 
-One frame alone, without odometry or history, is relocalized in three steps:
+Relocalize a single frame, without odometry or history:
 
     from locclient import LocalizerSettings, MapView, Relocalizer, fetch_map, finished
 
@@ -19,8 +19,8 @@ One frame alone, without odometry or history, is relocalized in three steps:
     relocalizer = Relocalizer(view, rectifier.camera, settings)
     fixes = finished(relocalizer.anywhere(finished(relocalizer.extract(rectifier.rectify(frame)))))
 
-`fixes` are the places that verify, the best first; fixes[0].map_from_cam is (4, 4). Several similar ones mean that the place is
-ambiguous: racks repeat.
+`fixes` are the verified places, the best first; fixes[0].map_from_cam is (4, 4). Several fixes with similar support mean that the
+place is ambiguous, as between identical racks.
 """
 
 from importlib import import_module
@@ -69,7 +69,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 
 def __getattr__(name: str) -> object:
-    """Imports a public name when it is first used, so that `import locclient` stays light (PEP 562)."""
+    """Import a public name on first use, so that `import locclient` stays fast (PEP 562)."""
     if name not in _MODULES:
         raise AttributeError(f"module 'locclient' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -21,18 +21,18 @@ def enrol(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="ROBOT.fleetmap, from `mapserver robots enrol`.")],
     identity: IdentityFolder = None,
 ) -> None:
-    """Make this robot's own key, and get a certificate for it. `run`, `replay` and `check` then need no server and no root."""
+    """Create this robot's key and obtain a certificate for it. `run`, `replay` and `check` then need neither `server` nor `root`."""
     from locclient.identity import RobotIdentity, identity_folder
 
     with disk_errors(f"{bundle} cannot be read", "check the path", UsageError):
         if bundle.stat().st_size > _MAX_BUNDLE_BYTES:
-            raise UsageError(f"{bundle} has {bundle.stat().st_size} bytes and is no enrolment bundle")
+            raise UsageError(f"{bundle} has {bundle.stat().st_size} bytes and is not an enrolment bundle")
         data = bundle.read_bytes()
     made = RobotIdentity.enrol(identity_folder(identity), data)
     about = made.certificate()
     typer.echo(f"enrolled as {made.who.robot} of site {made.who.site} at {made.who.endpoint}")
     typer.echo(f"certificate {about.name} until {about.ends:%Y-%m-%d}, in {made.folder}")
-    typer.echo(f"{bundle} is used and worth nothing now; remove it")
+    typer.echo(f"{bundle} is used and no longer valid; remove it")
 
 
 def check(
@@ -87,7 +87,7 @@ def status(
         typer.Option(metavar="DIR", help="The daemon's $RUNTIME_DIRECTORY; default: ours, or /run/fleetmap."),
     ] = None,
 ) -> None:
-    """Print what the running daemon last said; status 3 if it has not said anything for ten seconds."""
+    """Print the last status of the running daemon; exit status 3 if it is older than ten seconds."""
     from locclient.daemon.service_manager import last_status, runtime_folder
 
     typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
@@ -113,7 +113,7 @@ def _read_config(path: Path | None) -> "tuple[LocclientConfig, Options]":
 
 
 def _with_insecure(config: "LocclientConfig", *, insecure: bool) -> "LocclientConfig":
-    """The configuration, [run] insecure as on the command line where that says so."""
+    """Return the configuration, with [run] insecure set if `insecure`."""
     from msgspec.structs import replace
 
     return replace(config, run=replace(config.run, insecure=True)) if insecure else config
@@ -121,12 +121,12 @@ def _with_insecure(config: "LocclientConfig", *, insecure: bool) -> "LocclientCo
 
 app = make_app(COMMANDS, locclient, _read_config)
 
-# Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
+# Set before numpy is imported: matrix products are small, and a second BLAS thread costs more than it saves.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:
-    """Runs the command line."""
+    """Run the command line."""
     run_cli(app)
 
 

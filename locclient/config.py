@@ -47,7 +47,7 @@ TIERS = {
 
 
 class RunSection(Section, frozen=True):
-    """Who the robot is, where its map comes from, and what it may keep."""
+    """Name of the robot, source of its map, and limits of its files."""
 
     server: str | None = None
     store: str | None = None
@@ -71,7 +71,7 @@ class RunSection(Section, frozen=True):
 
 
 class LocclientConfig(Section, frozen=True):
-    """The whole file. `site`, and either `store` or `server`, at its top go for [run] and [replay]."""
+    """The whole file. Top-level `site`, and either `store` or `server`, apply to [run] and [replay]."""
 
     site: str | None = None
     store: str | None = None
@@ -85,9 +85,9 @@ class LocclientConfig(Section, frozen=True):
 
 
 def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig, Options]:
-    """Settings of the file at `path` and the options that it sets for `commands`, the defaults without one.
+    """Read the settings of the file at `path` and its options for `commands`; the defaults if `path` is None.
 
-    UsageError as `load_toml`, and for keys that are internal constants.
+    Raises UsageError as `load_toml`, and for keys that are internal constants.
     """
     if path is None:
         return LocclientConfig(), {}
@@ -98,7 +98,7 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
 
 
 def with_common(given: dict[str, Any]) -> dict[str, Any]:
-    """The content of a file, its [run] and [replay] completed by the keys at the top."""
+    """Return the content of a file, with [run] and [replay] completed by the top-level keys."""
     completed = dict(given)
     for name in ("run", "replay"):
         section: dict[str, Any] = given.get(name, {})

@@ -1,8 +1,8 @@
-"""A robot's identity: the folder that enrolment fills, and what follows from it for every connection to the server.
+"""A robot's identity: the folder that enrolment fills, and the settings that it gives every connection to the server.
 
-robot.pem      key and certificate in one file, so that both change in one moment; its presence says that the robot is enrolled
-next.pem       the key that waits for its certificate; on the disk before anybody is asked, because answers get lost
-servers.ca     who may sign servers' certificates          root.json    whose lists of maps are believed
+robot.pem      key and certificate in one file, so that both change atomically; the robot is enrolled if it exists
+next.pem       the key that waits for its certificate; written before the request, because responses may be lost
+servers.ca     authorities of servers' certificates        root.json    keys of trusted lists of maps
 identity.json  site, robot and endpoint
 """
 
@@ -25,13 +25,13 @@ from fleetmap.messages import decode_message, robot_key
 if TYPE_CHECKING:
     from fleetmap.trust.enrolment import CertificateInfo
 
-_LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot that was parked for eleven months comes back
+_LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot parked for eleven months can reconnect
 _ANSWER_S = 20.0
 _ENROL = "enrol it: `mapserver robots enrol ROBOT --site SITE` on the server, `locclient enrol ROBOT.fleetmap` here"
 
 
 class Identity(msgspec.Struct, frozen=True, kw_only=True):
-    """Who the robot is, and where its server is."""
+    """Site and name of the robot, endpoint of its server."""
 
     site: str
     robot: str
@@ -39,14 +39,14 @@ class Identity(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotIdentity:
-    """One folder, for this account alone."""
+    """One folder, accessible to this account only."""
 
     def __init__(self, folder: Path, who: Identity) -> None:
         self.folder, self.who = folder, who
 
     @classmethod
     def load(cls, folder: Path) -> Self | None:
-        """The identity in a folder, None where the robot is not enrolled; UsageError where it cannot be read."""
+        """Load the identity in a folder, None if the robot is not enrolled; UsageError if it cannot be read."""
         with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
             if not (folder / "robot.pem").is_file():
                 return None
@@ -63,29 +63,29 @@ class RobotIdentity:
         return TlsFiles(self.folder / "servers.ca", self.folder / "robot.pem")
 
     def certificate(self) -> "CertificateInfo":
-        """About the robot's certificate; UsageError for a damaged file."""
+        """Return details of the robot's certificate; UsageError for a damaged file."""
         from fleetmap.trust.enrolment import certificate_info
 
         return certificate_info(self._read("robot.pem"))
 
     def is_renewal_due(self, now: datetime) -> bool:
-        """Whether the certificate is a month old, or was signed while the server's clock was ahead."""
+        """Return True if the certificate is a month old, or was signed while the server's clock was ahead."""
         left = self.certificate().ends - now
         return not _LIFE - _RENEW_AFTER <= left <= _LIFE + timedelta(days=1)
 
     def renew(self, bus: Bus) -> None:
-        """Another key and certificate in the place of the present ones; connections that stand are not touched.
+        """Replace key and certificate by new ones; open connections are not affected.
 
-        Raises LinkError where the server is away or refuses, StoreError where the disk does. The present ones stay then.
+        Raises LinkError if the server is unreachable or refuses, StoreError on a disk error. The old ones stay then.
         """
         self._ask(bus, self._read("robot.pem"), _ANSWER_S)
 
     @classmethod
     def enrol(cls, folder: Path, bundle: bytes) -> Self:
-        """The identity that a bundle brings. May be repeated where the answer was lost.
+        """Enrol with a bundle and return the identity. May be repeated if the response was lost.
 
-        Raises UsageError for something that is no bundle, StateError where the robot has an identity, LinkError where the server
-        cannot be reached or refuses.
+        Raises UsageError for an invalid bundle, StateError if the robot has an identity, LinkError if the server is unreachable or
+        refuses.
         """
         from fleetmap.trust.enrolment import decode_bundle
 
@@ -131,10 +131,10 @@ class RobotIdentity:
         )
         if enrolment.certificate_info(answer.certificate.encode()).fingerprint != enrolment.key_fingerprint(key):
             raise LinkError("the server answered with a certificate of another key; who answers there?")
-        # Before the certificate: with it the robot may meet a server that another authority signed.
+        # Written before the certificate: with it the robot may connect to a server signed by another authority.
         self._write("servers.ca", answer.servers.encode())
         self._write("robot.pem", key + answer.certificate.encode())
-        with suppress(OSError):  # a key that has a certificate is not asked for again
+        with suppress(OSError):  # a leftover key that has a certificate is not requested again
             (self.folder / "next.pem").unlink()
 
     def _next_key(self, old: bytes) -> bytes:
@@ -153,16 +153,16 @@ class RobotIdentity:
             return (self.folder / name).read_bytes()
 
     def _write(self, name: str, data: bytes) -> None:
-        """Whole or not at all, for this account alone, also after a power cut."""
+        """Write atomically, for this account only, also in a power failure."""
         with disk_errors(f"{self.folder / name} cannot be written", "make space, or choose another folder"):
             write_atomically(self.folder / name, [data])
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapAddress:
-    """Where a robot's map comes from: `server` an endpoint, or `store` a folder. identity: where the server knows robots.
+    """Source of a robot's map: `server`, an endpoint, or `store`, a folder. identity: for servers that authenticate robots.
 
-    version: one of the store's, drafts too; None for the current one.
+    version: number in the store, drafts included; None for the current one.
     """
 
     site: str
@@ -180,7 +180,7 @@ class MapAddress:
 
 @dataclass(frozen=True, kw_only=True)
 class GivenAddress:
-    """What the configuration says of the map's address; what it leaves out comes from the identity."""
+    """Settings of the map's address; missing ones come from the identity."""
 
     site: str | None
     robot: str | None
@@ -192,15 +192,15 @@ class GivenAddress:
     sign: str = ""  # before the names in messages
 
     def resolve(self, usual_robot: str | None = None) -> MapAddress:
-        """The address. usual_robot: the name of a robot that has none.
+        """Return the address. usual_robot: the name of a robot that has none.
 
-        UsageError for contradictions, and for a server on another machine that cannot know the robot."""
+        UsageError for contradictions, and for a server on another machine that cannot authenticate the robot."""
         if self.server is not None and self.store is not None:
             raise UsageError(f"give either {self.sign}server, such as tls/HOST:7447, or {self.sign}store, a folder")
         folder = identity_folder(self.identity)
         identity = None if self.store is not None else RobotIdentity.load(folder)
         if identity is None:
-            self._named("site", None, None)  # the first thing that is asked of who has given nothing
+            self._named("site", None, None)  # first error of an empty configuration
         server = self.server or (None if identity is None else identity.who.endpoint)
         if server is None and self.store is None:
             raise UsageError(
@@ -234,7 +234,7 @@ class GivenAddress:
 
 
 def check_reach(endpoint: str | None, *, insecure: bool) -> None:
-    """Raises UsageError for an endpoint without TLS on another machine, unless that is wanted."""
+    """Raise UsageError for an endpoint without TLS on another machine, unless `insecure`."""
     if endpoint is None or has_tls(check_endpoint(endpoint)) or is_loopback(endpoint) or insecure:
         return
     raise UsageError(
@@ -244,7 +244,7 @@ def check_reach(endpoint: str | None, *, insecure: bool) -> None:
 
 
 def identity_folder(setting: str | Path | None = None) -> Path:
-    """The folder of the setting, else `identity` in the unit's or the user's folder of state (STATE_DIRECTORY, XDG_STATE_HOME)."""
+    """Return the folder of the setting, else `identity` in the unit's or user's state folder (STATE_DIRECTORY, XDG_STATE_HOME)."""
     if setting is not None:
         return Path(setting)
     if unit := os.environ.get("STATE_DIRECTORY"):

@@ -1,4 +1,4 @@
-"""Position priors as users write them, X,Y,YAW,SIGMA_M, and as the server passes on a person's word."""
+"""Position priors from the option X,Y,YAW,SIGMA_M, and from an operator's message by the server."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 
 
 def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
-    """The prior of the base in `map`, its heading not constrained; None for None; UsageError for anything else."""
+    """Parse a prior of the base in `map`, with unconstrained heading; None for None; UsageError for invalid text."""
     if text is None:
         return None
     try:
@@ -23,10 +23,10 @@ def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
 
 
 def told_prior(told: InitialPoseMessage) -> PositionPrior:
-    """A person's word from now on: believed over what the robot tracks, until fixes outweigh it. LinkError for what is no place."""
+    """Return an operator's pose as a prior that overrides the tracked pose until fixes outweigh it. LinkError for an invalid pose."""
     values = [told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m]
     if not np.isfinite(values).all() or not told.sigma_m > 0:
-        raise LinkError(f"a place at {values[:2]} m, heading {told.heading_rad} rad, sigma {told.sigma_m} m is none")
+        raise LinkError(f"invalid initial pose: {values[:2]} m, heading {told.heading_rad} rad, sigma {told.sigma_m} m")
     sigmas = UNSAID_SIGMAS.copy()
     sigmas[3:5] = told.sigma_m
     if told.heading_rad is None:

@@ -20,14 +20,14 @@ Insecure = Annotated[
 ]
 IdentityFolder = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Folder that `locclient enrol` fills; default: in the user's folder of state."),
+    typer.Option(metavar="DIR", help="Folder that `locclient enrol` fills; default: in the user's state folder."),
 ]
 NOT_LOCALISED_STATUS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """The map and the robot that asks for it."""
+    """Options of the map and of the robot's name."""
 
     server: Annotated[
         str | None, typer.Option(help="zenoh endpoint of the map server; default: the robot's identity.")
@@ -35,7 +35,7 @@ class MapOptions:
     store: Annotated[Path | None, typer.Option(help="Folder of a map store, instead of a server.")] = None
     site: Annotated[str | None, typer.Option(help="Name of the site.")] = None
     robot: Annotated[
-        str | None, typer.Option(help="Name by which the map is asked for; default: the identity's, or replay.")
+        str | None, typer.Option(help="Name of the robot for the server; default: the identity's, or replay.")
     ] = None
     cache: Annotated[Path | None, typer.Option(help="Folder of the tile cache; default: the user's cache.")] = None
     root: Annotated[
@@ -44,11 +44,11 @@ class MapOptions:
     ] = None
     identity: IdentityFolder = None
     insecure: Insecure = False
-    # As tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
+    # Equals tile_cache.DEFAULT_MAX_BYTES, which is not imported, so that --help stays fast.
     cache_bytes: Annotated[int, typer.Option(min=0, help="Largest size of the tile cache.")] = 2_000_000_000
 
     def address(self, version: int | None) -> "MapAddress":
-        """Where the map comes from; UsageError unless the options name one map, and for a version of a server's."""
+        """Return the map's address; UsageError unless the options name one map, and for a version with a server."""
         from locclient.identity import GivenAddress
 
         words = {name: None if value is None else str(value) for name, value in vars(self).items()}
@@ -64,7 +64,7 @@ class MapOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaybackOptions:
-    """The frames of a recording that are played, and how."""
+    """Played frames of a recording, and playback options."""
 
     frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames to play.")] = ":"
     calibration: Annotated[
@@ -83,12 +83,12 @@ class ResultFiles:
     """Files to write."""
 
     report: Annotated[Path | None, typer.Option(help="Write the report to this JSON file.")] = None
-    trajectory: Annotated[Path | None, typer.Option(help="Write the localised frames to this TUM file.")] = None
+    trajectory: Annotated[Path | None, typer.Option(help="Write the localized frames to this TUM file.")] = None
     picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
 
     def check(self) -> None:
-        """Raises UsageError for files that cannot be written."""
+        """Raise UsageError for files that cannot be written."""
         for name, path in vars(self).items():
             if path is not None and not path.parent.is_dir():
                 raise UsageError(f"--{name} {path}: the folder {path.parent} does not exist; make it first")
@@ -107,14 +107,14 @@ def replay(
     files: ResultFiles,
     version: Annotated[
         int | None,
-        typer.Option(min=1, help="Version of the map in --store, drafts too; default: the current one."),
+        typer.Option(min=1, help="Version of the map in --store, drafts included; default: the current one."),
     ] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: it did not find itself.
+    """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: never localized.
 
-    A failure's recording begins with the robot's pose, in the robot's version unless --version names another, and is compared with what
-    the robot said.
+    A failure's recording starts with the robot's pose, in the robot's version unless --version names another, and the result is compared
+    with the robot's.
     """
     from fleetmap.recordings.failure_recording import is_failure_recording
 
@@ -130,7 +130,7 @@ def replay(
 def _replay_failure(
     path: Path, map_options: MapOptions, playback: PlaybackOptions, files: ResultFiles, version: int | None
 ) -> None:
-    """Asks whether the present localizer would have failed too; the site is the failure's unless another is named."""
+    """Report if the present localizer would have failed too; the site is the failure's unless another is named."""
     from fleetmap.encoding import to_json
     from locclient.delivery.failure_file import read_failure_file
     from locclient.maps.connection import connected

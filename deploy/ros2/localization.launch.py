@@ -1,4 +1,4 @@
-"""In the place of nav2_bringup's localization_launch.py: the lifecycle manager. locclient is a service of its own and publishes /map.
+"""Replacement of nav2_bringup's localization_launch.py: the lifecycle manager. locclient is a separate service and publishes /map.
 
 ros2 launch deploy/ros2/localization.launch.py params:=deploy/ros2/nav2_params.yaml
 """
@@ -10,7 +10,7 @@ from launch_ros.actions import Node
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Starts it with the parameters of a file."""
+    """Start the lifecycle manager with the parameters of a file."""
     lifecycle_manager = Node(
         package="nav2_lifecycle_manager",
         executable="lifecycle_manager",

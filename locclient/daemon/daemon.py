@@ -41,12 +41,12 @@ from locclient.vda5050.fleet_maps import FleetMaps
 from locclient.vda5050.mqtt_link import MqttLink
 from locclient.vda5050.settings import check_section, origins_of
 
-_PATIENCE_S = 120.0  # in the middle of fetching a version; from the next part on it goes on where it was
+_PATIENCE_S = 120.0  # without an answer during a download; the next attempt resumes it
 _log = logging.getLogger(__name__)
 
 
 def check_run(config: LocclientConfig) -> MapAddress:
-    """Who the robot is, and where its map comes from; UsageError naming what [run] lacks or contradicts."""
+    """Check the configuration and return the map's address; UsageError names missing or contradicting settings of [run]."""
     run = config.run
     try:
         address = GivenAddress(
@@ -71,34 +71,34 @@ def check_run(config: LocclientConfig) -> MapAddress:
         check_for_ros2(output)
     if output.format == "ros2" and output.odom_topic.lstrip("/") == config.topics.wheel.lstrip("/"):
         raise UsageError(
-            f"[output] odom_topic = {output.odom_topic!r} is also where [topics] wheel listens: the robot would take its own "
-            'odometry for that of its wheels; set wheel = "" where it has none'
+            f"[output] odom_topic = {output.odom_topic!r} is also the topic of [topics] wheel: the robot would take its own "
+            'odometry for that of its wheels; set wheel = "" if it has none'
         )
     if run.replays not in ("off", *PICTURES):
         raise UsageError(f"[run] replays = {run.replays!r}: choose off, {' or '.join(PICTURES)}")
     if run.frame_queue < 1:
-        raise UsageError(f"[run] frame_queue = {run.frame_queue}: at least one frame must be able to wait")
+        raise UsageError(f"[run] frame_queue = {run.frame_queue}: must be at least 1")
     if not run.trial.contradicting_looks < config.localizer.track.kidnap_fixes:
         raise UsageError(
             f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
-            f"{config.localizer.track.kidnap_fixes}: a version must be given up before the robot believes that it was carried away"
+            f"{config.localizer.track.kidnap_fixes}: a new version must be dropped before the robot concludes that it was carried"
         )
     if config.vda5050.broker is not None:
         check_section(config.vda5050, insecure=run.insecure)
         if address.store is not None:
             raise UsageError(
-                "[vda5050] needs a map server: its signed lists say which maps may be run; set server, not store"
+                "[vda5050] needs a map server: its signed lists define the admitted maps; set server, not store"
             )
     return address
 
 
 @contextmanager
 def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
-    """The parts of the daemon, compiled and with the last good version chosen, without waiting for anybody; closed afterwards.
+    """Open the parts of the daemon, with the last good version selected, without waiting for the server; close them afterwards.
 
-    Raises FleetmapError for whatever of the configuration cannot be used.
+    Raises FleetmapError for unusable settings.
     """
-    cv2.setNumThreads(1)  # the rest of the board belongs to the robot's other programs
+    cv2.setNumThreads(1)  # leave the other cores to the robot's other programs
     run = config.run
     address = check_run(config)
     site, name = address.site, address.robot
@@ -122,7 +122,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if outbox.fault:
             _log.error("failures are not kept: %s", outbox.fault)
         if outbox.set_aside is not None:
-            _log.warning("the spool was damaged; it lies in %s now, and a new one was begun", outbox.set_aside)
+            _log.warning("the spool was damaged; it was moved to %s, and a new one was started", outbox.set_aside)
         give_back_free_memory()
         stack.enter_context(gc_frozen())
         caches: tuple[TileCache, ...] = ()
@@ -132,7 +132,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if bus is None:
             maps, first = _local_map(run, site)
         else:
-            # Two views of the same folder, because a cache is not for two threads; the second only reads.
+            # Two caches of the same folder, because one is not thread-safe; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
             client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
             client.require(trusted_map(bus, address, cache_folder(run.cache)))
@@ -177,7 +177,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
 
 
 def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:
-    """Renews the certificate of a robot that has one, once it is a month old."""
+    """Renew the certificate of an enrolled robot once it is a month old."""
     identity = address.identity
 
     def renew() -> None:
@@ -191,7 +191,7 @@ def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:
 def _fleet_manager(
     config: LocclientConfig, site: str, server: ServerSync, cache: TileCache, intake: Intake
 ) -> MqttLink:
-    """The connection of [vda5050], and the server's choice of versions given up for the fleet manager's where that is set."""
+    """Open the connection of [vda5050]; if set there, the fleet manager selects the version instead of the map server."""
     section, insecure, client, maps = config.vda5050, config.run.insecure, server.client, None
     if section.versions == "fleet manager":
         server.follows = False
@@ -212,7 +212,7 @@ def _fleet_manager(
 
 
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
-    """The file of the spool: as set, else beside the usual cache."""
+    """Return the file of the spool: as set, else beside the default cache."""
     return outbox_path(site, robot) if run.outbox is None else Path(run.outbox)
 
 

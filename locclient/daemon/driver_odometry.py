@@ -1,6 +1,6 @@
-"""The transform map -> odom where the robot's own driver publishes odom -> base: from the driver's poses, at the stamps of frames.
+"""Transform map -> odom for a robot whose driver publishes odom -> base, from the driver's poses at the stamps of frames.
 
-The driver's frame `odom` is not that of our odometry: it began elsewhere, drifts in its own way, and may start anew at any time.
+The driver's frame `odom` differs from that of our odometry: it has another origin, another drift, and may be reset at any time.
 """
 
 import threading
@@ -20,20 +20,20 @@ _GAP_NS = 1_000_000_000
 _STRAYS = 5
 _WAITING = 64
 _LINKS_TO_BASE = 16
-# No ground robot moves by more between two poses: metres and radians at once, and by the second. What does is the driver's new origin.
+# Maximum motion of a ground robot between two poses: constant part and rate, metres and radians. More is a reset of the driver's origin.
 _STEP_M, _STEP_RAD, _SPEED_MPS, _TURN_RADPS = 0.1, 0.2, 10.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """No pose for a stamp. may_come: with messages to come."""
+    """No pose for a stamp, with the reason. may_come: True if later messages may provide it."""
 
     reason: str
     may_come: bool
 
 
 class PoseHistory:
-    """Poses (4, 4) of the last seconds by stamp; they may come out of order."""
+    """Poses (4, 4) of the last seconds by stamp; they may arrive out of order."""
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
@@ -41,7 +41,7 @@ class PoseHistory:
         self._strays = 0
 
     def add(self, stamp_ns: int, odom_from_base: Array) -> None:
-        """Takes a pose. One that is much older than the newest is left out, unless several are: then the clock was set back."""
+        """Add a pose. Drop one that is much older than the newest, unless several are: then the clock was set back."""
         stamps, known = self._stamps_ns, self._odom_from_base
         if stamps and stamp_ns < stamps[-1] - _KEPT_NS:
             self._strays += 1
@@ -52,7 +52,7 @@ class PoseHistory:
         self._strays = 0
         place = bisect_left(stamps, stamp_ns)
         if place < len(stamps) and stamps[place] == stamp_ns:
-            return  # tf2 keeps the first one, too
+            return  # tf2 keeps the first one as well
         stamps.insert(place, stamp_ns)
         known.insert(place, odom_from_base)
         old = max(bisect_left(stamps, stamps[-1] - _KEPT_NS), len(stamps) - _KEPT_POSES)
@@ -63,7 +63,7 @@ class PoseHistory:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def at(self, stamp_ns: int) -> Array | Missing:
-        """The pose at a stamp, interpolated as tf2 does it: position and rotation apart from each other."""
+        """Return the pose at a stamp, interpolated like tf2: position and rotation separately."""
         stamps, known = self._stamps_ns, self._odom_from_base
         if not stamps:
             return Missing("none has come", may_come=True)
@@ -92,16 +92,16 @@ class PoseHistory:
 
 
 class DriverOdometry:
-    """Sends map_from_odom for every localized frame, once the driver's pose at its stamp is known. From any thread.
+    """Sends map_from_odom for every localized frame, once the driver's pose at its stamp is known. Thread-safe.
 
-    The pose is that of /tf, because it is what others compose with. Where the driver moves another frame, such as base_footprint,
-    /tf_static leads from it to the base.
+    The driver's pose is taken from /tf, because other nodes compose with it. If the driver moves another frame, such as
+    base_footprint, /tf_static must connect it to the base.
     """
 
     def __init__(
         self, odom_frame: str, base_frame: str, sensor_minus_frame_s: float, send: Callable[[int, Array], None]
     ) -> None:
-        """sensor_minus_frame_s: the driver's stamp minus the frame's at the same moment. send: gets the frame's stamp and the transform."""
+        """sensor_minus_frame_s: driver's stamp minus frame's stamp at the same moment. send: called with frame stamp and transform."""
         self._odom, self._base, self._send = odom_frame, base_frame, send
         self._offset_ns = round(sensor_minus_frame_s * 1e9)
         self._lock = threading.Lock()
@@ -120,15 +120,13 @@ class DriverOdometry:
                     self._odom_from_base.add(link.stamp_ns, link.parent_from_child @ child_from_base)
                     self._send_known()
                 elif self._odom_from_base.newest_ns is None and link.parent == self._odom:
-                    way = "and /tf_static no way from there to the base"
-                    self._refused = (
-                        f"/tf has {link.child!r} in {link.parent!r}, {way}; set [output] base_frame, or publish the way"
-                    )
+                    way = "and /tf_static has no chain from there to the base"
+                    self._refused = f"/tf has {link.child!r} in {link.parent!r}, {way}; set [output] base_frame, or publish the chain"
                 elif self._odom_from_base.newest_ns is None and link.child == self._base:
                     self._refused = f"/tf has {link.child!r} in {link.parent!r}: set [output] odom_frame"
 
     def handle_tf_static(self, message: bytes) -> None:
-        """tf2_msgs/TFMessage of /tf_static."""
+        """Handle a tf2_msgs/TFMessage of /tf_static."""
         with self._lock:
             self._parents |= {link.child: link for link in decode_frame_links(message) if link.is_usable}
 
@@ -139,7 +137,7 @@ class DriverOdometry:
             self._send_known()
 
     def fault(self, stamp_ns: int) -> str:
-        """Why nothing has been sent for more than a second up to this frame; empty otherwise."""
+        """Return the reason why nothing was sent for more than a second up to this frame; empty otherwise."""
         with self._lock:
             if self._since_ns is None or stamp_ns - self._since_ns < _GAP_NS:
                 return ""
@@ -160,7 +158,7 @@ class DriverOdometry:
         return None
 
     def _send_known(self) -> None:
-        """Sends what waits, in order. What can no longer get a pose is left out."""
+        """Send the waiting frames in order; drop those that can no longer get a pose."""
         while self._waiting:
             stamp_ns, map_from_base = self._waiting[0]
             odom_from_base = self._odom_from_base.at(stamp_ns + self._offset_ns)

@@ -1,4 +1,4 @@
-"""Settings of what a robot tells its own programs."""
+"""Settings of the estimates that a robot publishes to its own programs."""
 
 from typing import Annotated
 
@@ -10,7 +10,7 @@ from fleetmap.version_grid import FLOOR_M, TOP_M
 
 
 class OutputSection(Section, frozen=True):
-    """Format and endpoint of estimates. Without an endpoint they go to the map server's, or nowhere where there is none."""
+    """Format and endpoint of estimates. Default endpoint: the map server's; without a server nothing is published."""
 
     format: str = "messagepack"
     endpoint: str | None = None
@@ -36,10 +36,10 @@ class OutputSection(Section, frozen=True):
 
 
 def check_for_ros2(section: OutputSection) -> None:
-    """Raises UsageError for frames that tf2 does not take."""
+    """Raise UsageError for frame names that tf2 rejects."""
     frames = (section.map_frame, section.odom_frame, section.base_frame)
     if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
         raise UsageError(
-            f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 takes three different names "
+            f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 needs three different names "
             "that do not begin with a slash"
         )

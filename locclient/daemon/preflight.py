@@ -31,7 +31,7 @@ OK, WARN, FAIL = "ok", "warn", "fail"
 _ANSWER_S = 5.0
 _BASELINE_M = (0.03, 0.6)
 _MIN_FREE_BYTES = 200_000_000
-_OLD_NS = 1_700_000_000_000_000_000  # a clock before this program was written is wrong
+_OLD_NS = 1_700_000_000_000_000_000  # an earlier time is a wrong clock
 _SKEW_S = 0.5
 _CERTIFICATE_DAYS = 60  # robots renew after a month, with eleven left
 _MIN_FRAME_HZ, _MIN_IMU_HZ = 5.0, 90.0
@@ -40,7 +40,7 @@ _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """level: ok, warn or fail; text: what was found and, unless it is ok, what to do."""
+    """Result of a check. level: ok, warn or fail; text: the result and, unless ok, the next step."""
 
     level: str
     what: str
@@ -48,7 +48,7 @@ class Finding:
 
 
 def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
-    """One finding after another; never raises for a fault of the robot. listen_s: how long to listen to its sensors."""
+    """Yield findings one by one; never raise for a fault of the robot. listen_s: seconds to receive its sensors."""
     try:
         address = check_run(config)
     except FleetmapError as error:
@@ -134,7 +134,7 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
 
 
 def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterator[Finding]:
-    """Whether the left image is the left one, by the last frame that came."""
+    """Check by the last frame that left and right images are not swapped."""
     if raw is None:
         return
     frame = rectifier.rectify(decode_frame(raw) if isinstance(raw, StoredFrame) else raw)
@@ -147,12 +147,12 @@ def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterat
         yield Finding(OK, "left and right", "the left image is the left one")
     else:
         yield Finding(
-            WARN, "left and right", "not judged: too little is seen near the robot; check where things stand within 5 m"
+            WARN, "left and right", "not judged: too few features near the robot; check again with objects within 5 m"
         )
 
 
 class _StampRecorder(Intake):
-    """Keeps the stamps of accepted frames, and the last frame."""
+    """Records the stamps of accepted frames, and the last frame."""
 
     def __init__(self, *, has_imu: bool) -> None:
         super().__init__(frames=1, imu_minus_cam_s=0.0, has_imu=has_imu, imu_wait_s=0.0)
@@ -167,7 +167,7 @@ class _StampRecorder(Intake):
             self.last_frame = frame
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """See Intake; there is always room."""
+        """Return True: there is always room (see Intake)."""
         return True
 
 
@@ -187,7 +187,7 @@ def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
     if outbox.set_aside is not None:
-        yield Finding(WARN, "spool", f"was damaged and begun anew; what it held is in {outbox.set_aside}")
+        yield Finding(WARN, "spool", f"was damaged and started anew; its content is in {outbox.set_aside}")
     elif counts["dropped"]:
         yield Finding(WARN, "spool", f"{text}; raise [run] outbox_bytes or check the connection")
     else:

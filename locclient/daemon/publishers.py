@@ -17,27 +17,27 @@ _MAX_HYPOTHESES = 16
 
 
 class Publisher(ABC):
-    """Sends estimates. One that cannot be sent at once is dropped: the next one replaces it."""
+    """Sends estimates. An estimate that cannot be sent at once is dropped: the next one replaces it."""
 
     grid_height_m: float | None = None
-    """Height of the robot for whose planners the version's grid is wanted; None where it is not."""
+    """Robot height in metres for the version's occupancy grid; None if no grid is published."""
 
     @abstractmethod
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """Sends this estimate."""
+        """Send this estimate."""
 
     def alive(self, is_silent: bool) -> None:  # noqa: B027
-        """Says once a second that the robot localizes; is_silent: no frames come."""
+        """Publish a heartbeat, called once a second; is_silent: no frames are received."""
 
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:  # noqa: B027
-        """The grid of the version that the robot runs now, or why there is none; from any thread."""
+        """Publish the grid of the version that runs now, or the reason `why` there is none; thread-safe."""
 
     def close(self) -> None:  # noqa: B027
-        """Takes back what was declared."""
+        """Undeclare all publishers."""
 
 
 class MessagePackPublisher(Publisher):
-    """EstimateMessage under the robot's key."""
+    """Sends EstimateMessage under the robot's key."""
 
     def __init__(self, bus: Bus, key: str) -> None:
         self._bus, self._key = bus, key
@@ -64,9 +64,9 @@ class MessagePackPublisher(Publisher):
 def open_publisher(
     section: OutputSection, bus: Bus, site: str, robot: str, calibration: RigCalibration, intake: Intake
 ) -> Publisher:
-    """The publisher that the section asks for. intake: where commands of the robot's own programs go.
+    """Open the publisher of the section. intake: receives commands of the robot's own programs.
 
-    UsageError for an unknown format or a topic that is none.
+    Raises UsageError for an unknown format or an invalid topic.
     """
     if section.format == "messagepack":
         return MessagePackPublisher(bus, robot_key(site, robot, "estimate"))

@@ -1,4 +1,4 @@
-"""The robot's localization as a managed node of ROS 2 and a drop-in for nav2's: topics, services, lifecycle, bond, diagnostics."""
+"""Localization as a managed ROS 2 node, a drop-in for nav2's localizer: topics, services, lifecycle, bond, diagnostics."""
 
 import logging
 import threading
@@ -52,7 +52,7 @@ from locclient.robot.continuous_odom import PublishedPose
 
 
 class LifecycleState(IntEnum):
-    """lifecycle_msgs/State: ids of states; those from 10 on last only while the node changes."""
+    """State ids of lifecycle_msgs/State; those from 10 on are transition states."""
 
     UNKNOWN = 0
     UNCONFIGURED = 1
@@ -69,7 +69,7 @@ class LifecycleState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """lifecycle_msgs/TransitionDescription: from a state to one in which the node changes, and the state after that."""
+    """lifecycle_msgs/TransitionDescription: start state, transition state and goal state."""
 
     id: int
     label: str
@@ -92,9 +92,9 @@ TRANSITIONS = (
 
 
 def requested(request: bytes, state: LifecycleState) -> Transition | None:
-    """The transition that a request of lifecycle_msgs/srv/ChangeState asks for: by its label, which wins, or its id.
+    """Return the transition requested by lifecycle_msgs/srv/ChangeState: by its label, which has priority, or its id.
 
-    None for one that does not begin at this state. ValueError for bytes that are no request.
+    None for a transition that does not begin at this state. ValueError for an invalid request.
     """
     reader = CdrReader(request)
     number, label = reader.byte(), reader.text()
@@ -103,12 +103,12 @@ def requested(request: bytes, state: LifecycleState) -> Transition | None:
 
 
 def encode_state(state: LifecycleState) -> bytes:
-    """The response of lifecycle_msgs/srv/GetState."""
+    """Encode the response of lifecycle_msgs/srv/GetState."""
     return _put_state(CdrWriter(), state).message()
 
 
 def encode_states() -> bytes:
-    """The response of lifecycle_msgs/srv/GetAvailableStates."""
+    """Encode the response of lifecycle_msgs/srv/GetAvailableStates."""
     writer = CdrWriter().unsigned(len(LifecycleState))
     for state in LifecycleState:
         _put_state(writer, state)
@@ -116,7 +116,7 @@ def encode_states() -> bytes:
 
 
 def encode_transitions(transitions: Sequence[Transition], *, with_success: bool = False) -> bytes:
-    """The response of lifecycle_msgs/srv/GetAvailableTransitions; with_success: the steps out of the states between, too."""
+    """Encode the response of lifecycle_msgs/srv/GetAvailableTransitions; with_success: include those out of transition states."""
     steps = [(one.id, one.label, one.start, one.through) for one in transitions]
     if with_success:
         steps += [(one.success_id, "transition_success", one.through, one.goal) for one in transitions]
@@ -128,7 +128,7 @@ def encode_transitions(transitions: Sequence[Transition], *, with_success: bool 
 
 
 def encode_events(stamp_ns: int, transition: Transition) -> list[bytes]:
-    """Two lifecycle_msgs/TransitionEvent: into the state between, and out of it."""
+    """Encode two lifecycle_msgs/TransitionEvent: into the transition state, and out of it."""
     return [
         _put_step(CdrWriter().long_unsigned(stamp_ns), *step).message()
         for step in (
@@ -146,27 +146,27 @@ def _put_step(writer: CdrWriter, number: int, label: str, start: LifecycleState,
     return _put_state(_put_state(writer.byte(number).text(label), start), goal)
 
 
-_BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # nav2's own
-_STUCK_S = 3.0  # without a word from the thread that localizes, after which the bond is not renewed
+_BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # as in nav2
+_STUCK_S = 3.0  # without a sign of life from the localizing thread, after which the bond is not renewed
 _OK, _WARN, _ERROR = 0, 1, 2
 _LEVELS = {Status.TRACKING: _OK, Status.LOST: _ERROR}
-_OWN_TF = 256  # messages, by which the own ones are known when they come back
-_OTHER_S = 5.0  # another program is named for so long after its last transform
-# Of the motion between two frames: radians, metres, share of the distance; and where the odometry does not hold.
+_OWN_TF = 256  # last sent messages, to recognize them when they are received back
+_OTHER_S = 5.0  # another publisher is reported for so long after its last transform
+# Odometry sigmas between two frames, tracking and not: radians, metres, share of the distance.
 _MEASURED, _GUESSED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _log = logging.getLogger(__name__)
 
 
 class Ros2Localizer(Publisher):
-    """A Publisher whose node shows in the graph from the start, and publishes while it is active.
+    """A Publisher whose node is visible in the graph from the start, and publishes while active.
 
-    Localization goes on in every state: an active node has a pose at once. Commands reach the robot through its intake.
+    Localization runs in every state, so an activated node has a pose at once. Commands reach the robot through its intake.
     """
 
     def __init__(
         self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
     ) -> None:
-        """Raises UsageError for names that are none."""
+        """Raises UsageError for invalid names."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
         self.grid_height_m = section.robot_height_m if section.map_topic else None
         self._grid: OccupancyGrid | None = None
@@ -174,7 +174,7 @@ class Ros2Localizer(Publisher):
         self._state = LifecycleState.ACTIVE if section.autostart else LifecycleState.UNCONFIGURED
         self._lock = threading.Lock()  # of the state
         self._last: tuple[Estimate, PublishedPose] | None = None
-        self._fix_refused = ""  # by the newest query that ended: most frames end none
+        self._fix_refused = ""  # by the newest finished query: most frames finish none
         self._refused: deque[str] = deque(maxlen=1)
         self._alive_s = time.monotonic()
         self._bond: BondStatus | None = None
@@ -228,7 +228,7 @@ class Ros2Localizer(Publisher):
     # --- called by the thread that localizes --------------------------------------------------------------------------
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """A pose is sent only with its covariance, and is that of the base in the map."""
+        """Send the pose of the base in the map; only with its covariance."""
         before, self._last = self._last, (estimate, published)
         if estimate.fix is not None or estimate.refused:
             self._fix_refused = estimate.refused
@@ -249,7 +249,7 @@ class Ros2Localizer(Publisher):
         odometry_frame = section.odom_frame
         if section.publish_odom:
             self._send_tf(stamp_ns, FrameLink(section.odom_frame, section.base_frame, published.odom_from_base))
-        else:  # the driver's frame is another one than that of our odometry
+        else:  # the driver's frame differs from that of our odometry
             odometry_frame = f"{section.sensor_frames or OutputSection().sensor_frames}odom"
         if before is not None and estimate.odometry.scale_known and stamp_ns > before[0].stamp_ns:
             motion = motion_between(before, (estimate, published), base_from_body)
@@ -257,7 +257,7 @@ class Ros2Localizer(Publisher):
         self._send_status(encode_text(estimate.status.value))
 
     def _send_map_link(self, stamp_ns: int, map_from_odom: Array) -> None:
-        if self._state is not LifecycleState.ACTIVE:  # since the frame, whose pose of the driver came later
+        if self._state is not LifecycleState.ACTIVE:  # deactivated while the frame waited for the driver's pose
             return
         ahead_ns = stamp_ns + int(self._section.transform_tolerance_s * 1e9)
         self._send_tf(ahead_ns, FrameLink(self._section.map_frame, self._section.odom_frame, map_from_odom))
@@ -268,7 +268,7 @@ class Ros2Localizer(Publisher):
         self._put_tf(message)
 
     def _tell_building(self, building_from_map: Array | None) -> None:
-        """The last one that was known stays in ROS's tree of frames: what is static there is never taken back."""
+        """Publish the building's frame. The last known one stays in tf: static transforms are never withdrawn."""
         known = self._building_from_map
         if building_from_map is not None and (known is None or not np.array_equal(known, building_from_map)):
             self._building_from_map = building_from_map
@@ -303,7 +303,7 @@ class Ros2Localizer(Publisher):
         return Diagnosis(level, f"{self._section.node}: localization", words, self._robot, values)
 
     def _tf_fault(self) -> str:
-        """Why planners have no use of /tf; empty where they do. Logged when it begins and ends."""
+        """Return the reason why /tf is unusable for planners, empty if it is usable. Log its begin and end."""
         fault = ""
         if time.monotonic() - self._other_s < _OTHER_S:
             fault = f"another program publishes {self._other} too: stop it, or see publish_odom in docs/ros2.md"
@@ -316,7 +316,7 @@ class Ros2Localizer(Publisher):
         return fault
 
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
-        """Without a grid the last one stays on the topic: the map's frame is the same in every version."""
+        """Publish the grid. Without one the last grid stays on the topic: all versions share the map's frame."""
         self._map_words = why if grid is None else f"grid of version {version}"
         if grid is None:
             _log.warning("planners get no new map: %s", why)
@@ -334,7 +334,7 @@ class Ros2Localizer(Publisher):
     # --- called by threads of the bus ---------------------------------------------------------------------------------
 
     def _hear_tf(self, message: bytes) -> None:
-        """Transforms of other programs; those sent here come back, too."""
+        """Handle transforms of other programs; those sent here are received back as well."""
         section = self._section
         if message in self._sent_tf:
             return
@@ -353,7 +353,7 @@ class Ros2Localizer(Publisher):
         with self._lock:
             transition = requested(request, self._state)
             if transition is None:
-                _log.warning("a transition was asked for that does not begin at %s", self._state.name.lower())
+                _log.warning("a requested transition does not begin at %s", self._state.name.lower())
                 return CdrWriter().byte(0).message()
             if transition.start is LifecycleState.ACTIVE:
                 self._break_bond()
@@ -389,7 +389,7 @@ class Ros2Localizer(Publisher):
             self._send_map(encode_grid(time.time_ns(), self._section.map_frame, self._grid))
 
     def _send_static_frames(self) -> None:
-        """All in one message, of which late subscribers get the last one."""
+        """Send all static frames in one message: late subscribers receive only the last message."""
         section = self._section
         links = sensor_links(section, self._calibration) if section.sensor_frames else []
         if self._building_from_map is not None:
@@ -406,7 +406,7 @@ class Ros2Localizer(Publisher):
                 self._tell_bond(bond)
 
     def _hear_bond(self, message: bytes) -> None:
-        """Acknowledges the end of the other side, as bondcpp does; the node stays active."""
+        """Acknowledge the end of the other side, as bondcpp does; the node stays active."""
         other, own = decode_bond(message), self._bond
         if own is not None and other.bond == own.bond and other.instance != own.instance and not other.is_active:
             self._break_bond()
@@ -426,7 +426,7 @@ class Ros2Localizer(Publisher):
 def motion_between(
     before: tuple[Estimate, PublishedPose], after: tuple[Estimate, PublishedPose], base_from_body: Array
 ) -> Motion:
-    """The motion of two frames one after another: a mean velocity over the time between them."""
+    """Return the mean velocity between two consecutive frames."""
     (earlier, then), (estimate, now) = before, after
     odometry, seconds = estimate.odometry, (estimate.stamp_ns - earlier.stamp_ns) * 1e-9
     step = se3_inverse(then.odom_from_base) @ now.odom_from_base
@@ -434,7 +434,7 @@ def motion_between(
     turn_rad, floor_m, share = _GUESSED if odometry.status is OdometryStatus.DEGRADED else _MEASURED
     sigma_m = floor_m + share * float(np.linalg.norm(step[:3, 3]))
     twist_cov = np.diag([(sigma_m / seconds) ** 2] * 3 + [(turn_rad / seconds) ** 2] * 3)
-    # The odometry's own frame may be turned against the published one.
+    # The odometry's frame may be rotated against the published one.
     published_from_odometry = (now.odom_from_base @ base_from_body)[:3, :3] @ odometry.odom_from_body[:3, :3].T
     both = np.kron(np.eye(2), published_from_odometry)
     lever_m = now.odom_from_base[:3, :3] @ base_from_body[:3, 3]
@@ -443,7 +443,7 @@ def motion_between(
 
 
 def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[FrameLink]:
-    """base -> body, and body -> each camera, under names that no URDF has: PREFIXbody, PREFIXcam0_optical and so on."""
+    """Return base -> body and body -> each camera, under names that no URDF uses: PREFIXbody, PREFIXcam0_optical and so on."""
     body = f"{section.sensor_frames}body"
     links = [FrameLink(section.base_frame, body, calibration.base_from_body)]
     for number, camera in enumerate(calibration.cameras):

@@ -1,4 +1,4 @@
-"""Threads of the daemon: sensors, disk, network, and the calling one that localizes. An error in any thread ends all."""
+"""Threads of the daemon: sensors, disk, network, and the calling thread, which localizes. An error in any thread ends all."""
 
 import logging
 import threading
@@ -41,9 +41,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RuntimeParts:
-    """All that a daemon is made of. server: None for a robot that reads a store's folder. first: the version to begin with.
+    """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with.
 
-    fleet_manager: the connection to one that speaks VDA 5050; only with a server.
+    fleet_manager: the VDA 5050 connection; only with a server.
     """
 
     profile: RobotProfile
@@ -62,7 +62,7 @@ class RuntimeParts:
 
 
 class Runtime:
-    """Runs until `stop` is called, the source has ended, or a thread has died, whose error `run` raises."""
+    """Runs until `stop` is called, the source ends, or a thread fails; `run` raises its error."""
 
     def __init__(
         self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
@@ -70,19 +70,19 @@ class Runtime:
         self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
         self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
         self._stop, self._sensors_stop = threading.Event(), threading.Event()
-        # What threads exchange: deques and plain values, which need no lock.
+        # Exchanged between threads: deques and plain values, which need no lock.
         self._bound = PositionBound()
         self._held: list[WantedVersion] = []
         self._loaded: deque[LoadedMap] = deque()
         self._failures: deque[tuple[FailureContext, int]] = deque(maxlen=_MAX_PENDING)
-        # Of the thread that localizes.
+        # Owned by the localizing thread.
         self._figures = HealthFigures()
         self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
         self._last_frame_s: float | None = None
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._refusals, self._unreadable = LogLimit(_log), 0
         self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
-        # Of the thread of the disk.
+        # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._fetched_again: set[str] = set()
         self._shown_grid: WantedVersion | None = None
@@ -93,7 +93,7 @@ class Runtime:
         self._sensors_stop.set()
 
     def run(self) -> None:
-        """Localizes on the calling thread until it is over; threads are joined, and what they held is on the disk."""
+        """Localize on the calling thread until the end; then join all threads and write their data to the disk."""
         with ended_by_threads(self.stop):
             works: dict[str, Callable[[], None]] = {"sensors": self._run_sensors, "disk": self._run_disk}
             if self._server is not None:
@@ -114,7 +114,7 @@ class Runtime:
     def _finish(self, threads: list[threading.Thread]) -> None:
         self._manager.stopping()
         if self._server is not None:
-            self._server.health.append(self._health())  # of all frames
+            self._server.health.append(self._health())  # including the last frames
         self.stop()
         for thread in threads:
             thread.join(_DRAIN_S)
@@ -135,7 +135,7 @@ class Runtime:
         bundle = intake.take(_TAKE_S)
         while self._loaded:
             robot.use(self._loaded.popleft())
-            give_back_free_memory()  # of the version before, and of what reading this one took; half a millisecond
+            give_back_free_memory()  # of the previous version and of loading this one; takes 0.5 ms
         while server is not None and server.frames:
             robot.align(server.frames.popleft())
         while server is not None and server.priors:
@@ -170,7 +170,7 @@ class Runtime:
             _log.warning("%s", outcome.left_out[flag])
         self._figures.handle(outcome)
         if self._figures.search.is_long != was_lost:
-            _log.warning("%s", "localised again" if was_lost else self._figures.search.words)
+            _log.warning("%s", "localized again" if was_lost else self._figures.search.words)
         self._bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()
@@ -208,7 +208,7 @@ class Runtime:
 
     def _health(self) -> RobotHealth:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
-        with suppress(StoreError):  # the thread of the disk or of the network says so
+        with suppress(StoreError):  # logged by the disk or network thread
             self._outbox_counts = {f"spool_{name}": value for name, value in self._parts.outbox.counts().items()}
         for fault in [fault for cache in self._parts.caches for fault in cache.take_faults()]:
             _log.warning("tile cache: %s", fault)
@@ -265,7 +265,7 @@ class Runtime:
         self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
 
     def _show_grid(self, version: WantedVersion) -> None:
-        """Gives planners the grid of the confirmed version. What an older client did not fetch with it is fetched now, once."""
+        """Publish the grid of the confirmed version. If an older client did not fetch it with the version, fetch it now, once."""
         publisher = self._publisher
         height_m = None if publisher is None else publisher.grid_height_m
         if publisher is None or height_m is None or version == self._shown_grid:
@@ -283,7 +283,7 @@ class Runtime:
         _send(partial(publisher.show_grid, version.version or 0, grid, why))
 
     def _note_unusable(self, version: WantedVersion, reason: str) -> None:
-        """A version without manifest or any tile is fetched again, once, and dropped where there is no server."""
+        """Fetch a version without manifest or tiles again, once; drop it if there is no server."""
         _log.warning("version %s cannot be loaded: %s", version.version, reason)
         self._offers.pop(version.manifest_sha256 or "", None)
         if self._server is not None and version.manifest_sha256 not in self._fetched_again:
@@ -291,7 +291,7 @@ class Runtime:
             self._server.refetch.append(version)
 
     def _note_refused_tiles(self, version: WantedVersion) -> None:
-        """Logs refused tiles once, and has them fetched again."""
+        """Log refused tiles once, and request them again."""
         refused, sha256 = self._parts.tile_loader.refused(version), version.manifest_sha256 or ""
         if refused == self._refused_tiles.get(sha256, {}):
             return
@@ -320,7 +320,7 @@ class Runtime:
             server.step()
             if self._parts.fleet_manager is not None:
                 self._parts.fleet_manager.adapter.work()
-        server.step()  # a last time: changes of versions and failures since, if the server is there
+        server.step()  # a last time: delivers the last version changes and failures if the server is reachable
         server.close()
 
 

@@ -1,4 +1,4 @@
-"""Synchronization with the map server: versions, acknowledgements, failures, health. May block: it has a thread of its own."""
+"""Synchronization with the map server: versions, acknowledgements, failures, health. May block; runs in its own thread."""
 
 import logging
 import time
@@ -27,7 +27,7 @@ class ServerSync:
     """In each `step`: fetches the wanted version, delivers failures, acknowledges, reports health.
 
     Other threads append to `health`, `changes` and `refetch` (a held version with damaged pieces on the disk), and take fetched
-    versions from `fetched`, a person's word from `priors`. While the server is away, reports wait in the outbox.
+    versions from `fetched` and operators' poses from `priors`. While the server is unreachable, reports wait in the outbox.
     """
 
     def __init__(
@@ -40,23 +40,23 @@ class ServerSync:
         wall_ns: Callable[[], int] = time.time_ns,
         upkeep: Callable[[], None] = lambda: None,
     ) -> None:
-        """retry_s: when a postponed version is offered again. upkeep: called once an hour; what it refuses goes into the log."""
+        """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self._replayed_bytes: dict[str, int] = {}
         self._replay_at_s = self._deliver_at_s = 0.0
-        self.follows = True  # the server's choice of a version; False: somebody else's, whom the server is told
+        self.follows = True  # the server selects the version; False: the fleet manager does
         self.on_change: Callable[[VersionChange], None] = lambda _: None
-        self._refusals = LogLimit(_log)  # what stays as it is would fill the log
+        self._refusals = LogLimit(_log)  # repeated refusals would fill the log
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
         self.client, self._outbox, self._retry_s = client, outbox, retry_s
         self._clock_s, self._wall_ns = clock_s, wall_ns
-        self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is worth sending
+        self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is sent
         self.changes: deque[VersionChange] = deque()
         self.fetched: deque[WantedVersion] = deque()
         self.refetch: deque[WantedVersion] = deque(maxlen=1)
-        self.frames: deque[BuildingFrame | None] = deque()  # where the map lies in its building, whenever that changes
+        self.frames: deque[BuildingFrame | None] = deque()  # changes of the map's pose in the building
         self._frame: BuildingFrame | None = None
-        self._learn_frame()  # as it was kept
+        self._learn_frame()  # from the cache
         self._offered: set[str] = set()
         self._running = client.active()
         if self._running is not None:
@@ -65,7 +65,7 @@ class ServerSync:
         self._ask_at_s, self._silent_until_s, self._backoff_s = 0.0, 0.0, _BACKOFF_S
         self._announced: deque[WantedVersion] = deque(maxlen=1)
         self._last_ack: tuple[int | None, str] | None = None
-        self.priors: deque[PositionPrior] = deque(maxlen=4)  # where a person says that the robot stands
+        self.priors: deque[PositionPrior] = deque(maxlen=4)  # poses set by operators
         self._handles = [
             client.announce_presence(),
             client.on_wanted(self._announced.append),
@@ -73,13 +73,13 @@ class ServerSync:
         ]
 
     def step(self) -> None:
-        """Does what is due. Returns early where nobody answers, and then waits with an exponential backoff."""
+        """Do all due work. Return early if the server does not answer, then wait with exponential backoff."""
         self._handle_changes()
         now_s = self._clock_s()
         if now_s < self._silent_until_s or not self.client.connected():
             return
         try:
-            # First: with a certificate that was renewed, and whose answer got lost, nothing else may be asked.
+            # First: after a renewal whose response was lost, the server admits no other request.
             if now_s >= self._upkeep_at_s:
                 self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
                 self._upkeep()
@@ -136,13 +136,13 @@ class ServerSync:
                 return None
             if self._running is not None:
                 return None
-        # An incomplete first version is better than none; otherwise the last good one goes on.
+        # An incomplete first version is better than none; otherwise the last good one stays.
         self._offered.add(sha256)
         self.fetched.append(wanted)
         return None
 
     def _learn_frame(self) -> None:
-        """A site may be aligned anew while its version stays; what cannot be had changes nothing."""
+        """Update the building's frame: a site may be realigned while its version stays. On an error the frame stays."""
         try:
             frame = self.client.building_frame()
         except UnreachableError:
@@ -155,13 +155,13 @@ class ServerSync:
             self.frames.append(frame)
 
     def _fetch_again(self) -> None:
-        """Fetches damaged or missing pieces of a version that the robot holds."""
+        """Fetch damaged or missing pieces of a version that the robot holds."""
         if self.refetch:
             self.client.fetch(self.refetch[0])
             self.fetched.append(self.refetch.popleft())
 
     def _handle_changes(self) -> None:
-        """Makes adopted versions the active ones on the disk, and acknowledges all changes."""
+        """Activate adopted versions on the disk, and acknowledge all changes."""
         while self.changes:
             change = self.changes.popleft()
             sha256 = change.wanted.manifest_sha256 or ""
@@ -180,20 +180,20 @@ class ServerSync:
         try:
             self.client.activate(self.client.manifest(wanted), wanted)
         except FleetmapError as error:
-            # It runs from memory and from the cache, but the next start will not find it whole.
+            # It runs from memory and from the cache, but is incomplete at the next start.
             self._last_ack = (wanted.version, str(error))
             _log.warning("version %s runs but is not kept: %s", wanted.version, error)
         self._acknowledge()
 
     def _refuse(self, wanted: WantedVersion, reason: str, is_untrusted: bool = False) -> None:
-        """is_untrusted: the reason begins with the kind of attack, and so does what the server hears."""
+        """is_untrusted: the reason begins with the kind of attack, and is reported to the server unchanged."""
         _log.warning("version %s is refused: %s", wanted.version, reason)
         running = None if self._running is None else self._running.version
         self._last_ack = (running, reason if is_untrusted else f"version {wanted.version}: {reason}")
         self._acknowledge()
 
     def _acknowledge_again(self) -> None:
-        """For a server that restarted, or an acknowledgement that was lost."""
+        """Repeat the acknowledgement, for a restarted server or a lost message."""
         if self._last_ack is None and self._running is not None:
             self._last_ack = (self._running.version, "")
         self._acknowledge()
@@ -208,7 +208,7 @@ class ServerSync:
     # --- reports ------------------------------------------------------------------------------------------------------
 
     def _deliver(self, now_s: float) -> None:
-        """A spool that cannot be read or written holds up neither maps nor health."""
+        """Deliver reports. An unusable spool delays neither maps nor health."""
         if now_s < self._deliver_at_s:
             return
         try:
@@ -219,7 +219,7 @@ class ServerSync:
             _log.warning("reports of failures wait: %s", error)
 
     def _send_replay(self, now_s: float) -> None:
-        """A part of a recording, at most one in a second, while no report waits and no version is fetched."""
+        """Send a part of a recording, at most one per second, while no report waits and no version is fetched."""
         if self.replays is None or now_s < self._replay_at_s:
             return
         goes_on = False

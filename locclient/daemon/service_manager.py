@@ -1,4 +1,4 @@
-"""What the daemon tells whoever runs it: systemd by datagrams (sd_notify), and others by a file that `locclient status` reads."""
+"""Status of the daemon for systemd, by datagrams (sd_notify), and for `locclient status`, by a file."""
 
 import os
 import socket
@@ -13,10 +13,10 @@ _SILENT_S = 10.0  # as WatchdogSec of deploy/locclient.service
 
 
 class ServiceManager:
-    """Ready, status, watchdog, stopping. Source: the documented protocol of sd_notify(3)."""
+    """Reports ready, status, watchdog and stopping. Source: the documented protocol of sd_notify(3)."""
 
     def __init__(self, address: str | None = None, folder: Path | None = None) -> None:
-        """address: of systemd's socket, folder: of the file; those of the environment without them."""
+        """address: systemd's socket; folder: that of the status file. Defaults: from the environment."""
         given = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
         self._address = "\0" + given[1:] if given.startswith("@") else given
         self._folder = folder or runtime_folder()
@@ -25,7 +25,7 @@ class ServiceManager:
         self._tell("READY=1")
 
     def alive(self, status: str) -> None:
-        """Resets the watchdog; status: a line for `systemctl status` and `locclient status`."""
+        """Reset the watchdog; status: a line for `systemctl status` and `locclient status`."""
         self._tell(f"WATCHDOG=1\nSTATUS={status}")
         self._write(status)
 
@@ -39,31 +39,31 @@ class ServiceManager:
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
-            sender.setblocking(False)  # a manager that does not read must not hold up the robot
+            sender.setblocking(False)  # a manager that does not read must not block the robot
             try:
                 sender.connect(self._address)
                 sender.send(text.encode())
             except OSError:
-                pass  # nobody listens any more: the service goes on, and its manager will judge by the watchdog
+                pass  # the socket is gone: the service continues, and its manager decides by the watchdog
 
     def _write(self, status: str) -> None:
         if self._folder is None:
             return
-        with suppress(OSError):  # the robot drives on, and whoever reads the file finds it old
+        with suppress(OSError):  # the robot continues, and readers find an old file
             fresh = self._folder / f"{_FILE}.new"
-            # Of the clock since the machine's start, which nobody sets. Not rounded: rounded up, it would lie ahead.
+            # Monotonic clock, which is never set. Not rounded: rounded up, it would lie in the future.
             fresh.write_text(f"{time.monotonic()!r} {status}\n", encoding="utf-8")
             fresh.replace(self._folder / _FILE)
 
 
 def runtime_folder() -> Path | None:
-    """The folder of RUNTIME_DIRECTORY, the first where there are several."""
+    """Return the first folder of RUNTIME_DIRECTORY; None if unset."""
     given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     return Path(given) if given else None
 
 
 def last_status(folder: Path) -> str:
-    """What the daemon of this folder last said, and when; FleetmapError where that is not of the last ten seconds."""
+    """Return the last status of the daemon of this folder, with its age; FleetmapError if older than ten seconds."""
     path = folder / _FILE
     advice = "start `locclient run` with this folder as its RUNTIME_DIRECTORY, as deploy/locclient.service does"
     with disk_errors(f"no daemon has written {path}", advice, FleetmapError):
@@ -71,8 +71,8 @@ def last_status(folder: Path) -> str:
     try:
         age_s = time.monotonic() - float(said_s)
     except ValueError as error:
-        raise FleetmapError(f"{path} holds {said_s[:40]!r} and no status of a daemon; {advice}") from error
+        raise FleetmapError(f"{path} holds {said_s[:40]!r}, not the status of a daemon; {advice}") from error
     if not 0.0 <= age_s <= _SILENT_S:
         when = f"{age_s:.0f} s ago" if age_s > 0.0 else "before this machine was started"
-        raise FleetmapError(f"the daemon last said {status[:80]!r} {when}; it hangs or was killed, see its log")
+        raise FleetmapError(f"the daemon last reported {status[:80]!r} {when}; it hangs or was killed, see its log")
     return f"{status}, {age_s:.1f} s ago"

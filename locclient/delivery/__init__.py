@@ -1,1 +1,1 @@
-"""Delivery of failure reports: kept on the disk until the server has them."""
+"""Delivery of failure reports, which stay on the disk until the server has them."""

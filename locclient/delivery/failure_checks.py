@@ -1,7 +1,7 @@
-"""Checks a decoded failure recording before anything computes with it: robots write it, and a robot may be anybody's.
+"""Validation of a decoded failure recording before use: robots write it, and a robot may be compromised.
 
-Every array is in ARRAYS by its field's name, or by class and field, with dtype, shape and a check of its values. Letters in a shape are
-lengths that all arrays of one object share.
+ARRAYS lists every array by field name, or by class and field, with dtype, shape and a check of its values. Letters in a shape are
+lengths shared by all arrays of one object.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ _MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m")
 
 
 class Kind(NamedTuple):
-    """What an array must be. is_good: of values, by the camera."""
+    """Required dtype and shape of an array. is_good: check of its values, given the camera."""
 
     dtype: str
     shape: tuple[int | str, ...]
@@ -57,7 +57,7 @@ def _covariance(matrix: AnyArray, _: StereoCamera) -> bool:
 
 
 def _prior_covariance(matrix: AnyArray, camera: StereoCamera) -> bool:
-    """Infinite variances of a position prior are what nobody said."""
+    """Check the covariance of a position prior; infinite variances are unconstrained axes."""
     known = np.isfinite(np.diagonal(matrix))
     return not np.isnan(matrix).any() and _covariance(matrix[np.ix_(known, known)], camera) if known.any() else True
 
@@ -95,12 +95,12 @@ ARRAYS: Mapping[str, Kind] = {
     "Features.angles_deg": Kind("<f4", ("n",), _finite),
     "Features.descriptors": Kind("|u1", ("n", 32), _any),
     "FrameFeatures.pixels": Kind("<f8", ("n", 3), _stereo_pixels),
-    "track_ids": Kind("<i8", (0,), _any),  # of the odometry, whose tracks no recording keeps
+    "track_ids": Kind("<i8", (0,), _any),  # of the odometry; recordings do not keep its tracks
 }
 
 
 def check_record(record: Any) -> None:
-    """Raises RecordingError, naming the field, for a LocalizerRecord that no robot writes."""
+    """Raise RecordingError, naming the field, for an invalid LocalizerRecord."""
     camera = record.camera
     sizes = camera.width_px, camera.height_px
     numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
@@ -131,7 +131,7 @@ def _refused(where: str, what: str) -> RecordingError:
 
 
 class _Walk:
-    """Goes through all values of a record."""
+    """Traverses all values of a record."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera

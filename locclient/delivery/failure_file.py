@@ -1,6 +1,6 @@
-"""The file of a failure: the ring around its onset as an MCAP recording with reduced images, and its way back.
+"""Failure file: the ring around the onset as an MCAP recording with reduced images; writing and reading.
 
-The recording is for people. The attachment of the localizer holds its pose at the beginning and what it perceived since.
+The recording is for inspection. An attachment holds the localizer's start pose and its percepts since, for a replay.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ _ARRAYS = ("<f8", "<f4", "<i8", "<u8", "<u4", "|u1", "|i1", "|b1")
 
 
 class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the localizer began, in which map, and for each frame since what came before it and what was perceived."""
+    """Start state of the localizer, its map, and for each frame the preceding samples and commands and its percept."""
 
     format: Annotated[int, msgspec.Meta(ge=_FORMAT, le=_FORMAT)] = _FORMAT
     settings: LocalizerSettings
@@ -59,7 +59,7 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, pictures: str) -> bytes:
-    """The MCAP file of a cut that is complete. pictures: one of PICTURES."""
+    """Return the MCAP file of a complete cut. pictures: one of PICTURES."""
     assert cut.frames
     used = cut.used or next((f.commands.used for f in cut.frames if f.commands.used is not None), None)
     summary = FailureSummary(
@@ -99,7 +99,7 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
 
 
 def read_failure_file(path: Path) -> tuple[FailureSummary, LocalizerRecord]:
-    """Both attachments, decoded and checked; RecordingError for what no client of this version has written."""
+    """Read, decode and validate both attachments; RecordingError if no client of this version can have written them."""
     attachments = attachments_of(path)
     with zstandard.ZstdDecompressor().stream_reader(attachments[LOCALIZER]) as reader:
         try:
@@ -120,7 +120,7 @@ def read_failure_file(path: Path) -> tuple[FailureSummary, LocalizerRecord]:
 
 
 def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
-    """The localizer's part, unpacked, decoded and checked; RecordingError for what no client of this version has written."""
+    """Unpack, decode and validate the localizer's part; RecordingError if no client of this version can have written it."""
     try:
         record = msgspec.msgpack.decode(data, type=LocalizerRecord, dec_hook=_decoded_array)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError, TypeError) as error:
@@ -138,7 +138,7 @@ def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
 
 
 def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
-    """With the depth of every feature where the images were kept: another version matches others of them."""
+    """Add the depth of every feature if the images were kept: another version matches other features."""
     query = frame.percept.query
     if query is None or query.features is None:
         return frame.percept
@@ -159,7 +159,7 @@ def _encoded_array(value: Any) -> Any:
         raise NotImplementedError(type(value))
     form = value.dtype.newbyteorder("<").str
     if form == "<f8" and np.array_equal(value.astype("<f4").astype("<f8"), value, equal_nan=True):
-        return form, value.shape, value.astype("<f4").tobytes()  # half of the bytes, and no bit less
+        return form, value.shape, value.astype("<f4").tobytes()  # half of the bytes without loss
     return form, value.shape, value.astype(form).tobytes()
 
 
@@ -180,7 +180,7 @@ def _step(width_px: int) -> int:
 
 
 def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalibration:
-    """The rectified rig at the pictures' size."""
+    """Return the rectified rig at the pictures' size."""
     camera, step = profile.camera, _step(profile.camera.width_px)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]
     left = CameraCalibration(

@@ -1,4 +1,4 @@
-"""The robot's outbox (spool): reports on the disk until the server acknowledges them. SQL of the robot lives here alone."""
+"""The robot's outbox (spool): reports on the disk until the server acknowledges them. The only module of the robot with SQL."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -19,23 +19,23 @@ _BUSY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class QueuedReport:
-    """A report that waits; payload: the encoded message."""
+    """A waiting report; payload: the encoded message."""
 
     id: str
     payload: bytes
 
 
 class Outbox:
-    """Reports in the order in which they were put; above `max_bytes` the oldest are dropped and counted.
+    """Queue of reports, first in, first out; above `max_bytes` the oldest are dropped and counted.
 
-    Once `put` has returned, a report survives a crash and a loss of power. A damaged file is set aside under another name and begun
-    anew: a robot that cannot report must still drive. For any thread; each call opens the file for itself.
+    Once `put` has returned, a report survives a crash and a power failure. A damaged file is renamed and replaced by a new one: a
+    robot that cannot report must still drive. Thread-safe; each call opens the file itself.
     """
 
     def __init__(self, path: Path, *, max_bytes: int, is_needed: bool = True) -> None:
-        """Makes the file and its folder; raises StoreError where that is not possible.
+        """Create the file and its folder; raise StoreError if that fails.
 
-        is_needed: False keeps the reason in `fault` instead, and tries again at each call.
+        is_needed: if False, store the reason in `fault` instead and retry at each call.
         """
         self._path = path
         self._max_bytes = max_bytes
@@ -60,12 +60,12 @@ class Outbox:
                 self._set_aside()
                 self._check()
         except (OSError, sqlite3.Error) as error:
-            reason = f"the spool {path} cannot be used ({error}); check the disk and whose file it is, or choose another with [run] outbox"
+            reason = f"the spool {path} cannot be used ({error}); check the disk and the file's owner, or change [run] outbox"
             raise StoreError(reason) from error
         self._is_made, self.fault = True, ""
 
     def put(self, report: QueuedReport) -> None:
-        """Keeps a report; one with an id that waits already is not kept twice. Raises StoreError where the disk refuses."""
+        """Store a report; ignore one whose id waits already. Raises StoreError on a disk error."""
         with self._transaction() as database:
             database.execute("INSERT OR IGNORE INTO report (id, payload) VALUES (?, ?)", (report.id, report.payload))
             self._make_room(database)
@@ -79,11 +79,11 @@ class Outbox:
         self._remove(report_id, "delivered")
 
     def refused(self, report_id: str) -> None:
-        """Removes a report that the server will never take, or could never read."""
+        """Remove a report that the server rejects for good or cannot read."""
         self._remove(report_id, "refused")
 
     def counts(self) -> dict[str, int]:
-        """`waiting` now; `delivered`, `dropped` for want of room and `refused` (damaged ones among them) since the file was made."""
+        """Return `waiting` now; `delivered`, `dropped` for lack of space and `refused` (including damaged) since the file was made."""
         with self._transaction("DEFERRED") as database:
             known = dict(database.execute("SELECT name, value FROM count").fetchall())
             waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]
@@ -94,7 +94,7 @@ class Outbox:
             self._count(database, count, database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
 
     def _make_room(self, database: sqlite3.Connection) -> None:
-        """Drops the oldest reports, never the newest one."""
+        """Drop the oldest reports, never the newest one."""
         query = "SELECT number, LENGTH(payload) FROM report ORDER BY number"
         rows = database.execute(query).fetchall()
         total, dropped = sum(size for _, size in rows), 0

@@ -1,4 +1,4 @@
-"""Delivery to the server: reports of failures from the outbox, behind them their recordings part by part; reports into a folder, too."""
+"""Delivery to the server: failure reports from the outbox, then their recordings part by part; also reports into a folder."""
 
 import logging
 from collections import deque
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class ReplayQueue:
-    """Failures whose last seconds are still to come; `work` brings those that are complete to the outbox. For one thread."""
+    """Failures whose recording is not yet complete; `work` moves complete ones to the outbox. For one thread."""
 
     def __init__(self, outbox: Outbox, profile: RobotProfile, pictures: str) -> None:
         """pictures: one of failure_file.PICTURES."""
@@ -36,7 +36,7 @@ class ReplayQueue:
         self._pending.append((report, cut))
 
     def work(self) -> None:
-        """Writes recordings that are complete; one that cannot be written or is too large is lost, and its report is not."""
+        """Write complete recordings. One that cannot be written or is too large is lost; its report is not."""
         for report, cut in [entry for entry in self._pending if entry[1].frames is not None]:
             self._pending.remove((report, cut))
             try:
@@ -50,9 +50,9 @@ class ReplayQueue:
 
 
 def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[str, int]) -> bool:
-    """Sends one part of the oldest recording; False where none waits, or the server takes none now.
+    """Send one part of the oldest recording; False if none waits or the server accepts none now.
 
-    received_bytes: by the report's id, what the server had; kept by the caller between calls.
+    received_bytes: bytes that the server has, by report id; kept by the caller between calls.
     """
     waiting = outbox.waiting(1)
     if not waiting:
@@ -64,7 +64,7 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
         ack = client.send_replay_part(
             ReplayPart(id=replay.id, total_bytes=len(replay.payload), offset=offset, data=data)
         )
-    except LinkError as error:  # an older server knows no recordings: reports and maps go on
+    except LinkError as error:  # an older server does not accept recordings: reports and maps continue
         _log.info("the recording of failure %s waits: %s", replay.id, error)
         return False
     if ack.refused or ack.id != replay.id:
@@ -73,7 +73,7 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
     elif ack.received_bytes >= len(replay.payload):
         outbox.done(replay.id)
     elif ack.received_bytes == offset:
-        return False  # nothing was taken
+        return False  # the server accepted nothing
     else:
         received_bytes[replay.id] = ack.received_bytes
         return True
@@ -85,9 +85,9 @@ _DELIVERED_PER_STEP = 20
 
 
 def deliver(client: MapClient, outbox: Outbox) -> bool:
-    """Sends waiting reports, oldest first; False where the server refuses some of them for now.
+    """Send waiting reports, oldest first; False if the server refuses some of them for now.
 
-    One that is refused for now does not hold up those behind it; a damaged one is dropped. Raises UnreachableError where nobody answers.
+    A report refused for now does not delay later ones; a damaged one is dropped. Raises UnreachableError if the server does not answer.
     """
     is_open = True
     for report in outbox.waiting(_DELIVERED_PER_STEP):
@@ -113,19 +113,19 @@ def deliver(client: MapClient, outbox: Outbox) -> bool:
 
 
 def _is_whole(report: QueuedReport) -> bool:
-    """Whether a report is still the one that was put into the outbox; logs where it is not."""
+    """Return True if a report is undamaged; log the damage otherwise."""
     try:
         decoded_id = decode_message(report.payload, FailureReport).id
     except LinkError as error:
         _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
         return False
     if decoded_id != report.id:
-        _log.warning("the report of failure %s is damaged and dropped: it tells of %s", report.id, decoded_id)
+        _log.warning("the report of failure %s is damaged and dropped: it is about %s", report.id, decoded_id)
     return decoded_id == report.id
 
 
 def write_failure(folder: Path, report: FailureReport) -> Path:
-    """The path of `STAMP-KIND-CAUSE.json`, written with its pictures beside it; raises StoreError where the disk refuses."""
+    """Write `STAMP-KIND-CAUSE.json` with its pictures beside it and return its path; StoreError on a disk error."""
     name = f"{report.stamp_ns}-{report.kind}-{report.cause}"
     fields = to_plain(msgspec.structs.replace(report, thumbnails=()))
     fields["thumbnails"] = []

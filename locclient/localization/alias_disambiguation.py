@@ -1,16 +1,16 @@
 """Disambiguation of places that look alike, by landmarks that only one of them has. Pure.
 
-Fix totals cannot do this: a sign at an aisle's end is ten landmarks among hundreds, and the map's budget takes other landmarks of
-each aisle. So every hypothesis keeps a history: how often each landmark should have been observed, and how often it was. To compare
-two hypotheses, their landmarks are laid over each other in the odometry frame:
+Fix totals cannot do this: a sign at an aisle's end has ten landmarks among hundreds, and the map's budget selects different landmarks
+of each aisle. So every hypothesis keeps a history: how often each landmark was expected, and how often it was observed. To compare
+two hypotheses, their landmarks are superimposed in the odometry frame:
 
-* Landmarks that look the same at the same spot of any two competing hypotheses are left out. A third one counts, too: where the
-  robot's own aisle is not mapped, its aliases would else be told apart by what they share with it.
-* The others are compared cell by cell. In most cells both places have the same thing, of which the map holds different corners, or
-  the thing was taken away. Where the landmarks of one place are found and those of the other never are, one of the two is wrong.
-* A cell with landmarks of one place only is ignored: the budget may have chosen none of the other, or a box may have been moved.
-* Cells count beyond a threshold only, because the survey saw some aisles better than others and hundreds of weak cells would add up.
-* Blocks of cells are bounded, because a pallet can be carried from one aisle to another.
+* Landmarks that look the same at the same position of any two competing hypotheses are excluded. A third hypothesis counts as well: if
+  the robot's own aisle is not mapped, its aliases would otherwise be distinguished by features that they share with it.
+* The others are compared cell by cell. In most cells both places contain the same object, mapped by different corners, or the
+  object was removed. If the landmarks of one place are observed and those of the other never are, one of the two is wrong.
+* A cell with landmarks of one place only is ignored: the budget may have dropped the other's, or a box may have been moved.
+* Only cells beyond a threshold count, because the survey saw some aisles better than others and hundreds of weak cells would add up.
+* The log odds of a block of cells are bounded, because a pallet can be moved from one aisle to another.
 
 The result is a log Bayes factor (Kass and Raftery 1995); a landmark's observations follow a beta-binomial distribution.
 """
@@ -27,22 +27,22 @@ from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 
-_MAX_VIEWS, _ALL_VIEWS = 64, (1 << 64) - 1  # that are remembered: some 20 m of travel
-_MAX_LANDMARKS = 3000  # of a hypothesis: some 30 m of travel
-_STEP_M, _STEP_RAD = 0.2, 0.15  # between views that count: two from the same viewpoint fail for the same reasons
-_REACH_M, _ALIKE_BITS = 0.15, 75  # of one thing's landmark, mapped in two aisles; others differ by 90 bits and more
-# A plate, a poster, a pallet: some lattice has most of a sign in one cell, and little else with it.
+_MAX_VIEWS, _ALL_VIEWS = 64, (1 << 64) - 1  # in the history: about 20 m of travel
+_MAX_LANDMARKS = 3000  # of a hypothesis: about 30 m of travel
+_STEP_M, _STEP_RAD = 0.2, 0.15  # between counted views: two views from one viewpoint fail for the same reasons
+_REACH_M, _ALIKE_BITS = 0.15, 75  # between landmarks of one object in two aisles; others differ by over 90 bits
+# Sizes of a plate, a poster, a pallet: in one of the lattices, a single cell contains most of a sign and little else.
 _LATTICES = np.array([(cell_m, shift) for cell_m in (0.35, 0.6, 0.9) for shift in (0.0, 0.5)])
 _BLOCK_M, _MAX_BLOCKS = 1.8, 256
-_MAX_BLOCK_LOG_ODDS = 3.0  # no single thing that could have been carried here decides
-# Beta parameters of the share of views in which a landmark is found. Where it stands: about two in five, and one in eight landmarks
-# is never found. Where it does not: by chance.
+_MAX_BLOCK_LOG_ODDS = 3.0  # so that no single movable object decides
+# Beta parameters of the share of views in which a landmark is observed. If present: about two in five, and one in eight landmarks
+# is never observed. If absent: by chance.
 _PRESENT, _NEVER_SHARE, _ABSENT = (2.0, 2.8), 0.12, (0.5, 10.0)
 Flags = NDArray[np.bool_]
 
 
 class CellModel(NamedTuple):
-    """Probabilities of what a cell may hold."""
+    """Prior probabilities of the content of a cell."""
 
     least: float
     taken_share: float
@@ -52,22 +52,22 @@ class CellModel(NamedTuple):
 
 
 _MODEL = CellModel(
-    least=2.0,  # landmarks whose absence counts: any single one may be one that is never found
-    taken_share=0.05,  # of the cells in which stock was moved since the survey
-    different_share=0.15,  # of the cells with something that looks the same nowhere in the other place
-    odd_share=0.01,  # of those that mislead: stock moved to where it makes one place look like the other
+    least=2.0,  # minimum number of absent landmarks: a single one may be one that is never observed
+    taken_share=0.05,  # of cells: stock was moved since the survey
+    different_share=0.15,  # of cells: an object without counterpart in the other place
+    odd_share=0.01,  # of cells: moved stock makes one place look like the other
     threshold=1.25,  # a logarithm: cells hardly reach this by chance
 )
 
 
 @dataclass(slots=True)
 class ViewpointGate:
-    """Lets a view count only from another viewpoint than the last that did."""
+    """Admits a view only from another viewpoint than the last admitted one."""
 
     odom_from_body: Array | None = None
 
     def is_new(self, odom_from_body: Array) -> bool:
-        """Whether this view counts; it is the last one then."""
+        """Return True if this view is admitted, and store it as the last one."""
         if self.odom_from_body is not None:
             since = se3_inverse(self.odom_from_body) @ odom_from_body
             if np.linalg.norm(since[:3, 3]) < _STEP_M and rotation_angle_rad(since[:3, :3]) < _STEP_RAD:
@@ -82,10 +82,10 @@ class ViewpointGate:
 
 @dataclass(slots=True)
 class ObservationHistory:
-    """In which of the last views each landmark should have been observed from one hypothesis, and in which it was; ids (L,) rise.
+    """Last views of one hypothesis in which each landmark was expected, and in which it was found; ids (L,) ascending.
 
-    Views are bits, the newest the lowest. views: those with a fix at the hypothesis; expected, found (L,): those of each landmark.
-    points_odom (L, 3): means over the views. They coincide with those of another hypothesis that observed the same things.
+    Views are bits, the newest is the lowest. views: those with a fix at the hypothesis; expected, found (L,): per landmark.
+    points_odom (L, 3): means over the views. They coincide with those of another hypothesis that observed the same objects.
     """
 
     ids: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
@@ -96,7 +96,7 @@ class ObservationHistory:
     views: int = 0
 
     def begin_view(self) -> None:
-        """Begins a view, so far without a fix here; landmarks of the oldest view alone are forgotten."""
+        """Begin a view without a fix at this hypothesis so far; drop landmarks that only the oldest view had."""
         self.views = self.views << 1 & _ALL_VIEWS
         self.expected, self.found = self.expected << np.uint64(1), self.found << np.uint64(1)
         self._keep(np.flatnonzero(self.expected))
@@ -120,7 +120,7 @@ class ObservationHistory:
         self._keep(np.sort(np.argsort(newest, kind="stable")[:_MAX_LANDMARKS]))
 
     def counts(self, views: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """In how many of these views (bits) each landmark was expected (L,) and found (L,)."""
+        """Return the number of these views (bits) in which each landmark was expected (L,) and found (L,)."""
         mask = np.uint64(views)
         return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
 
@@ -133,17 +133,17 @@ class ObservationHistory:
 
 
 def mark_shared(one: ObservationHistory, other: ObservationHistory, one_shared: Flags, other_shared: Flags) -> None:
-    """Sets the flags of the landmarks (L,), (M,) that look the same at the same spot of the other place."""
+    """Set the flags of the landmarks (L,), (M,) that look the same at the same position of the other place."""
     if len(one.ids) and len(other.ids):
         first = one.points_odom, packed(one.descriptors), one_shared
         core.mark_shared(first, (other.points_odom, packed(other.descriptors), other_shared), _REACH_M, _ALIKE_BITS)
 
 
 def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Flags, other_shared: Flags) -> float:
-    """The log Bayes factor of the first hypothesis against the second, given the observations; 0 where nothing discriminates.
+    """Return the log Bayes factor of the first hypothesis against the second, given the observations; 0 without evidence.
 
-    Only views with a fix at both count: one at a single hypothesis may have been a bad fix. one_shared, other_shared: landmarks that
-    look the same at the same spot of any hypothesis, and so do not discriminate. Source: Kass and Raftery 1995 (Bayes factors).
+    Only views with a fix at both count: a fix at a single hypothesis may be wrong. one_shared, other_shared: landmarks that look
+    the same at the same position of any hypothesis, and so do not discriminate. Source: Kass and Raftery 1995 (Bayes factors).
     """
     common = one.views & other.views
     if not common or not len(one.ids) or not len(other.ids):
@@ -157,14 +157,14 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
 
 
 def log_beta_binomial(expected: int, found: int, a: float, b: float) -> float:
-    """Log probability of one order of `expected` views, `found` of them positive, of a landmark whose rate is Beta(a, b)."""
+    """Return the log probability of one sequence of `expected` views, `found` of them positive, of a landmark with rate Beta(a, b)."""
     # log B(a + found, b + expected - found) - log B(a, b)
     seen, missed = a + found, b + expected - found
     return lgamma(seen) + lgamma(missed) - lgamma(a + b + expected) + lgamma(a + b) - lgamma(a) - lgamma(b)
 
 
 def _log_likelihoods() -> Array:
-    """(expected, found, 2): log likelihoods of these counts where the landmark is present, and where it is absent."""
+    """Return (expected, found, 2): log likelihoods of these counts if the landmark is present, and if it is absent."""
     table = np.zeros((_MAX_VIEWS + 1, _MAX_VIEWS + 1, 2))
     for expected in range(_MAX_VIEWS + 1):
         for found in range(expected + 1):

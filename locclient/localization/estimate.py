@@ -20,7 +20,7 @@ from locclient.localization.settings import TrackSettings
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A pose that the robot may have, map_from_body (4, 4), and the number of fixes that support it."""
+    """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it."""
 
     map_from_body: Array
     support: int
@@ -28,15 +28,15 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Pose of the body at one frame, with what led to it.
+    """Pose of the body at one frame, with diagnostics.
 
-    map_from_body (4, 4), cov_rot_trans (6, 6): map axes, rotation first; None while unknown. cause: what stands in the way of TRACKING;
-    image: quality of the frame's images, with their own cause, also while TRACKING. fix: the one that was finished with this frame, taken
-    from the frame of fix_stamp_ns, which may be a few frames older. refused: why a fix was not used. innovation: squared Mahalanobis
-    distance between fix and prediction; innovation_m: metres, for fixes that were believed or found where the robot should be. moved_m: for
-    a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, where that is more than its
-    covariance admits: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the clock
-    that was passed in. calibration: what the map shows of it.
+    map_from_body (4, 4), cov_rot_trans (6, 6): map axes, rotation first; None if unknown. cause: reason why the status is not TRACKING;
+    image: quality of the frame's images, with their own cause, also while TRACKING. fix: the one finished with this frame, of the frame
+    at fix_stamp_ns, which may be a few frames older. refused: reason why a fix was not used. innovation: squared Mahalanobis
+    distance between fix and prediction; innovation_m: metres, for fixes that were accepted or found at the predicted place. moved_m: for
+    a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, if beyond its
+    covariance: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the given
+    clock. calibration: its state by the map.
     """
 
     stamp_ns: int
@@ -59,7 +59,7 @@ class Estimate:
 
 
 class QueryResult(NamedTuple):
-    """The result of a map query; fields as in Estimate."""
+    """Result of a map query; fields as in Estimate."""
 
     fix: Fix | None = None
     refused: str = ""
@@ -79,9 +79,9 @@ def assemble(
     has_failed: bool,
     was_tracking: bool,
 ) -> Estimate:
-    """`estimate`, whose cause is that of its images, with status, pose and cause.
+    """Return `estimate`, whose cause is that of its images, completed by status, pose and cause.
 
-    prior: the pose by the prior and the motion since. has_failed: the last map query found no fix.
+    prior: pose by the prior and the motion since. has_failed: the last map query found no fix.
     """
     if confirmed is not None:
         return _of_confirmed(estimate, confirmed, candidates.hypotheses, has_failed, settings)
@@ -93,7 +93,7 @@ def assemble(
         return estimate if is_open else _with_pose(estimate, ranking[0], settings)
     if prior is None or estimate.map_version is None:
         return estimate
-    # Nothing in the map agrees: the prior and the odometry since, as far as that goes.
+    # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
     if radius_95_m(prior.now_cov) <= settings.lost_radius_m:
         status = Status.DEGRADED
     estimate = replace(estimate, status=status, cause=estimate.cause or Cause.UNMATCHED)
@@ -114,7 +114,7 @@ def _of_confirmed(
     cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
     is_doubted = (
         confirmed.has_broken and has_failed
-    )  # what it saw vanished, and the map does not say that it is still there
+    )  # its tracks were lost, and the map has not confirmed its place since
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (
@@ -128,16 +128,16 @@ def _of_confirmed(
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
     is_told = any(h.speaks_against_others(settings) for h in elsewhere)
-    if status is not Status.TRACKING and is_told:  # it may be at either
+    if status is not Status.TRACKING and is_told:  # the robot may be at either
         places = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     return _with_pose(estimate, confirmed, settings)
 
 
 def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSettings) -> Estimate:
-    """With the map's own uncertainty, which is common to all fixes: no number of them averages it away.
+    """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out.
 
-    A pose or covariance with NaN says nothing: the estimate then has none.
+    The estimate has no pose if pose or covariance contain NaN.
     """
     if np.isnan(hypothesis.now_map_from_body).any() or np.isnan(hypothesis.now_cov).any():
         return estimate

@@ -1,4 +1,4 @@
-"""Competing pose hypotheses: voted for by fixes, ranked, told apart, confirmed. Pure."""
+"""Competing pose hypotheses: votes by fixes, ranking, disambiguation, confirmation. Pure."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -15,17 +15,17 @@ from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
 _PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
-_MAX_WRONG_SHARE = 0.05  # of unmapped places that may be believed by weak fixes of a robot that stands
+_MAX_WRONG_SHARE = 0.05  # of unmapped places that weak fixes of a standing robot may confirm by mistake
 
-# The fixes of one query, and each one's pose, propagated to the present.
+# The fixes of one query, each with its pose propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
 
 
 class HypothesisSet:
-    """Candidates while no pose is confirmed, else the places that refused fixes name; or those that contradict a prior.
+    """Candidates while no pose is confirmed, else the places of refused fixes; or those that contradict a prior.
 
-    hypotheses: in the order of their first fixes. abandoned: the confirmed pose that was given up for them, which was published as the
-    robot's until fixes named another. lookalikes: what unmapped places have in common with the map, None where nobody measured it.
+    hypotheses: in the order of their first fixes. abandoned: the confirmed and published pose that was given up for them after fixes
+    contradicted it. lookalikes: similarity of unmapped places to the map, None if not measured.
 
     Source: multiple hypothesis tracking (Reid 1979), of a single target and without branching.
     """
@@ -45,13 +45,13 @@ class HypothesisSet:
         self._viewpoint_gate.redefine_odom(new_odom_from_old_odom)
 
     def reset(self) -> None:
-        """Starts over without any."""
+        """Remove all hypotheses."""
         self.hypotheses, self.abandoned, self._disambiguated = [], None, None
 
     # --- one query ----------------------------------------------------------------------------------------------------
 
     def observe(self, observations: Observations, odom_from_body: Array | None) -> None:
-        """One query: every fix votes for a hypothesis, or founds one; those without votes for long are dropped.
+        """Add the fixes of one query: each votes for a hypothesis or creates one; drop those without recent votes.
 
         odom_from_body: at present; None keeps no history of landmarks.
         """
@@ -66,10 +66,10 @@ class HypothesisSet:
         self.hypotheses = [h for h in self.hypotheses if h.misses < self._settings.max_misses]
 
     def _vote(self, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None) -> None:
-        """A fix votes for the hypothesis at its pose, which takes that over, or founds one. fresh: the fix's pose at present."""
+        """Let a fix vote for the hypothesis at its pose and update it, or create one. fresh: the fix's pose at present."""
         for hypothesis in self.hypotheses:
             if self._is_same_pose(fresh, hypothesis):
-                if hypothesis.misses:  # at most one vote a query
+                if hypothesis.misses:  # at most one vote per query
                     hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
                     self._count(hypothesis, fix, fresh, odom_from_body)
                 hypothesis.take_pose(fresh)
@@ -90,27 +90,27 @@ class HypothesisSet:
         return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
-        """As `observe`, and disambiguation; in time slices."""
+        """Run `observe` and the disambiguation, in time slices."""
         self.observe(observations, odom_from_body)
         self._disambiguated = yield from self._tell_apart()
 
     # --- ranking ------------------------------------------------------------------------------------------------------
 
     def ranking(self) -> tuple[list[PoseHypothesis], list[PoseHypothesis]]:
-        """The hypotheses, the most likely first, and the competitors of that one."""
+        """Return the hypotheses, the most likely first, and the competitors of the first."""
         order, best = self._ranked(), self._disambiguated
-        if not any(h is best for h in order):  # it may have been pruned in a query that goes on
+        if not any(h is best for h in order):  # it may have been pruned during the query
             return order, self._competitors(order[0]) if order else []
         return sorted(order, key=lambda h: h is not best), []
 
     def _ranked(self) -> list[PoseHypothesis]:
-        """The one with most inliers first."""
+        """Return the hypotheses, the one with most inliers first."""
         return sorted(self.hypotheses, key=lambda h: -h.inlier_sum)
 
     def _competitors(self, best: PoseHypothesis) -> list[PoseHypothesis]:
-        """Hypotheses with nearly the support of `best`, per query since they were founded or in this query alone: by inliers, or by
-        landmark recall, since a place where the map is thin is no less likely than its alias. A robot that turns into its aisle sees more
-        of the next one at first: what it saw then must not outweigh that both look alike now.
+        """Return hypotheses with nearly the support of `best`, per query since their creation or in this query alone: by inliers, or by
+        landmark recall, since a sparsely mapped place is as likely as its alias. A robot that turns into its aisle sees more of the next
+        one at first: those observations must not outweigh that both look alike now.
         """
         settings = self._settings
 
@@ -129,11 +129,11 @@ class HypothesisSet:
         return [h for h in self.hypotheses if h is not best and competes(h)]
 
     def _tell_apart(self) -> TimeSliced[PoseHypothesis | None]:
-        """The hypothesis whose log odds against every competitor reach the threshold; None while there is none. In time slices.
+        """Return the hypothesis whose log odds against every competitor reach the threshold; None if absent. In time slices.
 
-        It need not rank first: a sign is little beside all that aliases share. What a person said counts as a sign, too. Only where the
-        whole site is mapped: of the aliases of a place that the map does not hold, one is always the least unlike it. The test is repeated
-        with every query, as in a sequential test (Wald 1945); it never rejects.
+        It need not rank first: a sign has few landmarks beside those that aliases share. An operator's pose counts like a sign. Used only
+        if the whole site is mapped: among the aliases of an unmapped place, one is always the most similar. The test is repeated with
+        every query, as in a sequential test (Wald 1945); it never rejects.
         """
         order, threshold = self._ranked(), self._settings.telling_evidence
         if not self._settings.is_whole_site_mapped or not order or not self._competitors(order[0]):
@@ -164,22 +164,22 @@ class HypothesisSet:
     # --- confirmation -------------------------------------------------------------------------------------------------
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether a place that is not in the map could look as much like the hypothesis: by its recall in all queries so far."""
+        """Return True if an unmapped place could look as similar, by the hypothesis's recall in all queries so far."""
         return self.lookalikes is not None and 0.0 < self.lookalikes.recall >= hypothesis.recall
 
     def is_supported(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether enough fixes agreed over enough distance."""
+        """Return True if enough fixes agreed over enough distance."""
         settings = self._settings
         has_enough = hypothesis.support >= settings.confirming_fixes
         return has_enough and hypothesis.travelled_m >= settings.confirming_distance_m
 
     def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
-        """By enough fixes over enough distance, or as the only hypothesis by an unambiguous fix: a strong one, or one of enough that
-        agree where the map's look-alikes were measured well enough, so that no distance needs to exclude them."""
+        """Return True after enough fixes over enough distance, or for the only hypothesis after an unambiguous fix: a strong one, or one
+        of enough agreeing fixes if the map's look-alikes were measured well enough, so that no distance is needed to exclude them."""
         settings = self._settings
         if len(self.hypotheses) == len(fixes) == 1:
             fix = fixes[0]
-            # It agrees so well that no other place of this map can be meant.
+            # It agrees too well for any other place of this map.
             is_unambiguous = fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share
             has_enough = hypothesis.support >= settings.confirming_fixes
             is_measured = self.lookalikes is not None and self.lookalikes.max_wrong_share <= _MAX_WRONG_SHARE
@@ -188,7 +188,7 @@ class HypothesisSet:
         return self.is_supported(hypothesis)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
-        """The distance of a hypothesis from the abandoned pose; None where their covariances admit it (Mahalanobis test)."""
+        """Return the distance of a hypothesis from the abandoned pose; None if within their covariances (Mahalanobis test)."""
         if self.abandoned is None:
             return None
         error = boxminus(hypothesis.now_map_from_body, self.abandoned.now_map_from_body)

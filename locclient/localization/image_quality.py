@@ -1,4 +1,4 @@
-"""Image quality of a frame: exposure, sharpness, and the fault that they show. Pure."""
+"""Image quality of a frame: exposure, sharpness, and faults. Pure."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ _BRIGHT = 250
 
 
 class ImageQualitySettings(Section, frozen=True):
-    """Limits beyond which an image counts as bad."""
+    """Limits of a good image."""
 
     dark_contrast: float = 4.0
     glare_share: float = 0.6
     blurred_share: float = 0.1
-    typical_frames: int = 150  # over which the usual contrast and depth are taken
+    typical_frames: int = 150  # for the average contrast and depth
     occluded_depth_share: float = 0.4
 
 
@@ -32,7 +32,7 @@ class ImageQuality:
     """Quality of one frame's images.
 
     cause: their fault, NONE for good ones. Of the left image: exposure, the mean brightness from 0 to 1, and sharpness, the variance of
-    the steps between neighbouring pixels of a row, where 1 is typical for this robot so far.
+    differences between neighbouring pixels of a row, relative to this robot's typical value.
     """
 
     cause: Cause = Cause.NONE
@@ -44,7 +44,7 @@ GOOD_IMAGE = ImageQuality()
 
 
 class ImageQualityMonitor:
-    """Judges frames in their order; both the localizer and the failure monitor use its verdict."""
+    """Assesses frames in order, for the localizer and the failure monitor."""
 
     def __init__(self, settings: ImageQualitySettings) -> None:
         self._settings = settings
@@ -54,7 +54,7 @@ class ImageQualityMonitor:
         self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
 
     def judge(self, frame: RectifiedFrame) -> ImageQuality:
-        """The quality of `frame`; its fault is darkness, glare, a camera (either one) that repeats its last image, or blur."""
+        """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
         thinned = [_ThinnedImage.of(image) for image in (frame.left, frame.right) if image is not None]
         self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
         count, total, squares = core.row_steps(np.ascontiguousarray(frame.left), _EVERY_PX)
@@ -69,12 +69,12 @@ class ImageQualityMonitor:
         return ImageQuality(cause, thinned[0].mean / 255.0, variance / max(typical, 1e-9))
 
     def without_frozen(self, frame: RectifiedFrame) -> RectifiedFrame:
-        """`frame`, just judged, without what a stuck camera repeats: no right image, or nothing to see at all."""
+        """Return `frame`, just judged, without images of a stuck camera: no right image, or an empty left one."""
         left = np.zeros_like(frame.left) if self._frozen[0] else frame.left
         return RectifiedFrame(frame.stamp_ns, left, None, None)
 
     def judge_depth(self, scene_depth_m: float) -> Cause:
-        """OCCLUDED where the scene is much nearer than it used to be: something stands before the cameras."""
+        """Return OCCLUDED if the scene is much nearer than usual: an object is in front of the cameras."""
         typical_m = median(self._depths_m) if self._depths_m else scene_depth_m
         if scene_depth_m < self._settings.occluded_depth_share * typical_m:
             return Cause.OCCLUDED
@@ -87,14 +87,14 @@ class ImageQualityMonitor:
         return Cause.GLARE if left.bright_share > self._settings.glare_share else Cause.NONE
 
     def _is_frozen(self, side: int, image: "_ThinnedImage") -> bool:
-        """Sensor noise never repeats itself: equal to the last bit is a stuck camera."""
+        """Return True for an image that is bit-identical to the last one: sensor noise never repeats."""
         last, self._last[side] = self._last[side], image.pixels
         return last is not None and image.contrast > 1.0 and np.array_equal(last, image.pixels)
 
 
 @dataclass(frozen=True, slots=True)
 class _ThinnedImage:
-    """Every eighth pixel of every eighth row, with their mean, standard deviation and share of nearly white ones."""
+    """Every eighth pixel of every eighth row, with mean, standard deviation and share of nearly white pixels."""
 
     pixels: Image
     mean: float

@@ -12,17 +12,17 @@ from locclient.localization.pose_covariance import compose_inverse_cov, transpor
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
-_SIGMA_M = 0.05  # added to any prior: it is of a moment between two frames
-_DRIFT_SHARE = 0.2  # of the distance travelled since, added likewise
+_SIGMA_M = 0.05  # added to any prior, because its moment lies between two frames
+_DRIFT_SHARE = 0.2  # of the distance travelled since, also added
 _CHI2_999, _BOUND_SIGMAS = 13.816, 3.7  # 0.999 of two dimensions
-# What is beyond is never looked at, and the next aisle that looks the same may be within: at 0.999 one start in a thousand would be at the
-# wrong one. A prior's own error counts up to 0.99999 (23.026); the drift that is added to it is a generous bound already.
+# Places beyond the bound are not searched, and a similar next aisle may be within: at 0.999 one start in a thousand would choose the wrong
+# one. A prior's own error counts up to 0.99999 (23.026); the drift that is added to it is already a generous bound.
 _WIDER = 23.026 / _CHI2_999
-_PLACE_REACH_M = 3.0  # between the robot and a place that shows what it sees
+_PLACE_REACH_M = 3.0  # maximum distance between the robot and a place with the same view
 
 
 def agrees(prior: PositionPrior, confirmed: PoseHypothesis, base_from_body: Array) -> bool:
-    """Whether a confirmed pose lies within the bound of a prior's position and heading."""
+    """Return True if a confirmed pose lies within the bound of a prior's position and heading."""
     map_from_base = confirmed.now_map_from_body @ se3_inverse(base_from_body)
     off_m = map_from_base[:2, 3] - prior.map_from_base[:2, 3]
     cov_m2 = _WIDER * prior.cov_rot_trans[3:5, 3:5] + confirmed.now_cov[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
@@ -36,9 +36,9 @@ def agrees(prior: PositionPrior, confirmed: PoseHypothesis, base_from_body: Arra
 class InitialPosePrior:
     """A prior, and the robot's motion since its moment.
 
-    hypothesis: the pose by both, published while the map gives none; None for priors with an unknown direction. contradictions: places
-    that fixes name instead of those within a revisable prior. is_told: somebody said so, as of docks and zones; else it is where the robot
-    itself believes to be, by odometry.
+    hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
+    of fixes outside a revisable prior. is_told: True for a prior from outside, such as a dock, a zone or an operator; else it is the
+    robot's own estimate by odometry.
     """
 
     def __init__(self, prior: PositionPrior, base_from_body: Array, settings: TrackSettings) -> None:
@@ -53,7 +53,7 @@ class InitialPosePrior:
     def at(
         cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, *, is_revisable: bool, is_told: bool
     ) -> "InitialPosePrior":
-        """A pose at a frame of the odometry as a prior."""
+        """Return a pose at a frame of the odometry as a prior."""
         map_from_base = known.map_from_body @ se3_inverse(base_from_body)
         covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
         made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body, settings)
@@ -67,7 +67,7 @@ class InitialPosePrior:
         return self._since is None
 
     def propagate(self, odometry: OdometryEstimate, step: Array) -> None:
-        """To the present frame, by `step` (4, 4) from the last one. The caller propagates `tracked` with other hypotheses."""
+        """Propagate to the present frame, by `step` (4, 4) from the last one. The caller propagates `tracked` with other hypotheses."""
         self.travelled_m += float(np.linalg.norm(step[:3, 3]))
         if self._since is not None:
             return
@@ -82,7 +82,7 @@ class InitialPosePrior:
         return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether the robot's motion leads back from a present pose to within the bound of the prior's position."""
+        """Return True if a present pose, traced back by the robot's motion, lies within the bound of the prior's position."""
         if self._since is None:
             return True
         since, now = ((h.now_map_from_body, h.now_cov) for h in (self._since, hypothesis))
@@ -92,10 +92,10 @@ class InitialPosePrior:
         return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + covariance[3:5, 3:5], off_m) < _CHI2_999)
 
     def is_contradicted(self, observations: Observations, lookalikes: LookAlikes | None) -> bool:
-        """Whether the fixes of a query without any within the prior, and those before, outweigh it.
+        """Return True if the fixes of a query, none within the prior, and earlier ones outweigh it.
 
-        It counts as much as what confirms a pose: more fixes than that must agree, over as much distance, on one place without
-        competitors that no unmapped place resembles. A robot that stands sees the same thing again, which is no more evidence.
+        It weighs as much as the confirmation of a pose: more fixes than that must agree, over as much distance, on one place without
+        competitors or similar unmapped places. Repeated views of a standing robot add no evidence.
         """
         found = self.contradictions
         found.lookalikes = lookalikes
@@ -108,13 +108,13 @@ class InitialPosePrior:
         return has_more and (is_telling or found.is_supported(order[0])) and not found.may_be_lookalike(order[0])
 
     def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
-        """(N,) which positions (N, 3) may show what the robot sees now."""
+        """Return flags (N,) of the positions (N, 3) from which the robot may have its present view."""
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 
     def weighed(self, observations: Observations) -> Observations:
-        """The fixes of a query, with what a person's word for its place is worth to each: 0 for places that were not named. Exact sources
-        exclude the others instead."""
+        """Return the fixes of a query, each weighted by an operator's prior: 0 for places outside it. Exact sources exclude other places
+        instead."""
         for _, hypothesis in observations if self.is_revisable and self.is_told else ():
             if self.is_compatible(hypothesis):
                 share = self._settings.wrong_prior_share
@@ -122,19 +122,19 @@ class InitialPosePrior:
         return observations
 
     def confirms(self, hypothesis: PoseHypothesis) -> bool:
-        """Whether it is told, and so tight that one fix at its place confirms that; of a person's, at the place that was named."""
+        """Return True if the prior is told and so tight that one fix within it confirms a pose; an operator's, only at its own place."""
         is_named = not self.is_revisable or hypothesis.told_log_odds > 0.0
         return self.is_told and is_named and self.is_tight(self._settings.tight_prior_sigma_m)
 
     def is_tight(self, sigma_m: float) -> bool:
-        """Whether its horizontal sigma is at most that, now."""
+        """Return True if the present horizontal sigma is at most `sigma_m`."""
         return self._sigma_m() <= sigma_m
 
     def _sigma_m(self, scale: float = 1.0) -> float:
         return float(np.sqrt(np.linalg.eigvalsh(self._cov_m2(scale))[-1]))
 
     def _cov_m2(self, scale: float = 1.0) -> Array:
-        """(2, 2) of the prior's horizontal position, its own part times `scale`. It grows with the distance travelled: neither unmodelled
-        drift nor a push nor an operator's error must keep the robot from its pose for ever."""
+        """Return the covariance (2, 2) of the horizontal position, the prior's own part times `scale`. It grows with the distance
+        travelled, so that unmodelled drift, a push or an operator's error do not prevent localization forever."""
         added = _SIGMA_M**2 + (_DRIFT_SHARE * self.travelled_m) ** 2
         return np.asarray(scale * self._prior.cov_rot_trans[3:5, 3:5] + added * np.eye(2))

@@ -25,10 +25,10 @@ from locclient.localization.settings import LocalizerSettings
 
 
 class Localizer:
-    """Localizes one robot in one map version; a new version is taken over without losing the pose.
+    """Localizes one robot in one map version; a new version is adopted without losing the pose.
 
-    A frame goes through image quality and odometry, which make a `Percept` of it; through `PoseTracker`, which carries the pose on;
-    through `MapQuery`, whose fixes correct it; and through what the map shows of the calibration.
+    A frame passes image quality and odometry, which produce a `Percept`; `PoseTracker`, which propagates the pose;
+    `MapQuery`, whose fixes correct it; and `CalibrationMonitor`.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Localizer:
         settings: LocalizerSettings,
         clock: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        """`clock` (seconds) measures the stages; the default measures nothing."""
+        """clock: seconds, measures the stages; the default measures nothing."""
         self._clock, self._settings, self._camera = clock, settings, camera
         rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
         self.odometry = Odometry(*rig, settings.odometry, settings.stereo)
@@ -61,9 +61,9 @@ class Localizer:
         self._calibration.watch.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """A prior at this moment, used until a pose is confirmed, with a covariance that grows with the distance since. One whose
-        covariance is finite is published as long as the map gives no pose: DEGRADED, by odometry from there. A person's takes the place of
-        a confirmed pose that it contradicts, and stays until fixes contradict it with more evidence than it has."""
+        """Use a prior at this moment until a pose is confirmed, with a covariance that grows with the distance since. A prior with finite
+        covariance is published, DEGRADED and propagated by odometry, until the map gives a pose. An operator's prior replaces a confirmed
+        pose that it contradicts, until fixes outweigh it."""
         if prior.is_revisable and self._tracker.confirmed is not None:
             if not self._tracker.is_contradicted_by(prior):
                 return
@@ -71,7 +71,7 @@ class Localizer:
         self._tracker.handle_prior(prior)
 
     def forget_pose(self) -> None:
-        """Searches in the whole map from the next frame on; a map query that goes on is given up."""
+        """Search the whole map from the next frame on; cancel a running map query."""
         self._tracker.forget()
         self._query.forget()
         self._calibration.give_up()
@@ -84,9 +84,9 @@ class Localizer:
         survey_focal_px: float,
         lookalikes: LookAlikes | None = None,
     ) -> None:
-        """The tiles to use from now on, all of one version. A map query that goes on is given up.
+        """Use these tiles, all of one version, from now on; cancel a running map query.
 
-        lookalikes: what places that are not in the map have in common with it; None where nobody measured it.
+        lookalikes: similarity of unmapped places to the map; None if not measured.
         """
         self._tracker.lookalikes = lookalikes
         self._map_version = version
@@ -95,17 +95,17 @@ class Localizer:
         self._calibration.give_up()
 
     def start(self) -> Start | None:
-        """What another localizer, with the same odometry, goes on with; None while a map query goes on, as its fix would be missing."""
+        """Return the state with which another localizer of the same odometry can start; None during a map query, whose fix is missing."""
         return None if self._query.is_under_way else self._tracker.start(self._query.failed)
 
     def begin(self, start: Start) -> None:
-        """Goes on from `start` with the next frame."""
+        """Continue from `start` with the next frame."""
         self.forget_pose()
         self._tracker.begin(start)
         self._query.failed = start.failed_queries
 
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
-        """The estimate at `frame`, newer than any before."""
+        """Return the estimate at `frame`, which must be newer than all before."""
         begun_s = self._clock()
         image = self._images.judge(frame)
         if image.cause is Cause.FROZEN:
@@ -131,7 +131,7 @@ class Localizer:
         return motions
 
     def localize(self, percept: Percept, frame: RectifiedFrame | None = None) -> Estimate:
-        """The estimate by what was perceived, newer than any before. frame: without it, all that the frame showed is in `percept`."""
+        """Return the estimate by a percept, newer than all before. frame: its images; None if `percept` has all data of the frame."""
         odometry, tracker = percept.odometry, self._tracker
         if odometry.is_lifted or (self._last_ns is not None and is_away(self._last_ns, odometry)):
             tracker.forget(keeps_new_prior=True, is_carried=odometry.is_lifted)

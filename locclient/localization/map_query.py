@@ -1,4 +1,4 @@
-"""Map queries: when one begins, and the work of one, spread over frames. Pure."""
+"""Map queries: their start, and their work spread over frames. Pure."""
 
 from dataclasses import dataclass
 
@@ -18,14 +18,16 @@ from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.settings import LocalizerSettings
 
-_SPREAD_SHARE = 0.45  # of the interval of map queries: at a lower frame rate a query is not spread over frames
+_SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-_MORE_SLICES = 3  # in a frame: of a search where the last one began too, as a late estimate costs nothing there, and where tracks broke
+_MORE_SLICES = (
+    3  # per frame: in searches from an unchanged viewpoint, where a late estimate does no harm, and after lost tracks
+)
 
 
 @dataclass(frozen=True)
 class FinishedQuery:
-    """A look at the map that has ended, with or without a fix; whether the pose is confirmed."""
+    """A finished map query, with or without a fix; is_confirmed: the pose is confirmed."""
 
     frame: RectifiedFrame
     odometry: OdometryEstimate
@@ -36,44 +38,44 @@ class FinishedQuery:
 
 
 class MapQuery:
-    """Looks at the map from time to time, a slice of work with each frame.
+    """Queries the map from time to time, with a slice of work in each frame.
 
-        IDLE      --due by the interval, or at once where tracks broke-->  EXTRACT   features of that frame
+        IDLE      --due by the interval, or at once after lost tracks-->   EXTRACT   features of that frame
         EXTRACT   --a pose is confirmed-->                                 NEAR      landmarks expected around it
-        EXTRACT   --none is-->                                             SEARCH    near candidates, then in the whole map or the prior
-        NEAR      --nothing there, and not for the first time-->           SEARCH
-        any       --slices used up-->                                      goes on with the next frame
-        any       --version changes, forget, tracks break-->               IDLE, without a result
+        EXTRACT   --no pose is confirmed-->                                SEARCH    near candidates, then in the whole map or the prior
+        NEAR      --no fix, repeatedly-->                                  SEARCH
+        any       --slices used up-->                                      continue with the next frame
+        any       --version changes, forget, tracks are lost-->            IDLE, without a result
         NEAR, SEARCH --done-->                                             IDLE, with fixes for the tracker
 
-    failed: the last so many queries found nothing.
+    failed: number of failed queries in a row.
     """
 
     def __init__(self, tracker: PoseTracker, settings: LocalizerSettings) -> None:
         self._tracker, self._settings, self._track = tracker, settings, settings.track
         self.relocalizer: Relocalizer | None = None
         self.failed = 0
-        self.finished: FinishedQuery | None = None  # with the last frame
+        self.finished: FinishedQuery | None = None  # finished with the last frame
         self._job: TimeSliced[QueryResult] | None = None
         self._begun: tuple[Percept, RectifiedFrame | None] | None = None  # the frame of that job, or of the last one
         self._begun_ns: int | None = None
-        self._slices, self._is_urgent = 1, False  # of that job: in a frame; it began where tracks broke
+        self._slices, self._is_urgent = 1, False  # of that job: slices per frame; started by lost tracks
         self._last_ns: int | None = None  # of the last frame
         self._gate = ViewpointGate()
-        self._failed_places: list[Array] = []  # tried in vain from the viewpoint of the gate
+        self._failed_places: list[Array] = []  # searched without success from the viewpoint of the gate
 
     @property
     def is_under_way(self) -> bool:
         return self._job is not None
 
     def use(self, relocalizer: Relocalizer) -> None:
-        """Another map: a query that goes on is given up."""
+        """Use another map; cancel a running query."""
         self.relocalizer = relocalizer
         self._cancel()
         self._failed_places.clear()
 
     def forget(self) -> None:
-        """The pose is not known any more: a query that goes on is given up."""
+        """Forget the pose; cancel a running query."""
         self._cancel()
         self.failed = 0
         self._failed_places.clear()
@@ -83,10 +85,10 @@ class MapQuery:
         self._tracker.end_query()
 
     def step(self, percept: Percept, frame: RectifiedFrame | None) -> QueryResult:
-        """The result of a query that is finished with this frame, with the stamp of the frame that it is for; an empty one otherwise.
+        """Return the result of a query finished with this frame, with the stamp of the query's frame; otherwise an empty result.
 
-        Queries are spread over frames, but for the first one, those after a gap, and those of recordings with hardly more frames
-        than queries. frame: None in a replay, where queries begin as they did.
+        Queries are spread over frames, except the first one, those after a gap, and those of recordings with hardly more frames
+        than queries. frame: None in a replay, where queries begin at the recorded frames.
         """
         self.finished = None
         if percept.odometry.new_odom_from_old_odom is not None:
@@ -99,7 +101,7 @@ class MapQuery:
         odometry, is_at_once = percept.odometry, False
         is_urgent = percept.has_broken and not self.failed
         if is_urgent and not self._is_urgent:
-            self._cancel()  # a frame before the break says nothing about where the robot is now
+            self._cancel()  # a frame before the break is unrelated to the robot's present pose
         if self._job is None and self.relocalizer is not None:
             is_due = is_urgent or self._is_due(odometry)
             begins = percept.query is not None if frame is None else is_due
@@ -115,7 +117,7 @@ class MapQuery:
         return last_ns is None or odometry.after_gap or (odometry.stamp_ns - last_ns) * 1e-9 >= 0.999 * interval_s
 
     def _is_sparse(self, stamp_ns: int) -> bool:
-        """Whether there are too few frames to spread a query over."""
+        """Return True if there are too few frames to spread a query over."""
         if self._begun_ns is None or self._last_ns is None:
             return True
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
@@ -175,7 +177,7 @@ class MapQuery:
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
     def _near(self, features: FrameFeatures, relocalizer: Relocalizer, hypothesis: PoseHypothesis) -> Fix | None:
-        """The fix near a hypothesis at the frame of the query."""
+        """Return the fix near a hypothesis at the frame of the query."""
         map_from_body = hypothesis.query_map_from_body
         map_from_cam = map_from_body @ self._tracker.body_from_cam
         cov_cam = transport_cov(hypothesis.query_cov, map_from_cam[:3, 3] - map_from_body[:3, 3])
@@ -185,7 +187,7 @@ class MapQuery:
         return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]
 
     def _search(self, features: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
-        """Fixes in the whole map, or within the prior; around the candidates first."""
+        """Return fixes in the whole map, or within the prior; near the candidates first."""
         tracker, fixes = self._tracker, list[Fix]()
         candidates = tracker.candidates.hypotheses
         for number, candidate in enumerate(candidates, start=1):
@@ -204,7 +206,7 @@ class MapQuery:
             return fixes
         within = tracker.within_prior(fixes)
         if within or not prior.is_revisable:
-            return fixes if prior.is_revisable else within  # a person may have named an alias of the place
+            return fixes if prior.is_revisable else within  # an operator may have chosen an alias of the place
         yield
         fixes = yield from relocalizer.anywhere(features, None, None)
         fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
@@ -212,14 +214,12 @@ class MapQuery:
 
 
 def _extract(query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer) -> TimeSliced[FrameFeatures]:
-    """The features of a frame, kept in `query`; those that were kept, in as many slices, where there is no frame."""
+    """Return the features of a frame and store them in `query`; without a frame, the stored ones, in as many slices."""
     if frame is None:
         for _ in range(query.slices):
             yield
         if query.features is None:
-            raise RecordingError(
-                "a map query without features is over before they are there; was the file made by a robot?"
-            )
+            raise RecordingError("a map query ends before its features are available; was the file made by a robot?")
         return query.features
     work = relocalizer.extract(frame)
     while True:

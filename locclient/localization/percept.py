@@ -1,4 +1,4 @@
-"""What a robot perceives with one frame, before a map says where that is. Robots keep it, and replays of failures have it again. Pure."""
+"""Percept: measurements of one frame that do not depend on a map. Robots store them for replays of failures. Pure."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from locclient.localization.pose_hypothesis import Motion
 
 @dataclass(slots=True)
 class QueryInput:
-    """The features of a frame with which a map query begins, and in how many slices they were extracted; None until they all are."""
+    """Features of the frame of a map query, and the number of slices of their extraction; None until they are complete."""
 
     slices: int = 0
     features: FrameFeatures | None = None
@@ -20,10 +20,10 @@ class QueryInput:
 
 @dataclass(slots=True)
 class Percept:
-    """One frame.
+    """Percept of one frame.
 
-    motions: of the odometry, from frames that hypotheses began with. is_reversed: left and right image are exchanged or mirrored.
-    calibration: what the map showed of it until this frame. query: of a map query that begins with this frame.
+    motions: of the odometry, from start frames of hypotheses. is_reversed: left and right image are exchanged or mirrored.
+    calibration: its state by the map before this frame. query: of a map query that begins with this frame.
     """
 
     odometry: OdometryEstimate
@@ -35,5 +35,5 @@ class Percept:
 
     @property
     def has_broken(self) -> bool:
-        """Tracks are lost though the picture is sound: something came before the cameras, or the robot is elsewhere."""
+        """True if tracks are lost in a good image: an object moved in front of the cameras, or the robot is elsewhere."""
         return self.odometry.status is OdometryStatus.DEGRADED and self.image.cause is Cause.NONE

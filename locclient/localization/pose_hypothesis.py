@@ -14,12 +14,12 @@ from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
 _MEASURED_DRIFT, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
-_VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can turn the motion
+_VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can rotate the motion
 
 
 class Motion(NamedTuple):
-    """The odometry's motion from a frame to the present one: body_from_now (4, 4), its covariance (6, 6), a left perturbation in the
-    body's axes; is_last: it forgets the frame with the next one."""
+    """Odometry motion from a frame to the present one: body_from_now (4, 4), its covariance (6, 6), a left perturbation in the
+    body's axes; is_last: the odometry drops the start frame with the next frame."""
 
     body_from_now: Array
     cov_rot_trans: Array
@@ -28,14 +28,14 @@ class Motion(NamedTuple):
 
 @dataclass
 class PoseHypothesis:
-    """Where the body was in `map` at one frame of the odometry, and the support for it.
+    """Pose of the body in `map` at one frame of the odometry, and its support.
 
     map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: propagated to the present. query_map_from_body,
     query_cov: at the frame of the present map query, which may be some frames old. stamp_ns: of the last fix. support: number of
-    fixes that agreed. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
+    agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
-    for those without a fix, and their number. misses: queries since the last fix. told_log_odds: that a person who named its
-    place is right, 0 where nobody did. has_broken: tracks broke since the last fix.
+    for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
+    this place is right, 0 without one. has_broken: tracks were lost since the last fix.
     """
 
     frame_index: int
@@ -66,15 +66,15 @@ class PoseHypothesis:
 
     @classmethod
     def at_query(cls, query: "PoseHypothesis", map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
-        """A pose at the frame of a map query, propagated to the present. query: the identity at that frame, propagated likewise."""
+        """Propagate a pose at the frame of a map query to the present. query: the identity at that frame, propagated to the present."""
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
         return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken)
 
     @property
     def evidence(self) -> str:
-        """What speaks for it, in words."""
-        return f"{self.mean_inliers:.0f} matches, {self.mean_recall:.0%} of what should be seen"
+        """Text of the supporting evidence."""
+        return f"{self.mean_inliers:.0f} matches, {self.mean_recall:.0%} of the expected landmarks"
 
     @property
     def mean_inliers(self) -> float:
@@ -89,15 +89,15 @@ class PoseHypothesis:
         return self.recall_total / max(self.looks, 1)
 
     def speaks_against_others(self, settings: TrackSettings) -> bool:
-        """Whether its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than fixes of
-        one place lie apart.
+        """Return True if its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than the
+        scatter of fixes at one place.
 
-        Racks repeat. What a standing robot sees by few landmarks of another place is one look, however often it is taken.
+        Racks repeat: weak fixes of a standing robot at another place count as one, however many there are.
         """
         return self.mean_inliers >= settings.strong_inliers or self.travelled_m >= settings.hypothesis_distance_m
 
     def decay(self, kept_share: float) -> None:
-        """Begins a map query: older ones weigh less."""
+        """Reduce the weight of older queries when a map query begins."""
         self.inlier_sum, self.recall_sum = kept_share * self.inlier_sum, kept_share * self.recall_sum
         self.queries = kept_share * self.queries + 1.0
         self.query_inliers, self.query_recall = 0, 0.0
@@ -110,11 +110,11 @@ class PoseHypothesis:
         self.query_inliers, self.query_recall = inliers, landmark_recall
 
     def mark_query(self) -> None:
-        """Keeps the present pose for the map query that begins now."""
+        """Store the present pose for the map query that begins now."""
         self.query_map_from_body, self.query_cov = self.now_map_from_body, self.now_cov
 
     def take_pose(self, other: "PoseHypothesis") -> None:
-        """Takes over the pose of another hypothesis, and keeps its own support."""
+        """Adopt the pose of another hypothesis, and keep the own support."""
         self.frame_index, self.stamp_ns = other.frame_index, other.stamp_ns
         self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans
         self.now_map_from_body, self.now_cov = other.now_map_from_body, other.now_cov
@@ -122,15 +122,15 @@ class PoseHypothesis:
     def propagate(
         self, motions: Mapping[int, Motion], odometry: OdometryEstimate, step: Array, settings: TrackSettings
     ) -> None:
-        """To the present frame: by the motion since its own frame while the odometry holds that, else by `step` (4, 4) from the last.
+        """Propagate to the present frame, by the motion since the start frame if the odometry has it, else by `step` (4, 4) from the last.
 
-        Moves to the present frame before the odometry forgets its own.
+        The start frame becomes the present one before the odometry drops it.
         """
         step_m = length(step[:3, 3])
         self.travelled_m += step_m
         motion = motions.get(self.frame_index)
         if motion is None:
-            # The robot stood so long that its frame was forgotten, or the odometry restarted: one step by its estimates alone.
+            # The odometry dropped the start frame in a long standstill, or restarted: one step by its estimates alone.
             is_sure = odometry.new_odom_from_old_odom is None and odometry.status is not OdometryStatus.DEGRADED
             cov_step = _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m)
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)

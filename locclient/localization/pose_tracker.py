@@ -1,4 +1,4 @@
-"""Where the robot is in its map: a prior, competing candidates or one confirmed pose, carried on by the odometry. Pure."""
+"""Pose tracking in the map: a prior, competing candidates or one confirmed pose, propagated by the odometry. Pure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,17 +20,17 @@ from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
-NO_AGREEMENT = QueryResult(refused="nothing in the map agrees with this frame")
+NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a localizer begins with: by default it searches for itself.
+    """Start state of a localizer; by default it searches the whole map.
 
     map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
-    of which stamp_ns and support are; else by a prior, with its is_revisable, is_told and travelled_m, the distance since it came.
-    has_broken: tracks broke since. was_tracking: the robot has known its pose before; is_carried: hands have moved it since.
-    failed_queries: the last so many map queries found nothing.
+    with their stamp_ns and support; else by a prior, with its is_revisable, is_told and travelled_m, the distance since its arrival.
+    has_broken: tracks were lost since. was_tracking: the robot knew its pose before; is_carried: it was lifted since.
+    failed_queries: number of failed map queries in a row.
     """
 
     frame_index: int = 0
@@ -49,12 +49,12 @@ class Start:
 
 
 class PoseTracker:
-    """Carries hypotheses from frame to frame, confirms one of them, and gives it up.
+    """Propagates hypotheses from frame to frame, confirms one of them, and gives it up.
 
-    SEARCHING   nothing, or a prior, by which and by odometry the pose is DEGRADED    <--+
+    SEARCHING   no pose, or a DEGRADED one by a prior and odometry                    <--+
         | fixes                                                                          | forget
         v                                                                                |
-    CANDIDATES  poses of fixes; AMBIGUOUS where several agree with what is seen       ---+
+    CANDIDATES  poses of fixes; AMBIGUOUS if several match the image                  ---+
         | enough fixes over enough distance or a tight prior, and no competitor       |  |
         v                                                                             |  |
     CONFIRMED   each fix within its gate updates it                                   ---+
@@ -62,7 +62,7 @@ class PoseTracker:
         v
     CANDIDATES  at the places of these fixes
 
-    CONFIRMED   --its radius admits the next place that looks alike-->  SEARCHING, with the pose as a prior
+    CONFIRMED   --its radius includes the next similar place-->  SEARCHING, with the pose as a prior
     """
 
     def __init__(self, settings: LocalizerSettings, body_from_cam: Array, base_from_body: Array) -> None:
@@ -73,25 +73,25 @@ class PoseTracker:
         self.candidates = HypothesisSet(settings.track)
         self.confirmed: PoseHypothesis | None = None
         self.was_tracking = False
-        self.is_carried = False  # hands have moved it since it knew its pose
+        self.is_carried = False  # it was lifted since it knew its pose
         self.lookalikes: LookAlikes | None = None
         self.odom_from_body: Array | None = None  # of the last frame
-        self._query_frame: PoseHypothesis | None = None  # of the map query that goes on, as the identity
+        self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
 
     # --- priors and starts --------------------------------------------------------------------------------------------
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """A prior at this moment, in the place of any before."""
+        """Use a prior at this moment; it replaces any earlier one."""
         self.prior = InitialPosePrior(prior, self._base_from_body, self._track)
 
     def is_contradicted_by(self, prior: PositionPrior) -> bool:
-        """Whether a confirmed pose lies outside the bound of a prior."""
+        """Return True if a confirmed pose lies outside the bound of a prior."""
         return self.confirmed is not None and not agrees(prior, self.confirmed, self._base_from_body)
 
     def forget(self, *, keeps_new_prior: bool = False, is_carried: bool = False) -> None:
-        """Searches for itself from now on. keeps_new_prior: one that came since the last frame says where the robot is now. is_carried: it
-        knows that it is lifted, and is LOST if it had known its pose."""
+        """Drop the pose and search the whole map. keeps_new_prior: keep a prior received since the last frame. is_carried: the robot
+        knows that it is lifted, and is LOST if it had a pose."""
         if not (keeps_new_prior and self.prior is not None and self.prior.is_new):
             self.prior = None
         self.confirmed = self._query_frame = None
@@ -100,7 +100,7 @@ class PoseTracker:
         self.was_tracking &= is_carried
 
     def start(self, failed_queries: int) -> Start:
-        """What another tracker, with the same odometry, goes on with."""
+        """Return the state with which another tracker of the same odometry can start."""
         prior = self.prior
         known = self.confirmed or (None if prior is None else prior.hypothesis)
         start = Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
@@ -121,7 +121,7 @@ class PoseTracker:
         )
 
     def begin(self, start: Start) -> None:
-        """Goes on from `start` with the next frame."""
+        """Continue from `start` with the next frame."""
         self.forget()
         self.was_tracking, self.is_carried = start.was_tracking, start.is_carried
         if start.map_from_body is None or start.cov_rot_trans is None:
@@ -143,13 +143,13 @@ class PoseTracker:
 
     @property
     def frame_indices(self) -> set[int]:
-        """Frames of the odometry whose motion to the next frame `propagate` needs."""
-        # Of the last query's frame, too: another version may find a fix there, and go on from it.
+        """Return frames of the odometry whose motion to the next frame `propagate` needs."""
+        # Includes the last query's frame: another version may find a fix there, and continue from it.
         last_query = set() if self._query_index is None else {self._query_index}
         return {hypothesis.frame_index for hypothesis in self._tracked()} | last_query
 
     def propagate(self, odometry: OdometryEstimate, motions: Mapping[int, Motion], *, has_broken: bool) -> None:
-        """Carries every hypothesis to the present frame. has_broken: tracks are lost though the picture is sound."""
+        """Propagate every hypothesis to the present frame. has_broken: tracks are lost in a good image."""
         change, last = odometry.new_odom_from_old_odom, self.odom_from_body
         if last is not None and change is not None:
             last = change @ last
@@ -176,7 +176,7 @@ class PoseTracker:
     # --- fixes of a map query -----------------------------------------------------------------------------------------
 
     def begin_query(self, odometry: OdometryEstimate) -> None:
-        """A map query begins with the present frame; its fixes may come some frames later."""
+        """Begin a map query with the present frame; its fixes may follow some frames later."""
         self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
             hypothesis.mark_query()
@@ -184,8 +184,8 @@ class PoseTracker:
         self._query_index = odometry.frame_index
 
     def _doubt_confirmed(self, odometry: OdometryEstimate) -> None:
-        """A pose whose radius exceeds half of the site's smallest repetition becomes a prior: a fix of the next bay or aisle is within
-        the gate of its covariance, and must be confirmed as anywhere else."""
+        """Turn a pose whose radius exceeds half of the site's smallest repetition into a prior: a fix of the next bay or aisle would be
+        within the gate of its covariance, and must be confirmed like any other."""
         confirmed = self.confirmed
         if confirmed is None or not radius_95_m(confirmed.now_cov) > 0.5 * self._track.alias_step_m:
             return
@@ -200,7 +200,7 @@ class PoseTracker:
         self._query_frame = None
 
     def observations(self, fixes: Sequence[Fix]) -> Observations:
-        """The fixes of the query that goes on, with their poses at the present."""
+        """Return the fixes of the running query with their poses at present."""
         assert self._query_frame is not None
         found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
         return found if self.prior is None else self.prior.weighed(found)
@@ -209,17 +209,17 @@ class PoseTracker:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
     def _at_body(self, fix: Fix) -> tuple[Array, Array]:
-        """A fix as map_from_body with its covariance (map axes, about the body)."""
+        """Return a fix as map_from_body with its covariance (map axes, about the body)."""
         map_from_body = fix.map_from_cam @ self._cam_from_body
         return map_from_body, transport_cov(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
 
     def within_prior(self, fixes: Sequence[Fix]) -> list[Fix]:
-        """The fixes that the prior admits."""
+        """Return the fixes within the prior."""
         assert self.prior is not None
         return [fix for fix, hypothesis in self.observations(fixes) if self.prior.is_compatible(hypothesis)]
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
-        """Whether fixes without any within the prior contradict it by now; it is dropped then, and what they name must be confirmed."""
+        """Return True if fixes, none within the prior, contradict it by now; then drop it: their places must be confirmed."""
         assert self.prior is not None
         if not self.prior.is_contradicted(self.observations(fixes), self.lookalikes):
             return False
@@ -228,8 +228,8 @@ class PoseTracker:
         return True
 
     def update(self, fixes: list[Fix], confirmed: PoseHypothesis, *, is_near: bool) -> QueryResult:
-        """Kalman update of the confirmed pose at the frame of the query. Fixes beyond its chi-square gate are refused, and so are
-        several within it: long without the map, the gate may hold the pose's own alias.
+        """Update the confirmed pose at the frame of the query (Kalman). Fixes beyond its chi-square gate are refused, and so are
+        several within it: long without a fix, the gate may include an alias of the pose.
 
         Sources: Bar-Shalom et al. 2001 (validation gate), Bucy and Joseph 1968 (covariance update).
         """
@@ -238,7 +238,7 @@ class PoseTracker:
             return NO_AGREEMENT
         map_from_body, covariance = confirmed.query_map_from_body, confirmed.query_cov
         innovations = [(fix, *innovation_of(*self._at_body(fix), map_from_body, covariance)) for fix in fixes]
-        # A fix near the prediction is tested by the gate alone; one found by search must be reliable besides.
+        # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
         limit = self._track.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
         fix, error, innovation = min(innovations, key=lambda entry: entry[2])
@@ -246,7 +246,7 @@ class PoseTracker:
         if len(gated) != 1:
             self._detect_kidnapping(fixes, confirmed)
             if gated:
-                return QueryResult(None, f"{len(gated)} places agree with what was seen", innovation)
+                return QueryResult(None, f"{len(gated)} places match the image", innovation)
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
             return QueryResult(None, reason, innovation, off_m if is_near else None)
         _, cov_fix = self._at_body(fix)
@@ -257,7 +257,7 @@ class PoseTracker:
         return QueryResult(fix, "", innovation, off_m)
 
     def _detect_kidnapping(self, fixes: list[Fix], confirmed: PoseHypothesis) -> None:
-        """Abandons the confirmed pose when refused fixes agree with each other query after query; theirs must be confirmed anew."""
+        """Abandon the confirmed pose when refused fixes agree with each other over several queries; confirm theirs anew."""
         assert self.odom_from_body is not None
         self.candidates.observe(self.observations(fixes), self.odom_from_body)
         telling = [h.support for h in self.candidates.hypotheses if h.speaks_against_others(self._track)]
@@ -267,11 +267,11 @@ class PoseTracker:
             self.prior = None  # it led to that pose
 
     def update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
-        """Updates the candidates, and confirms the one without competitors that has enough support or a tight prior."""
+        """Update the candidates, and confirm one without competitors and with enough support or a tight prior."""
         assert self.odom_from_body is not None
         candidates = self.candidates
         is_near = self.prior is not None and self.prior.is_tight(self._track.near_prior_sigma_m)
-        # Whether the robot cannot be where nothing is mapped and all looks like a place of the map.
+        # True if the robot cannot be at an unmapped place that looks like a mapped one.
         is_excluded = self.lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self.lookalikes
         yield from candidates.update(self.observations(fixes), self.odom_from_body)
@@ -280,13 +280,13 @@ class PoseTracker:
         (best, *_), competitors = candidates.ranking()
         if competitors:
             told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))
-            return QueryResult(None, f"{len(competitors) + 1} places agree with what was seen: {told}")
+            return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")
         moved_m = None
         has_prior = self.prior is not None and self.prior.confirms(best)
         if not has_prior and candidates.may_be_lookalike(best):
             assert self.lookalikes is not None
             told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
-            return QueryResult(None, f"a place that is not in the map may look as much like this one: {told}")
+            return QueryResult(None, f"a place that is not in the map may look the same: {told}")
         if has_prior or candidates.is_confirmed(best, fixes):
             moved_m = candidates.moved_m(best)
             candidates.reset()

@@ -18,12 +18,12 @@ class TrackSettings(Section, frozen=True):
     confirming_distance_m: float = 1.0  # motion between them
     strong_inliers: int = STRONG_INLIERS
     strong_share: float = 0.55  # inlier share of a fix that is accepted at once
-    # Votes of another place, as a share of the best one's, that forbid it; chance reaches 0.36
+    # Votes of another place, relative to the best one's, that forbid acceptance; chance reaches 0.36
     strong_alias_share: float = 0.5
     tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
-    # Of places that people name: one of these is weighed against its aliases, not believed. An assumption
+    # Error rate of operators' poses, which are weighed against aliases of the place. An assumption
     wrong_prior_share: float = 0.05
-    near_prior_sigma_m: float = 2.1  # 3.7 sigmas of it exclude the look-alikes that the map server looks for, 8 m away
+    near_prior_sigma_m: float = 2.1  # 3.7 sigmas exclude the look-alikes that the map server searches, 8 m away
     # Squared Mahalanobis distance from the prediction: 0.999 of chi-square, 6 degrees of freedom
     innovation_limit: float = 22.458
     hypothesis_distance_m: float = 0.5  # within which fixes support one hypothesis
@@ -35,7 +35,7 @@ class TrackSettings(Section, frozen=True):
     telling_evidence: float = 4.0
     evidence_kept_share: float = 0.8  # decay of a hypothesis's inliers from fix to fix
     max_misses: int = 4  # contradicting fixes in a row that end a hypothesis
-    drift_share: float = 0.01  # error of odometry beyond its own covariance, as a share of the way
+    drift_share: float = 0.01  # odometry error beyond its own covariance, as a share of the distance
     drift_floor_m: float = 0.005  # the same for each step
     degraded_after_s: float = 0.9
     degraded_radius_m: float = 0.3
@@ -47,7 +47,7 @@ class TrackSettings(Section, frozen=True):
     map_sigma_rad: float = 0.006  # of the map itself, added to the estimate
 
     def query_interval_s(self, support: int, *, is_sure: bool) -> float:
-        """Between map queries: the longer one of a pose with enough support, as long as nothing is wrong."""
+        """Return the interval between map queries: the longer one for a pose with enough support and no fault."""
         is_settled = is_sure and support >= self.settled_fixes
         return max(self.fix_interval_s, self.settled_interval_s) if is_settled else self.fix_interval_s
 
@@ -65,5 +65,5 @@ class LocalizerSettings(Section, frozen=True):
 
     @property
     def relocalizer(self) -> RelocalizerSettings:
-        """Those of relocalization."""
+        """Return the settings of relocalization."""
         return RelocalizerSettings(self.seed, self.stereo, self.orb, self.fix)

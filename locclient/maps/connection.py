@@ -1,4 +1,4 @@
-"""Connection of a command to its map: over the bus, or in a store's folder."""
+"""Connection of a command to its map, over the bus or in a store's folder."""
 
 import logging
 import os
@@ -16,12 +16,12 @@ from locclient.maps.map_source import LocalMapSource, MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES, TileCache
 
 _log = logging.getLogger(__name__)
-_PATIENCE_S = 120.0  # with a server that goes away in the middle of a fetch; one that is restarted is back by then
+_PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a server's restart
 
 
 @dataclass(frozen=True)
 class MapConnection:
-    """What a recording is localized in, and for which robot."""
+    """Map source of a recording, and the robot's identity."""
 
     source: MapSource
     site: str
@@ -29,12 +29,12 @@ class MapConnection:
 
 
 def open_bus(address: MapAddress) -> Bus:
-    """A connection to the server, with the robot's identity where it has one."""
+    """Open a connection to the server, with the robot's identity if it has one."""
     return Bus.connect(str(address.server), tls=address.tls)
 
 
 def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
-    """The signed lists of a site; UsageError where a root is needed and not given, or cannot be read."""
+    """Return the signed lists of a site; UsageError if a required root is missing or cannot be read."""
     site, server, root = address.site, str(address.server), address.root
     folder, data = cache / "trust" / site, None
     if root is not None:
@@ -42,7 +42,7 @@ def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
             data = Path(root).read_bytes()
     elif not is_loopback(server):
         raise UsageError(
-            f"whose maps may be trusted at {server}? Copy trust/1.root.json of the server's store to the robot and name it: root"
+            f"{server} needs a root of trust for its maps: copy trust/1.root.json of the server's store to the robot and set root"
         )
     return TrustedMap(folder, site, data, ask_over(bus, site, address.robot))
 
@@ -51,7 +51,7 @@ def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
 def connected(
     address: MapAddress, cache_setting: Path | None = None, cache_bytes: int = DEFAULT_MAX_BYTES
 ) -> Iterator[MapConnection]:
-    """A connection to a map's address, by a cache of at most so many bytes; closed afterwards."""
+    """Open a connection to a map's address, with a cache of at most so many bytes; close it afterwards."""
     site, robot = address.site, address.robot
     if address.store is not None:
         yield MapConnection(LocalMapSource(Path(address.store), site, address.version), site, robot)
@@ -70,17 +70,17 @@ def connected(
 
 
 def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:
-    """The file of the outbox beside the tile cache, one for each robot of the machine."""
+    """Return the file of the outbox beside the tile cache, one for each robot of the machine."""
     return cache_folder(cache).parent / "spool" / f"{site}.{robot}.sqlite3"
 
 
 def replay_outbox(outbox: Path) -> Path:
-    """The file in which recordings of failures wait, beside the one of their reports."""
+    """Return the outbox file of failure recordings, beside that of reports."""
     return outbox.with_name(f"{outbox.stem}.replays{outbox.suffix}")
 
 
 def cache_folder(setting: str | Path | None = None) -> Path:
-    """The folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
+    """Return the folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
     if setting is not None:
         return Path(setting)
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "fleetmap" / "tiles"

@@ -1,4 +1,4 @@
-"""Tiles of one map version in memory, and which of them a robot holds: those within reach, and those ahead. Pure."""
+"""Tiles of one map version in memory, and their selection: those within reach, and those ahead. Pure."""
 
 from dataclasses import dataclass, field
 
@@ -13,11 +13,11 @@ from fleetmap.relocalization.map_view import LookAlikes
 from locclient.localization.estimate import Estimate
 
 Cell = tuple[int, int]
-_RADIUS_STEP_M = 10.0  # so that tiles are not read anew with every frame
+_RADIUS_STEP_M = 10.0  # so that tiles are not selected again with every frame
 
 
 class TileSelectionSettings(Section, frozen=True):
-    """How far around the robot tiles are held."""
+    """Range of held tiles around the robot."""
 
     reach_m: float = 35.0
     ahead_s: float = 8.0
@@ -27,7 +27,7 @@ class TileSelectionSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class PositionBound:
-    """The robot is within radius_m of a position (3,), None for anywhere; with its velocity (3,)."""
+    """Bound of the robot's position: within radius_m of a position (3,), None for anywhere; with its velocity (3,)."""
 
     position_map_m: Array | None = None
     velocity_map_mps: Array = field(default_factory=lambda: np.zeros(3))
@@ -35,10 +35,10 @@ class PositionBound:
 
 
 class PositionBoundTracker:
-    """Follows a robot's estimates. While it is lost, the bound grows at the maximum speed assumed for it.
+    """Tracks the position bound by a robot's estimates. While it is lost, the bound grows at the assumed maximum speed.
 
-    A lost robot's own estimate leads out of the tiles that it holds, and without them it finds no other place. All tiles of a
-    large site at once are more than its memory should have to take.
+    A lost robot's estimate may leave the held tiles, and without tiles it cannot be localized elsewhere. All tiles of a large site
+    may exceed its memory.
     """
 
     def __init__(self, settings: TileSelectionSettings) -> None:
@@ -58,7 +58,7 @@ class PositionBoundTracker:
 
 
 def tiles_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> frozenset[Cell]:
-    """Tiles of the version that come nearer than reach_m to a position (3,)."""
+    """Return tiles of the version within reach_m of a position (3,)."""
     size_m = manifest.tile_size_m
     near = set()
     for entry in manifest.tiles:
@@ -72,10 +72,10 @@ def tiles_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> f
 def select_tiles(
     manifest: Manifest, held: frozenset[Cell] | None, bound: PositionBound, settings: TileSelectionSettings
 ) -> frozenset[Cell]:
-    """The tiles to hold now: all of them without a position. held: those that are, None for none.
+    """Select the tiles to hold: all of them without a position. held: the present tiles, None for none.
 
-    A held tile stays within the reach plus a hysteresis (spare_m): a robot that turns on the border of a tile does not load it again
-    and again.
+    A held tile stays up to the reach plus a hysteresis (spare_m), so that a robot at the border of a tile does not reload it
+    repeatedly.
     """
     position_map_m = bound.position_map_m
     if position_map_m is None:
@@ -90,7 +90,7 @@ def select_tiles(
 
 @dataclass(frozen=True)
 class LoadedMap:
-    """Some tiles of one version. is_offer: a version to begin with or to try, not only other tiles of one that is held."""
+    """Some tiles of one version. is_offer: a version to start with or to try, not only other tiles of a held one."""
 
     wanted: WantedVersion
     manifest: Manifest
@@ -104,7 +104,7 @@ class LoadedMap:
 
     @property
     def lookalikes(self) -> LookAlikes | None:
-        """What places outside the map have in common with it; None where its build did not measure it."""
+        """Similarity of unmapped places to the map; None if its build did not measure it."""
         recall, starts = self.manifest.report.get("lookalike_recall"), self.manifest.report.get("starts")
         share = starts.get("max_wrong_share") if isinstance(starts, dict) else None
         if not isinstance(recall, int | float):

@@ -1,4 +1,4 @@
-"""Sources of published maps, and those without a network: the tile cache alone, or a store's folder."""
+"""Sources of published maps, with two that need no network: the tile cache alone, and a store's folder."""
 
 import os
 import shlex
@@ -29,7 +29,7 @@ from locclient.maps.tile_cache import TileCache
 
 @dataclass(frozen=True)
 class FetchedTiles:
-    """Tiles that are whole, and for each other one the reason why it is missing."""
+    """Valid tiles, and for each other one the reason why it is missing."""
 
     tiles: dict[tuple[int, int], Tile] = field(default_factory=dict)
     refused: dict[tuple[int, int], str] = field(default_factory=dict)
@@ -37,7 +37,7 @@ class FetchedTiles:
 
 @dataclass(frozen=True)
 class ReadyVersion:
-    """The version to run now. note: why it is not the wanted one, or not whole; empty where it is."""
+    """The version to run now. note: reason why it is not the wanted one, or incomplete; else empty."""
 
     wanted: WantedVersion
     note: str = ""
@@ -47,28 +47,28 @@ class MapSource(ABC):
     """Source that a robot reads its map from."""
 
     def __init__(self, site: str) -> None:
-        """Raises UsageError for a name that no site can have."""
+        """Raises UsageError for an invalid site name."""
         self._site = check_name(site, "site")
 
     @abstractmethod
     def ready(self) -> ReadyVersion:
-        """The version to run now."""
+        """Return the version to run now."""
 
     @abstractmethod
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
-        """The verified bytes of an address. max_bytes: the most that may come over a network."""
+        """Return the verified bytes of an address. max_bytes: limit of a download."""
 
     def manifest(self, wanted: WantedVersion) -> Manifest:
-        """The wanted version's manifest; errors as of `blob`, LinkError without a version, MapFormatError where it is another."""
+        """Return the wanted version's manifest; errors as of `blob`, LinkError without a version, MapFormatError for another one's."""
         return checked_manifest(self.blob(address_of(wanted)[1]), wanted)
 
     def vocabulary(self, manifest: Manifest) -> bytes:
-        """The version's vocabulary: the one that ships, or errors as of `blob`."""
+        """Return the version's vocabulary: the shipped one or a blob; errors as of `blob`."""
         entry = manifest.vocabulary
         return shipped_vocabulary(entry.sha256) or self.blob(entry.sha256, entry.bytes)
 
     def tiles(self, manifest: Manifest, cells: Iterable[tuple[int, int]] | None = None) -> FetchedTiles:
-        """Tiles of the version: all, or those of `cells` that it has. One that cannot be used is refused with its reason."""
+        """Return tiles of the version: all, or those of `cells` that it has. An unusable tile is refused with its reason."""
         fetched = FetchedTiles()
         asked = None if cells is None else set(cells)
         for entry in manifest.tiles:
@@ -85,21 +85,21 @@ class MapSource(ABC):
 
 
 class CachedMap(MapSource):
-    """Reads from the cache alone and waits for nobody; for another thread than the MapClient's, with a TileCache of its own."""
+    """Reads from the cache alone, without waiting; for another thread than the MapClient's, with its own TileCache."""
 
     def __init__(self, cache: TileCache, site: str) -> None:
         super().__init__(site)
         self._cache = cache
 
     def ready(self) -> ReadyVersion:
-        """The active version; raises LinkError before the first one."""
+        """Return the active version; LinkError before the first one."""
         active = self._cache.active(self._site)
         if active is None:
-            raise LinkError(f"the cache has no version of site {self._site} yet; it has to come from a server first")
+            raise LinkError(f"the cache has no version of site {self._site} yet; fetch one from a server first")
         return ReadyVersion(active.wanted(self._site))
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
-        """The verified bytes of an address; LinkError where they are not here."""
+        """Return the verified bytes of an address; LinkError if not in the cache."""
         data = self._cache.get(sha256)
         if data is None:
             raise LinkError(f"{sha256} is not in the cache; it has to be fetched again")
@@ -107,17 +107,17 @@ class CachedMap(MapSource):
 
 
 class LocalMapSource(MapSource):
-    """Reads from a store's folder, for a robot without a server; without its database where the current version is wanted.
+    """Reads from a store's folder, for a robot without a server; the current version does not need the store's database.
 
-    version: another one than the current, drafts too.
+    version: number of another version than the current one, drafts included.
     """
 
     def __init__(self, folder: Path, site: str, version: int | None = None) -> None:
-        """Raises StoreError where `folder` is no store, UsageError for a name that no site can have."""
+        """Raises StoreError if `folder` is not a store, UsageError for an invalid site name."""
         super().__init__(site)
         if not (folder / "sites").is_dir():
             raise StoreError(
-                f"{folder} is no map store; check --store, or "
+                f"{folder} is not a map store; check --store, or "
                 f"make one with `mapserver build RECORDING --site {site} --store {shlex.quote(str(folder))}`"
             )
         self._folder, self._version = folder, version
@@ -126,7 +126,7 @@ class LocalMapSource(MapSource):
         return ReadyVersion(self.wanted())
 
     def wanted(self) -> WantedVersion:
-        """As `ready`; UsageError for a version that is not there, StoreError where the store cannot be read."""
+        """Return the version to run; UsageError for a missing version, StoreError if the store cannot be read."""
         if self._version is not None:
             return self._asked(self._version)
         path = self._folder / current_path(self._site)
@@ -141,7 +141,7 @@ class LocalMapSource(MapSource):
 
     def _asked(self, number: int) -> WantedVersion:
         path, query = self._folder / "store.sqlite3", "SELECT version, manifest_sha256 FROM versions WHERE site = ?"
-        # Where nobody can write beside the database, and no process left a log of changes, SQLite reads the file alone.
+        # Without write access beside the database, and without a write-ahead log, SQLite must open it as immutable.
         log = path.with_name(f"{path.name}-wal")
         how = "mode=ro" if os.access(self._folder, os.W_OK) or log.exists() else "mode=ro&immutable=1"
         try:
@@ -157,7 +157,7 @@ class LocalMapSource(MapSource):
         return WantedVersion(site=self._site, version=number, manifest_sha256=known[number])
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
-        """The verified bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        """Return the verified bytes of an address; StoreError for missing ones, MapFormatError for damaged ones."""
         path = self._folder / blob_path(sha256)
         with disk_errors(f"{path} cannot be read", "the store is incomplete"):
             data = path.read_bytes()
@@ -165,17 +165,17 @@ class LocalMapSource(MapSource):
 
 
 def address_of(wanted: WantedVersion) -> tuple[int, str]:
-    """Number and manifest's address of a version; LinkError where the site has none."""
+    """Return number and manifest address of a version; LinkError if the site has none."""
     if wanted.version is None or wanted.manifest_sha256 is None:
         raise LinkError(
             f"site {wanted.site} has no published version; publish one with `mapserver publish --site {wanted.site} --store DIR` "
-            "where its store is"
+            "on the machine of its store"
         )
     return wanted.version, check_sha256(wanted.manifest_sha256)
 
 
 def checked_manifest(data: bytes, wanted: WantedVersion) -> Manifest:
-    """The decoded manifest; MapFormatError where it is not the wanted version's."""
+    """Decode the manifest; MapFormatError if it is not the wanted version's."""
     manifest = decode_manifest(data)
     if (manifest.site, manifest.version) != (wanted.site, wanted.version):
         raise MapFormatError(
@@ -185,7 +185,7 @@ def checked_manifest(data: bytes, wanted: WantedVersion) -> Manifest:
 
 
 def checked_tile(entry: TileEntry, size_m: float, data: bytes) -> Tile:
-    """The decoded tile; MapFormatError where it is not the manifest's."""
+    """Decode the tile; MapFormatError if it does not match the manifest."""
     tile = decode_tile(data)
     if (tile.tile_x, tile.tile_y, tile.size_m, len(tile)) != (entry.x, entry.y, size_m, entry.landmarks):
         raise MapFormatError(

@@ -16,11 +16,11 @@ from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
 from fleetmap.messages import WantedVersion
 
 DEFAULT_MAX_BYTES = 2_000_000_000
-_MAX_FAULTS = 100  # that wait to be taken
+_MAX_FAULTS = 100  # kept until `take_faults`
 
 
 class ActiveVersion(msgspec.Struct, frozen=True):
-    """The version of a site that this robot has whole; blobs: all its addresses, the manifest's first."""
+    """A version of a site that is complete in the cache; blobs: all its addresses, the manifest's first."""
 
     version: Annotated[int, msgspec.Meta(ge=1)]
     blobs: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
@@ -32,13 +32,13 @@ class ActiveVersion(msgspec.Struct, frozen=True):
 class TileCache:
     """Files below one folder. Above `max_bytes` the least recently used are evicted, never those of an active, kept or reserved version.
 
-    Bytes are verified whenever they are read. A disk that fails costs the cache, not the robot's map: `take_faults` has the reasons.
-    For one thread at a time, but for `take_faults`. One process should use a folder; a second one does no harm but may evict what
-    the first one still wants.
+    Bytes are verified on every read. A disk error affects the cache, not the robot's map: `take_faults` has the reasons.
+    For one thread at a time, except `take_faults`. One process should use a folder; a second one does no harm but may evict files
+    that the first one needs.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
-        """Makes the folder; raises StoreError where that is not possible."""
+        """Create the folder; StoreError if that fails."""
         self._folder = folder
         self._max_bytes = max_bytes
         self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
@@ -58,7 +58,7 @@ class TileCache:
         return sum(self._sizes.values())
 
     def get(self, sha256: str) -> bytes | None:
-        """The bytes of an address; None where they are not here or cannot be read. Damaged ones are removed. Both are faults."""
+        """Return the bytes of an address; None if absent, unreadable or damaged. The last two are faults; damaged files are removed."""
         path = self._path(sha256)
         try:
             data = verified(path.read_bytes(), sha256)
@@ -73,18 +73,16 @@ class TileCache:
             self._note(f"cached {sha256} cannot be used and was removed: {error}")
             self._remove(sha256)
             return None
-        with suppress(
-            OSError
-        ):  # a disk that cannot be written, or another account's file: good to read, and never evicted
+        with suppress(OSError):  # a read-only disk, or another account's file: readable, and never evicted
             os.utime(path)
         # Dictionaries keep their order: last used is last.
         self._sizes[sha256] = self._sizes.pop(sha256, len(data))
         return data
 
     def put(self, sha256: str, data: bytes) -> None:
-        """Keeps `data`, written whole or not at all, and evicts others for it.
+        """Store `data` atomically, and evict other files for it.
 
-        Raises MapFormatError for bytes of another address. A disk that refuses is a fault.
+        Raises MapFormatError for bytes of another address. A disk error is a fault.
         """
         verified(data, sha256)
         if not self._write(self._path(sha256), data):
@@ -94,13 +92,13 @@ class TileCache:
         self._evict(keep=sha256)
 
     def reserve(self, site: str, blobs: Sequence[str]) -> None:
-        """Keeps these addresses from eviction until the site's next version is reserved or active."""
+        """Protect these addresses from eviction until the site's next version is reserved or active."""
         self._reserved[site] = frozenset(blobs)
 
     def activate(self, site: str, version: int, blobs: Sequence[str]) -> None:
-        """Makes a version the active one, whole or not at all. blobs: all its addresses, the manifest's first.
+        """Activate a version atomically. blobs: all its addresses, the manifest's first.
 
-        Raises StoreError where one of them is missing or the disk refuses; what was active stays so.
+        Raises StoreError if one of them is missing or on a disk error; the active version then stays.
         """
         missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
         if missing:
@@ -119,7 +117,7 @@ class TileCache:
         return self._active.get(site)
 
     def keep(self, site: str, version: int, blobs: Sequence[str]) -> None:
-        """Keeps a whole version until `release`, however full the cache is; errors as of `activate`."""
+        """Keep a complete version until `release`, even in a full cache; errors as of `activate`."""
         missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
         record = ActiveVersion(version, tuple(blobs))
         if missing or not self._write(self._kept_path(site, version), to_json(record)):
@@ -129,7 +127,7 @@ class TileCache:
         self._kept[site, version] = record
 
     def release(self, site: str, version: int) -> None:
-        """Takes back `keep`, and removes what no other version needs; raises StoreError where the disk refuses."""
+        """Undo `keep`, and remove files that no other version needs; StoreError on a disk error."""
         with disk_errors(f"version {version} of {site} cannot be removed from the cache", "check its rights"):
             self._kept_path(site, version).unlink(missing_ok=True)
             sync_path(self._kept_path(site, version).parent)
@@ -138,11 +136,11 @@ class TileCache:
             self._remove(sha256)
 
     def kept(self, site: str) -> list[ActiveVersion]:
-        """The site's kept versions, oldest first."""
+        """Return the site's kept versions, oldest first."""
         return [record for (of, _), record in sorted(self._kept.items()) if of == site]
 
     def keep_file(self, site: str, kind: str, data: bytes | None) -> None:
-        """Keeps what a site has beside its versions, until the next one of that kind; None: it has none any more."""
+        """Store a site's file beside its versions, until the next one of that kind; None removes it."""
         path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
         if data is None:
             self._try_unlink(path)
@@ -150,7 +148,7 @@ class TileCache:
             self._write(path, data)
 
     def kept_file(self, site: str, kind: str) -> bytes | None:
-        """What `keep_file` was given last; None without."""
+        """Return the last file given to `keep_file`; None without one."""
         path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
         try:
             return path.read_bytes()
@@ -161,11 +159,11 @@ class TileCache:
             return None
 
     def room_bytes(self) -> int:
-        """Bytes that can be put beside what must stay."""
+        """Return the free bytes beside the protected files."""
         return self._max_bytes - sum(self._sizes.get(sha256, 0) for sha256 in self._used())
 
     def take_faults(self) -> list[str]:
-        """What went wrong with the disk since the last call, in words. For any thread."""
+        """Return texts of disk faults since the last call. Thread-safe."""
         return [self._faults.popleft() for _ in range(len(self._faults))]
 
     def _note(self, fault: str) -> None:
@@ -208,7 +206,7 @@ class TileCache:
             return None
 
     def _used(self) -> set[str]:
-        """Addresses that must stay."""
+        """Return the protected addresses."""
         records = (*self._active.values(), *self._kept.values())
         return set().union(*self._reserved.values(), *(record.blobs for record in records))
 
@@ -225,7 +223,7 @@ class TileCache:
                 self._remove(sha256)
 
     def _write(self, path: Path, data: bytes) -> bool:
-        """Whether `data` is under `path` now, whole and on the disk; if not, what was there before is, and a fault is kept."""
+        """Write `data` to `path` durably and return True; on an error keep the old content, note a fault and return False."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, [data], mode=0o666)

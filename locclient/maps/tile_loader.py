@@ -1,4 +1,4 @@
-"""Loading of tiles from the robot's disk into its memory. Slow work: not for the thread that localizes."""
+"""Loading of tiles from the robot's disk into its memory. Slow: not for the localizing thread."""
 
 from dataclasses import dataclass, field
 
@@ -22,16 +22,16 @@ class _Version:
 
 
 class TileLoader:
-    """Reads from one MapSource. A tile that cannot be read is left out, and its reason kept; the others stay usable."""
+    """Reads from one MapSource. An unreadable tile is left out and its reason kept; the others stay usable."""
 
     def __init__(self, source: MapSource, settings: TileSelectionSettings) -> None:
         self._source, self.settings = source, settings
         self._versions: dict[str, _Version] = {}
 
     def load(self, wanted: WantedVersion, bound: PositionBound) -> LoadedMap | None:
-        """The version's tiles around the robot; None where they are those that were loaded last.
+        """Load the version's tiles around the robot; None if the selection has not changed since the last call.
 
-        Raises FleetmapError where its manifest or vocabulary cannot be had, or none of its tiles.
+        Raises FleetmapError if its manifest, its vocabulary or all of its tiles are unusable.
         """
         version = self._version(wanted)
         cells = select_tiles(version.manifest, version.cells, bound, self.settings)
@@ -48,19 +48,19 @@ class TileLoader:
         return LoadedMap(wanted, version.manifest, version.vocabulary, dict(version.tiles))
 
     def grid(self, wanted: WantedVersion, robot_height_m: float) -> OccupancyGrid:
-        """What planners of a robot of this height may drive on by a version's grid.
+        """Return the occupancy grid of a version for planners of a robot of this height.
 
-        Raises StateError for a version without one, saying why, and other FleetmapErrors where it cannot be had or is damaged.
+        Raises StateError with the reason for a version without one, and other FleetmapErrors if it is missing or damaged.
         """
         return occupancy(grid_of(self._source.manifest(wanted), self._source.blob), robot_height_m)
 
     def refused(self, wanted: WantedVersion) -> dict[Cell, str]:
-        """Tiles of a version that could not be read, with the reasons."""
+        """Return unreadable tiles of a version, with the reasons."""
         version = self._versions.get(wanted.manifest_sha256 or "")
         return {} if version is None else dict(version.refused)
 
     def retry_refused(self, wanted: WantedVersion) -> None:
-        """Lets refused tiles of a version be read again, after it was fetched anew."""
+        """Allow refused tiles of a version to be read again, after it was fetched again."""
         version = self._versions.get(wanted.manifest_sha256 or "")
         if version is not None and version.refused:
             version.refused.clear()

@@ -1,4 +1,4 @@
-"""A version's file over HTTP, from servers that the robot's owner named. What it holds is not believed here."""
+"""Download of a version's file over HTTP, from servers that the robot's owner configured. The caller verifies its content."""
 
 import hashlib
 import http.client
@@ -15,16 +15,16 @@ from fleetmap.errors import LinkError, UnreachableError, UsageError, disk_errors
 
 _CHUNK_BYTES = 1 << 18
 _STALL_S = 30.0  # without a byte
-_MIN_BYTES_PER_S = 20_000  # over the whole file, behind _STALL_S: nobody may hold the robot's network thread for a day
+_MIN_BYTES_PER_S = 20_000  # mean of a file, after _STALL_S: no server may occupy the network thread for a day
 
 
 class TooLargeError(LinkError):
-    """A file that is larger than there is room for."""
+    """A file that is larger than the free space."""
 
 
 @dataclass(frozen=True)
 class Origins:
-    """Servers that files may come from. token: sent to them as a bearer's; ca: file of authorities, None for the machine's."""
+    """Allowed servers of files. token: bearer token sent to them; ca: file of authorities, None for the machine's."""
 
     allowed: Sequence[str]
     token: str | None = None
@@ -32,7 +32,7 @@ class Origins:
     insecure: bool = False
 
     def check(self) -> None:
-        """Raises UsageError for an origin that is none."""
+        """Raise UsageError for an invalid origin."""
         for text in self.allowed:
             origin = _origin(urlsplit(text))
             if origin is None or urlsplit(text).path not in {"", "/"}:
@@ -41,27 +41,27 @@ class Origins:
                 raise UsageError(f"{text} is on another machine and without TLS; use https, or --insecure")
 
     def admit(self, link: str) -> SplitResult:
-        """The parts of a link; LinkError unless it leads to one of the servers."""
+        """Return the parts of a link; LinkError unless it points to one of the servers."""
         try:
             parts = urlsplit(link)
             origin = _origin(parts)
         except ValueError:
             origin = None
         if origin is None or any(ord(sign) < 33 or ord(sign) > 126 for sign in link):
-            raise LinkError(f"the link {link[:200]!r} is no plain address by http or https")
+            raise LinkError(f"the link {link[:200]!r} is not a plain http or https address")
         if origin not in {_origin(urlsplit(text)) for text in self.allowed}:
             raise LinkError(
-                f"the link leads to {parts.netloc[:200]!r}, and the robot takes maps from "
+                f"the link points to {parts.netloc[:200]!r}, and the robot takes maps from "
                 f"{', '.join(self.allowed) or 'nowhere'}; [vda5050] download_from names the servers"
             )
         return parts
 
 
 def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) -> str:
-    """Writes the bytes behind a link into `target` and returns their SHA-256. Redirections are not followed.
+    """Download a link into `target` and return the SHA-256. Redirections are not followed.
 
-    Raises LinkError for a link or answer that is refused or longer than max_bytes, UnreachableError where the server does not answer or
-    stalls, StoreError where the disk refuses.
+    Raises LinkError for a refused link or a response that is an error or longer than max_bytes, UnreachableError if the server does not
+    answer or stalls, StoreError on a disk error.
     """
     parts = origins.admit(link)
     connection = _connection(parts, origins)
@@ -110,7 +110,7 @@ def _connection(parts: SplitResult, origins: Origins) -> http.client.HTTPConnect
 
 
 def _origin(parts: SplitResult) -> tuple[str, str, int] | None:
-    """Scheme, host and port; None for what is no address of a web server, or one with a name and password in it."""
+    """Return scheme, host and port; None for an invalid web address, or one that contains a name and password."""
     try:
         port = parts.port or (443 if parts.scheme == "https" else 80)
     except ValueError:

@@ -1,1 +1,1 @@
-"""Replay of recordings: the robot in them, measures of a run, its picture."""
+"""Replay of recordings: simulated robot, metrics of a run, picture."""

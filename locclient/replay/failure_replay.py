@@ -1,9 +1,9 @@
-"""Replay of a failure: the present localizer over what the robot perceived, in the map that it had or in another version.
+"""Replay of a failure: run the present localizer on the robot's percepts, in the robot's map version or in another one.
 
-It begins with the robot's pose and covariance at the beginning of the recording. In the robot's own version it finds the same statuses and
-causes, and poses within `SAME_M`; where the recording begins while the robot searched for itself, not before its first fixes. Another
-version or a newer localizer is given the same perception; depth of features is known where the robot measured it or its images were
-kept, and the odometry, which knows no map, is as it was.
+It starts with the robot's pose and covariance at the beginning of the recording. In the robot's own version it reproduces statuses,
+causes, and poses within `SAME_M`; if the recording begins during a search for the pose, only from the first fixes on. Another version
+or a newer localizer gets the same percepts; depth of features is known where the robot measured it or its images were kept, and the
+odometry, which does not depend on the map, is unchanged.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,14 +26,14 @@ from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
 from locclient.robot.failure_ring import UsedMap, moment_of
 
-SAME_M, SAME_RAD = 0.01, np.radians(0.5)  # of poses that count as the same
+SAME_M, SAME_RAD = 0.01, np.radians(0.5)  # maximum difference of equal poses
 
 Load = Callable[[UsedMap], LoadedMap]
-"""The map to use in the place of the one that the robot used."""
+"""Loads the map that replaces the robot's."""
 
 
 def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
-    """What the present localizer says of every frame. Errors as of `load`."""
+    """Return the results of the present localizer for every frame. Errors as of `load`."""
     rig = RigCalibration((), None, record.base_from_body)
     localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings)
     if record.used is not None:
@@ -58,7 +58,7 @@ def _use(localizer: Localizer, loaded: LoadedMap) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What was said then and now, by the same stamps; version: of the map that is used now."""
+    """Results then and now, by the same stamps; version: of the map used now."""
 
     summary: FailureSummary
     version: int | None
@@ -66,28 +66,28 @@ class Comparison:
 
     @property
     def first_difference_ns(self) -> int | None:
-        """Stamp of the first frame of which another status, cause or pose is said; None where there is none."""
+        """Return the stamp of the first frame with another status, cause or pose; None if all are equal."""
         pairs = zip(self.summary.moments, self.now, strict=True)
         return next((then.stamp_ns for then, now in pairs if not _is_same(then, now)), None)
 
     @property
     def apart_m(self) -> float:
-        """The largest distance between poses of the same frame."""
+        """Return the largest distance between poses of the same frame."""
         pairs = [(a.position_map_m, b.position_map_m) for a, b in zip(self.summary.moments, self.now, strict=True)]
         return max((dist(a, b) for a, b in pairs if a is not None and b is not None), default=0.0)
 
     @property
     def answer(self) -> str:
-        """Whether it would have failed too, in a sentence."""
+        """Return a sentence: would it have failed too?"""
         then_s, now_s = (longest_blind_s(moments) for moments in (self.summary.moments, self.now))
         what = f"version {self.version}" if self.version != self.summary.version else "this client"
         if self.first_difference_ns is None:
-            return f"{what} says the same of every frame, with poses at most {1e3 * self.apart_m:.1f} mm apart"
+            return f"{what} gives the same result for every frame, poses at most {1e3 * self.apart_m:.1f} mm apart"
         if now_s > BLIND_S:
-            return f"{what} would have failed too: no position to rely upon for {now_s:.1f} s, then {then_s:.1f} s"
+            return f"{what} would have failed too: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
         if then_s > BLIND_S:
-            return f"{what} would not have failed: at most {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
-        return f"{what} says otherwise: {now_s:.1f} s without a position to rely upon, then {then_s:.1f} s"
+            return f"{what} would not have failed: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
+        return f"{what} gives other results: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
 
 
 def _is_same(then: Moment, now: Moment) -> bool:
@@ -100,7 +100,7 @@ def _is_same(then: Moment, now: Moment) -> bool:
 
 
 def longest_blind_s(moments: Sequence[Moment]) -> float:
-    """The longest time without a position to rely upon, as `is_blind` has it, or before one was found."""
+    """Return the longest time without a reliable position, by `is_blind`, or before the first one."""
     longest_s, since_ns = 0.0, None
     for each in moments:
         radius_m = float("inf") if each.radius_95_m is None else each.radius_95_m
@@ -113,7 +113,7 @@ def longest_blind_s(moments: Sequence[Moment]) -> float:
 
 
 def phases(moments: Sequence[Moment], began_ns: int) -> Iterator[str]:
-    """Statuses one after the other, each with its time since the failure began."""
+    """Yield the successive statuses, each with its time since the failure began."""
     for status, group in groupby(moments, key=lambda each: each.status):
         yield f"{(next(group).stamp_ns - began_ns) * 1e-9:+.1f} s {status}"
 
@@ -121,9 +121,9 @@ def phases(moments: Sequence[Moment], began_ns: int) -> Iterator[str]:
 def compare_failure(
     failure: tuple[FailureSummary, LocalizerRecord], source: MapSource, manifest_sha256: str | None = None
 ) -> Comparison:
-    """Then and now, in the robot's map or in the version with that manifest; LinkError where a tile is not to be had.
+    """Compare then and now, in the robot's map or in the version with that manifest; LinkError if a tile is not available.
 
-    Of another version the tiles within the bounds of those that the robot had in memory are used.
+    Of another version, tiles within the bounds of those in the robot's memory are used.
     """
     summary, record = failure
     maps: dict[UsedMap, LoadedMap] = {}
@@ -155,7 +155,7 @@ def _loaded(source: MapSource, site: str, used: UsedMap, other_sha256: str | Non
     missing = [cell for cell in cells if cell not in found.tiles]
     if missing:
         reason = found.refused.get(missing[0], "the version does not have it")
-        raise LinkError(f"tile {missing[0]} of version {manifest.version} cannot be had: {reason}")
+        raise LinkError(f"tile {missing[0]} of version {manifest.version} is not available: {reason}")
     wanted = WantedVersion(site=site, version=manifest.version, manifest_sha256=sha256)
     vocabulary = decode_vocabulary(source.vocabulary(manifest))
     return LoadedMap(wanted, manifest, vocabulary, {cell: found.tiles[cell] for cell in cells})

@@ -1,4 +1,4 @@
-"""Picture of a replay, by OpenCV, which robots have: path and landmarks, coloured by error; errors and statuses over time."""
+"""Picture of a replay, drawn by OpenCV: path and landmarks, coloured by error; errors and statuses over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,12 +31,12 @@ _WIDTH, _PLAN_WIDTH, _TOP, _LEFT, _BELOW = 2040, 1220, 140, 100, 140
 _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT = 520.0, 1100.0
 _LIMIT_MM = 1e3 * ERROR_LIMIT_M
 _MAX_LANDMARKS = 40_000
-_SHIFT = 4  # bits of a coordinate behind the point
+_SHIFT = 4  # fractional bits of a coordinate
 
 
 @dataclass(frozen=True)
 class RunPlot:
-    """Values of the picture: positions_map_m, truths_map_m (N, 3), NaN where unknown, of N frames; landmarks_map_m (M, 3)."""
+    """Data of the picture: positions_map_m, truths_map_m (N, 3), NaN if unknown, of N frames; landmarks_map_m (M, 3)."""
 
     title: str
     frames: Sequence[FrameRecord]
@@ -46,14 +46,14 @@ class RunPlot:
 
 
 def save_picture(plot: RunPlot, path: Path) -> None:
-    """Writes the picture as PNG; UsageError where it cannot be written."""
+    """Write the picture as PNG; UsageError if it cannot be written."""
     _, data = cv2.imencode(".png", draw_run(plot))
     with disk_errors(f"the picture cannot be written to {path}", "check the path", UsageError):
         path.write_bytes(data.tobytes())
 
 
 def draw_run(plot: RunPlot) -> Picture:
-    """(H, 2040, 3) BGR; the height follows the shape of the map."""
+    """Return the picture (H, 2040, 3) BGR; the height follows the shape of the map."""
     low, high = _view(plot)
     size_m = high - low
     height = float(np.clip(_PLAN_WIDTH * size_m[1] / size_m[0], _MIN_PLAN_HEIGHT, _MAX_PLAN_HEIGHT))
@@ -72,7 +72,7 @@ def draw_run(plot: RunPlot) -> Picture:
         radii_mm = np.array([1e3 * radius_95_m(frame.cov_rot_trans) for frame in plot.frames])
         values_mm, label = np.where(np.isfinite(radii_mm), radii_mm, np.nan), "95 % radius of the position, mm"
     known_mm = values_mm[~np.isnan(values_mm)]
-    ceiling_mm = min(1.1 * float(known_mm.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0  # what is larger stands there
+    ceiling_mm = min(1.1 * float(known_mm.max(initial=0.0)), 2.0 * _LIMIT_MM) or 1.0  # larger values are clipped
     darkest_mm = min(ceiling_mm, _LIMIT_MM)
     _draw_plan(plan, plot, values_mm / darkest_mm, f"{darkest_mm:.0f} mm")
 
@@ -90,7 +90,7 @@ def draw_run(plot: RunPlot) -> Picture:
 
 
 def _view(plot: RunPlot) -> tuple[Array, Array]:
-    """Corners (2,) in metres that show the path and most landmarks."""
+    """Return corners (2,) in metres of a view of the path and most landmarks."""
     path = plot.positions_map_m[~np.isnan(plot.positions_map_m[:, 0]), :2]
     spread = np.percentile(plot.landmarks_map_m[:, :2], [2, 98], axis=0) if len(plot.landmarks_map_m) else path[:2]
     shown = np.vstack([path, spread, [[0.0, 0.0]] if not len(path) and not len(spread) else path[:0]])
@@ -102,7 +102,7 @@ def _view(plot: RunPlot) -> tuple[Array, Array]:
 def _figures(plot: RunPlot) -> str:
     share, errors, times = localised_share_of_all(plot.frames), error_m(plot.frames), frame_ms(plot.frames)
     figures = [f"{len(plot.frames)} frames"]
-    figures += [] if share is None else [f"localised {100 * share:.1f} % of all" if share else "never localised"]
+    figures += [] if share is None else [f"localized {100 * share:.1f} % of all" if share else "never localized"]
     if errors is not None:
         figures.append(f"error: median {1e3 * errors['median']:.0f} mm, 99 % below {1e3 * errors['p99']:.0f} mm")
     if times is not None:
@@ -111,7 +111,7 @@ def _figures(plot: RunPlot) -> str:
 
 
 def _draw_plan(axes: "_Axes", plot: RunPlot, shares: Array, darkest: str) -> None:
-    """shares (N,): of the darkest blue."""
+    """Draw the map from above. shares (N,): of the darkest blue."""
     axes.draw_frame("x and y, m")
     landmarks = plot.landmarks_map_m[:: len(plot.landmarks_map_m) // _MAX_LANDMARKS + 1, :2]
     inside = ((landmarks > axes.data_low) & (landmarks < axes.data_high)).all(axis=1)
@@ -130,7 +130,7 @@ def _draw_plan(axes: "_Axes", plot: RunPlot, shares: Array, darkest: str) -> Non
     for point, colour in [*((p, _GOOD) for p in places[known][:1]), *((p, _BAD) for p in places[known][-1:])]:
         axes.dot(point, 8.0, colour)
     entries = [("start", _GOOD), ("end", _BAD), ("landmark", _POINT), ("0 mm", _by_error(0.0))]
-    entries += [(darkest, _by_error(1.0)), ("ground truth", _INK), ("not localised", _NOT_LOCALISED)]
+    entries += [(darkest, _by_error(1.0)), ("ground truth", _INK), ("not localized", _NOT_LOCALISED)]
     _legend(axes.picture, (axes.low[0], axes.low[1] - 18), entries)
 
 
@@ -153,7 +153,7 @@ def _draw_over_time(axes: "_Axes", seconds: Array, values_mm: Array, label: str)
 
 
 def _by_error(share: float) -> Colour:
-    """Light blue at 0 to dark blue at 1; red beyond, grey for NaN."""
+    """Return light blue at 0 to dark blue at 1; red beyond, grey for NaN."""
     if np.isnan(share) or share > 1.0:
         return _POINT if np.isnan(share) else _BAD
     blue, green, red = _EXACT + max(share, 0.0) * (_AT_LIMIT - _EXACT)
@@ -171,7 +171,7 @@ class _Axes:
     data_high: Array
 
     def pixels(self, data: Array) -> Array:
-        """(N, 2) of data points; the second axis of data points upwards."""
+        """Return pixels (N, 2) of data points, whose second axis points upwards."""
         share = (data - self.data_low) / (self.data_high - self.data_low)
         share[:, 1] = 1.0 - share[:, 1]
         return np.asarray(self.low + share * np.subtract(self.high, self.low))
@@ -185,7 +185,7 @@ class _Axes:
         cv2.circle(self.picture, (x, y), round(radius * 2**_SHIFT), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
 
     def draw_frame(self, label: str) -> None:
-        """Border, grid, ticks with their values, and the label below."""
+        """Draw border, grid, ticks with values, and the label below."""
         cv2.rectangle(self.picture, self.low, self.high, _GRID, 2)
         for axis in (0, 1):
             for value in ticks(float(self.data_low[axis]), float(self.data_high[axis])):
@@ -198,7 +198,7 @@ class _Axes:
 
 
 def ticks(low: float, high: float, about: int = 8) -> list[float]:
-    """Round values between two limits, about so many: steps of 1, 2 or 5 times a power of ten."""
+    """Return about `about` round values between two limits, in steps of 1, 2 or 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10((high - low) / about))
     step = float(next(power * k for k in (1, 2, 5, 10) if power * k * about >= high - low))
     return [round(k * step, 9) for k in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1)]

@@ -1,5 +1,4 @@
-"""Replay of a recording by the robot that `locclient run` runs: map loaded, frames handled one by one. `localize` is all of it as one
-call."""
+"""Replay of a recording by the `Robot` of `locclient run`: load the map, handle frames one by one. `localize` does all in one call."""
 
 import re
 import time
@@ -43,7 +42,7 @@ TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Settings of the localizer, whether the recording is played at its own speed, a call with the number of each frame, a file."""
+    """Settings of the localizer, playback at recorded speed, progress callback with the number of each frame, export file."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
@@ -52,9 +51,9 @@ class ReplayOptions:
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
-    """The version to run with all of its usable tiles, those that were refused, and a note where it is not the wanted version.
+    """Return the version to run with all usable tiles, the refused tiles, and a note if it is not the wanted version.
 
-    Raises LinkError where no map can be had.
+    Raises LinkError if no map is available.
     """
     ready = source.ready()
     manifest = source.manifest(ready.wanted)
@@ -72,12 +71,12 @@ def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
 def replay(
     source: ReplaySource, connection: MapConnection, options: ReplayOptions, prior: PositionPrior | None = None
 ) -> ReplayResult:
-    """Plays the source; prior: a coarse pose at its beginning.
+    """Play the source; prior: a coarse pose at its beginning.
 
-    A frame that cannot be read is left out, which a note says. Raises LinkError where no map can be fetched, RecordingError where most
-    frames cannot be read.
+    An unreadable frame is left out with a note. Raises LinkError if no map can be fetched, RecordingError if most frames are
+    unreadable.
     """
-    cv2.setNumThreads(1)  # one robot, one thread: figures are then those of the board's core
+    cv2.setNumThreads(1)  # one thread, so that figures are those of one core
     loaded, tiles, note = load_map(connection.source)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
     robot = Robot(source.calibration, rectifier, options.settings, TrialSettings(), time.process_time)
@@ -133,13 +132,13 @@ def replay(
 
 
 def _lens_note(recording: Recording) -> list[str]:
-    """What to know of the lens where another one fits the images better: none of the map is found with a wrong one."""
+    """Return a note if another lens model fits the images better: with a wrong one nothing in the map matches."""
     fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, recording.read_frame)
     return [fit.words(recording.calibration.cameras[0])] if fit is not None and fit.is_doubtful else []
 
 
 def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: float, decode_s: float) -> FrameRecord:
-    """The record of a frame whose images were decoded before the robot got them."""
+    """Return the record of a frame whose images were decoded beforehand."""
     estimate, error_map_m, error_rad = outcome.estimate, None, None
     if truth_map_from_body is not None and estimate.map_from_body is not None:
         error_map_m = estimate.map_from_body[:3, 3] - truth_map_from_body[:3, 3]
@@ -161,11 +160,11 @@ def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: fl
 
 @dataclass(frozen=True)
 class LocalizeOptions(ReplayOptions):
-    """Options of `localize` beside those of every replay.
+    """Options of `localize` in addition to those of every replay.
 
-    frames: which of the recording's, as a Python slice. reverse: backwards, with new stamps and without IMU. calibration, topics: for
-    opening a recording by its path. robot: the name that the server sees, `replay` unless it has an identity. root, identity,
-    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: of a store's folder, drafts too.
+    frames: Python slice of the recording's frames. reverse: backwards, with new stamps and without IMU. calibration, topics: for
+    opening a recording by its path. robot: name for the server; default: the identity's, else `replay`. root, identity,
+    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: in a store's folder, drafts included.
     """
 
     frames: str = ":"
@@ -192,10 +191,10 @@ def localize(
     prior: PositionPrior | None = None,
     options: LocalizeOptions = _DEFAULTS,
 ) -> ReplayResult:
-    """Localizes every frame of a recording in the current map of a site, as a robot would.
+    """Localize every frame of a recording in the current map of a site, as a robot would.
 
-    recording: its path, or one that is open. maps: folder of a store, or endpoint of a server, such as tcp/127.0.0.1:7447.
-    prior: a coarse pose at the beginning. Raises FleetmapError for whatever cannot be opened, read or fetched.
+    recording: its path, or an open one. maps: folder of a store, or endpoint of a server, such as tcp/127.0.0.1:7447.
+    prior: a coarse pose at the beginning. Raises FleetmapError if anything cannot be opened, read or fetched.
     """
     with ExitStack() as stack:
         if not isinstance(recording, Recording):
@@ -210,7 +209,7 @@ def localize(
 
 
 def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS) -> LoadedMap:
-    """The current map of a site with all of its tiles, for a `MapView`; arguments and errors as of `localize`."""
+    """Fetch the current map of a site with all of its tiles, for a `MapView`; arguments and errors as of `localize`."""
     with connected(_address(maps, site, options), options.cache, options.cache_bytes) as connection:
         return load_map(connection.source)[0]
 

@@ -1,4 +1,4 @@
-"""A replay as an MCAP file that Foxglove opens: map, robot, path, fixes, images and failures."""
+"""Export of a replay as an MCAP file for Foxglove: map, robot, path, fixes, images and failures."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,14 +31,14 @@ class RunExport:
         self._status = ("", "")
 
     def begin(self, first_ns: int, loaded: LoadedMap, profile: RobotProfile, rectifier: Rectifier) -> None:
-        """The map and the robot. Called once, before the first frame, with its stamp."""
+        """Write the map and the robot. Call once, before the first frame, with its stamp."""
         self._profile, self._rectifier = profile, rectifier
         landmarks = np.concatenate([tile.points_map for tile in loaded.tiles.values()])
         self._write(channels.points(first_ns, landmarks))
         self._write(channels.lens(first_ns, profile.camera))
 
     def handle(self, frame: CameraFrame, outcome: Outcome) -> None:
-        """The results of a frame; its images are as they were recorded."""
+        """Write the results of a frame, with its images as recorded."""
         estimate, published, profile = outcome.estimate, outcome.published, self._profile
         stamp_ns = estimate.stamp_ns
         self._write(channels.picture(stamp_ns, self._rectifier.rectify(frame).left))
@@ -66,7 +66,7 @@ class RunExport:
                 self._write(message)
 
     def _marks(self, estimate: Estimate) -> list[RobotMark]:
-        """Where the robot is, or may be."""
+        """Return marks of the robot's pose, or of its possible poses."""
         robot, body_from_base = self._profile.robot, se3_inverse(self._profile.base_from_body)
         if estimate.map_from_body is not None:
             return [RobotMark(robot, estimate.map_from_body @ body_from_base, estimate.status)]
@@ -86,6 +86,6 @@ class RunExport:
 
 @contextmanager
 def run_export(path: Path) -> Iterator[RunExport]:
-    """Writes the file at `path`, which appears when the block ends well. StoreError where the disk refuses."""
+    """Write the file at `path`, which appears when the block succeeds. StoreError on a disk error."""
     with appearing_file(path) as file, ChannelWriter(file) as writer:
         yield RunExport(writer)

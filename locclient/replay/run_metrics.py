@@ -1,4 +1,4 @@
-"""Measures of a run: localised share, times, errors, failures. Pure. To add one: a function here and a line in METRICS."""
+"""Metrics of a run: localized share, times, errors, failures. Pure. To add one: a function here and a line in METRICS."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ WARM_UP_FRAMES = 20
 class FrameRecord:
     """One frame of a run.
 
-    Errors are unaligned against the truth in the map's frame, None where either is unknown; error_map_m (3,) is estimate minus
+    Errors are unaligned against the truth in the map's frame, None if either is unknown; error_map_m (3,) is estimate minus
     truth. cpu_s and wall_s: from decoded images to estimate. stage_s: seconds by stage, decoding included. speed_mps: by wheels or
-    odometry, None where neither knows it. may_be_mapped: False where the robot knows that the map does not cover its place.
+    odometry, None if unknown. may_be_mapped: False if the robot knows that the map does not cover its place.
     """
 
     stamp_ns: int
@@ -47,7 +47,7 @@ Frames = Sequence[FrameRecord]
 
 
 def localised(frames: Frames) -> list[bool]:
-    """For each frame, by `failure_definition.is_localised`, whether it is, with the longer of the gaps before and after it."""
+    """Return for each frame True if localized, by `failure_definition.is_localised` with the longer of the gaps before and after it."""
     stamps_ns = np.array([frame.stamp_ns for frame in frames], np.int64)
     gaps_ns = np.maximum(np.diff(stamps_ns, prepend=stamps_ns[:1]), np.diff(stamps_ns, append=stamps_ns[-1:]))
     return [
@@ -57,25 +57,25 @@ def localised(frames: Frames) -> list[bool]:
 
 
 def first_fix(frames: Frames) -> int | None:
-    """Index of the first frame with a verified fix."""
+    """Return the index of the first frame with a verified fix."""
     return next((k for k, f in enumerate(frames) if f.has_fix), None)
 
 
 def localised_share(frames: Frames) -> float | None:
-    """Share of localised frames among the first fix and everything after it."""
+    """Return the share of localized frames from the first fix on."""
     start = first_fix(frames)
     return None if start is None else float(np.mean(localised(frames)[start:]))
 
 
 def localised_share_of_all(frames: Frames) -> float | None:
-    """Share of localised frames among all; None without any."""
+    """Return the share of localized frames among all; None without frames."""
     return float(np.mean(localised(frames))) if frames else None
 
 
 def not_localised_share(frames: Frames) -> float | None:
-    """Share of the driving time in which the robot was not localised; None where it did not drive.
+    """Return the share of the driving time in which the robot was not localized; None if it did not drive.
 
-    A frame speaks for the time since the one before. Frames without a known speed count as driving.
+    A frame represents the time since the previous one. Frames without a known speed count as driving.
     """
     stamps_s = np.array([frame.stamp_ns for frame in frames], np.int64) * 1e-9
     lasted_s = np.diff(stamps_s, prepend=stamps_s[:1])
@@ -86,23 +86,23 @@ def not_localised_share(frames: Frames) -> float | None:
 
 
 def first_fix_s(frames: Frames) -> float | None:
-    """Sensor time from the first frame to the first fix."""
+    """Return the sensor time from the first frame to the first fix."""
     start = first_fix(frames)
     return None if start is None else (frames[start].stamp_ns - frames[0].stamp_ns) * 1e-9
 
 
 def frame_ms(frames: Frames) -> dict[str, float] | None:
-    """CPU milliseconds of the whole process per frame, after the warm-up frames."""
+    """Return CPU milliseconds of the whole process per frame, after the warm-up frames."""
     return spread([1e3 * f.cpu_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
 
 
 def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
-    """Wall-clock milliseconds per frame, after the warm-up frames."""
+    """Return wall-clock milliseconds per frame, after the warm-up frames."""
     return spread([1e3 * f.wall_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
 
 
 def stage_ms(frames: Frames) -> dict[str, float]:
-    """Mean CPU milliseconds per frame and stage, after the warm-up frames."""
+    """Return mean CPU milliseconds per frame and stage, after the warm-up frames."""
     rows = [f.stage_s for f in frames[WARM_UP_FRAMES:]]
     return {
         name: 1e3 * float(np.mean([r.get(name, 0.0) for r in rows])) for name in sorted({n for r in rows for n in r})
@@ -110,33 +110,33 @@ def stage_ms(frames: Frames) -> dict[str, float]:
 
 
 def error_m(frames: Frames) -> dict[str, float] | None:
-    """Unaligned position errors of localised frames with a truth."""
+    """Return unaligned position errors of localized frames with ground truth."""
     values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good]
     return spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
 
 
 def error_deg(frames: Frames) -> dict[str, float] | None:
-    """Unaligned orientation errors of localised frames with a truth."""
+    """Return unaligned orientation errors of localized frames with ground truth."""
     values = [f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good]
     return spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
 
 
 def status_share(frames: Frames) -> dict[str, float]:
-    """Share of frames by status."""
+    """Return the share of frames by status."""
     return {status.value: float(np.mean([f.status is status for f in frames])) for status in Status} if frames else {}
 
 
 def silent_failures(frames: Frames) -> int | None:
-    """Failures in which the status was TRACKING and the place was wrong; None without truth."""
+    """Return the number of failures with status TRACKING and a wrong position; None without ground truth."""
     if all(f.error_m is None for f in frames):
         return None
     return len(_episodes(frames, _is_silent, SILENT_S))
 
 
 def position_failures(frames: Frames) -> int:
-    """Count of failures as `fleetmap.failure_definition` defines them; overlapping ones count once.
+    """Return the number of failures by `fleetmap.failure_definition`; overlapping ones count once.
 
-    Without ground truth only blindness can be seen, and that the robot does not find itself.
+    Without ground truth only the failures `blind` and `not_found` are detectable.
     """
     start = first_fix(frames)
     after = list(frames[start:]) if start is not None else []
@@ -152,7 +152,7 @@ def position_failures(frames: Frames) -> int:
 
 
 def not_found(frames: Frames) -> list[tuple[int, int]]:
-    """(begin, end) stamps of stretches in which the robot did not find itself for too long."""
+    """Return (begin, end) stamps of periods in which the robot was not localized for too long."""
     clock, stretches = SearchClock(), []
     begin = None
     for frame, is_localised in zip(frames, localised(frames), strict=True):
@@ -178,7 +178,7 @@ def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
 
 
 def is_outside_its_bound(frame: FrameRecord) -> bool:
-    """Whether the truth lies outside the 99.9 % bound of the position that the frame claims."""
+    """Return True if the ground truth lies outside the 99.9 % bound of the frame's position."""
     if frame.error_map_m is None or frame.cov_rot_trans is None:
         return False
     return failure_definition.is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
@@ -191,9 +191,9 @@ def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
 def _episodes(
     frames: Frames, is_bad: Callable[[FrameRecord, bool], bool], longer_than_s: float
 ) -> list[tuple[int, int]]:
-    """(begin, end) stamps of stretches that are bad for longer than so many seconds.
+    """Return (begin, end) stamps of bad periods longer than so many seconds.
 
-    A stretch lasts until the next frame that is not bad. Stretches without 5 s of good tracking between them are one failure.
+    A period lasts until the next frame that is not bad. Periods without 5 s of good tracking between them are one failure.
     """
     good = localised(frames)
     stretches: list[tuple[int, int]] = []
@@ -210,7 +210,7 @@ def _episodes(
 
 
 def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
-    """Joins stretches, sorted by begin, without 5 s of good tracking between them. fine: stamp and goodness of each frame."""
+    """Merge periods, sorted by begin, without 5 s of good tracking between them. fine: stamp and goodness of each frame."""
     merged: list[tuple[int, int]] = []
     for begin, end in stretches:
         if merged and _longest_fine_ns(fine, merged[-1][1], begin) < GOOD_S * 1e9:
@@ -221,7 +221,7 @@ def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> l
 
 
 def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
-    """Duration of the longest stretch of good tracking between two stamps, up to the frame that ends it."""
+    """Return the duration of the longest period of good tracking between two stamps, up to the frame that ends it."""
     longest, begin = 0, None
     for stamp, is_fine in fine:
         if since_ns <= stamp <= until_ns:
@@ -234,7 +234,7 @@ def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int)
 
 
 def spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:
-    """Mean, median or percentiles of the values by their names; None without values."""
+    """Return mean, median or percentiles of the values by name; None without values."""
     if not values:
         return None
     shares = {"p50": 50, "median": 50, "p95": 95, "p99": 99, "max": 100}

@@ -16,17 +16,17 @@ from locclient.replay.plots import RunPlot, save_picture
 from locclient.replay.run_metrics import METRICS, FrameRecord, localised, spread
 from locclient.robot.health_report import SearchWay
 
-_MIN_ALIGNED = 3  # frames, below which a fit is not defined
+_MIN_ALIGNED = 3  # minimum number of frames for a fit
 
 
 @dataclass
 class ReplayResult:
-    """A finished replay, one entry a frame: records, estimates, and the true pose of the body (4, 4), None where unknown.
+    """A finished replay, one entry per frame: records, estimates, and the true pose of the body (4, 4), None if unknown.
 
-    truth_in_map: whether the truth is of the frame `map`; else it is of a frame of its own, and errors are known after a fit alone.
+    truth_in_map: True if the ground truth is in the frame `map`; else it has its own frame, and errors are known only after a fit.
 
-    manifest, tiles: the map that was used. notes: what a user should know of the run, in words. failures: how many the robot
-    detected. search: how far the robot had driven at the end without finding itself.
+    manifest, tiles: the map that was used. notes: texts for users about the run. failures: number detected by the robot.
+    search: distance driven without localization at the end.
     """
 
     frames: list[FrameRecord]
@@ -45,14 +45,14 @@ class ReplayResult:
 
     @property
     def map_from_body(self) -> Array:
-        """(N, 4, 4) estimated poses; NaN where there is none."""
+        """Return estimated poses (N, 4, 4); NaN if absent."""
         unknown = np.full((4, 4), np.nan)
         found = [unknown if e.map_from_body is None else e.map_from_body for e in self.estimates]
         return np.array(found).reshape(-1, 4, 4)
 
     @property
     def cov_rot_trans(self) -> Array:
-        """(N, 6, 6) covariances of the poses in map axes, rotation first; NaN where there is none."""
+        """Return covariances of the poses (N, 6, 6) in map axes, rotation first; NaN if absent."""
         unknown = np.full((6, 6), np.nan)
         found = [unknown if e.cov_rot_trans is None else e.cov_rot_trans for e in self.estimates]
         return np.array(found).reshape(-1, 6, 6)
@@ -62,9 +62,9 @@ class ReplayResult:
         return [estimate.status for estimate in self.estimates]
 
     def aligned_error_m(self) -> dict[str, float] | None:
-        """Position errors of the localised frames with a truth after the rigid fit of these positions to it; None below 3 frames.
+        """Return position errors of localized frames with ground truth after a rigid fit to it; None below 3 frames.
 
-        frames: how many those are. scale: by which the estimate would have to be multiplied to fit best; it is not applied.
+        frames: their number. scale: factor of the estimate for the best fit; it is not applied.
         """
         found = [
             (estimate.map_from_body[:3, 3], truth[:3, 3])
@@ -83,12 +83,12 @@ class ReplayResult:
         }
 
     def alignment_note(self) -> str:
-        """What a user should know of errors against a truth in another frame."""
+        """Return a note for users on errors against ground truth in another frame."""
         found = self.aligned_error_m()
         words = "the ground truth is in another frame than the map: error_m is unknown"
         if found is None:
-            return f"{words}, and fewer than {_MIN_ALIGNED} localised frames have a truth to align"
-        return f"{words}; aligned_error_m is after the best rigid fit of the {found['frames']} localised frames with a truth"
+            return f"{words}, and fewer than {_MIN_ALIGNED} localized frames have ground truth for a fit"
+        return f"{words}; aligned_error_m is after a rigid fit of {found['frames']} localized frames with ground truth"
 
     @property
     def report(self) -> dict[str, object]:
@@ -106,12 +106,12 @@ class ReplayResult:
 
     @property
     def trajectory(self) -> Trajectory:
-        """map_from_body of the localised frames."""
+        """Return map_from_body of the localized frames."""
         kept = np.array(localised(self.frames), bool) & ~np.isnan(self.map_from_body[:, 0, 0])
         return Trajectory(self.stamps_ns[kept], self.map_from_body[kept])
 
     def save_picture(self, path: str | Path) -> None:
-        """Draws path, landmarks and errors into a PNG file; UsageError where it cannot be written."""
+        """Draw path, landmarks and errors into a PNG file; UsageError if it cannot be written."""
         known = [truth if self.truth_in_map else None for truth in self.truths]
         truths_m = [np.full(3, np.nan) if truth is None else truth[:3, 3] for truth in known]
         plot = RunPlot(

@@ -1,4 +1,4 @@
-"""The frame `odom` that a robot publishes: continuous from the first localized pose on. Pure."""
+"""Published frame `odom`: continuous from the first localized pose on. Pure."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ from locclient.localization.pose_covariance import transport_cov
 class PublishedPose:
     """One estimate in the published frames; map_from_odom is None while there is no single pose.
 
-    building_from_map: of the map that the robot uses, None where that does not say it. cov_rot_trans (6, 6): of map_from_base, map axes
-    about the base, where the estimate has one.
+    building_from_map: of the robot's map, None if the map does not define it. cov_rot_trans (6, 6): of map_from_base, map axes, about
+    the base, None if the estimate has none.
     """
 
     odom_from_base: Array
@@ -23,16 +23,16 @@ class PublishedPose:
 
     @property
     def map_from_base(self) -> Array | None:
-        """(4, 4), None while there is no single pose."""
+        """Return (4, 4), None while there is no single pose."""
         return None if self.map_from_odom is None else self.map_from_odom @ self.odom_from_base
 
 
 class ContinuousOdom:
-    """Follows estimates one after another.
+    """Converts successive estimates.
 
-    The odometry redefines its own frame when it finds gravity, knows it better or is initialized again. Before the first localized pose
-    `odom` follows it, because nobody navigates by it yet. Afterwards the difference goes into map_from_odom, which may jump, so that
-    odom_from_base never does.
+    The odometry redefines its frame when it estimates gravity, refines it or is initialized again. Before the first localized pose
+    `odom` follows, because it is not yet used for navigation. Afterwards the difference goes into map_from_odom, which may jump, so
+    that odom_from_base never does.
     """
 
     def __init__(self, base_from_body: Array) -> None:
@@ -41,7 +41,7 @@ class ContinuousOdom:
         self._is_localized = False
 
     def handle(self, estimate: Estimate) -> PublishedPose:
-        """The pose to publish for this frame."""
+        """Return the pose to publish for this frame."""
         if not self._is_localized:
             self._frame = ContinuousFrame()
         odom_from_body = self._frame.handle(estimate.odometry)

@@ -1,4 +1,4 @@
-"""Detection of position failures and their causes, from estimates as they come. Pure; `fleetmap.failure_definition` has the limits."""
+"""Detection of position failures and their causes, from successive estimates. Pure; `fleetmap.failure_definition` has the limits."""
 
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ CONTRADICTING_LOOKS = 3  # one refused fix is chance, several in a row are a dou
 class Failure:
     """A failure, reported once.
 
-    stamp_ns: of its first frame. estimate: of the frame with which it was detected; image: of the same frame, None where none came.
+    stamp_ns: of its first frame. estimate: of the frame of its detection; image: of the same frame, None without one.
     """
 
     kind: FailureKind
@@ -44,10 +44,9 @@ class Failure:
 class FailureMonitor:
     """Reports every failure once, when it has lasted long enough; the next may begin after GOOD_S of good tracking.
 
-    `blind`: after the first fix, no position that may be relied upon for BLIND_S. `not_found`: searching for itself for too long, from
-    the start on or later. `suspected`: the robot is tracking, but the
-    last fixes contradict it for SILENT_S, or it is found elsewhere than it had claimed, beyond its covariance. The robot can see
-    the first two; the third estimates what only ground truth could show.
+    `blind`: after the first fix, no reliable position for BLIND_S. `not_found`: no pose for too long, from the start on or later.
+    `suspected`: the robot is tracking, but the last fixes contradict it for SILENT_S, or it is found elsewhere than claimed, beyond
+    its covariance. The first two are certain; the third is an indication of an error that only ground truth could prove.
     """
 
     def __init__(self) -> None:
@@ -58,7 +57,7 @@ class FailureMonitor:
         self._had_fix = False
         self._blind_ns: int | None = None
         self._doubted_ns: int | None = None
-        self._contradicted_ns: int | None = None  # since when no fix was believed and some contradicted the estimate
+        self._contradicted_ns: int | None = None  # since when no fix was accepted and some contradicted the estimate
         self._contradicting_looks = 0
         self._good_ns: int | None = None
         self.is_running = False  # a reported failure has not ended yet
@@ -66,7 +65,7 @@ class FailureMonitor:
 
     @property
     def begun_ns(self) -> dict[FailureKind, int]:
-        """Stamps of the first frames of what goes on and is, or may become, a failure."""
+        """Return first stamps of ongoing failures and of conditions that may become one, by kind."""
         stamps = (self._blind_ns, self._search.began_ns, self._contradicted_ns)
         kinds = (FailureKind.BLIND, FailureKind.NOT_FOUND, FailureKind.SUSPECTED)
         return {kind: stamp_ns for kind, stamp_ns in zip(kinds, stamps, strict=True) if stamp_ns is not None}
@@ -74,9 +73,9 @@ class FailureMonitor:
     def handle(
         self, estimate: Estimate, speed_mps: float | None = None, *, may_be_mapped: bool = True
     ) -> Failure | None:
-        """The failure that is detected with this frame, if any.
+        """Return the failure detected with this frame, if any.
 
-        speed_mps: None where neither wheels nor odometry know it. may_be_mapped: False where the map does not cover the place.
+        speed_mps: by wheels or odometry, None if unknown. may_be_mapped: False if the map does not cover the place.
         """
         # Of other statuses it decides nothing.
         radius_m = radius_95_m(estimate.cov_rot_trans) if estimate.status is Status.DEGRADED else float("inf")
@@ -103,7 +102,7 @@ class FailureMonitor:
         return None
 
     def handle_silence(self, for_s: float) -> Failure | None:
-        """The failure of a source that has sent no frame for so long; None before the first frame."""
+        """Return the failure of a source without frames for so many seconds; None before the first frame."""
         is_too_long = for_s > BLIND_S if self._had_fix else for_s >= FIND_DRIVING_S
         if self.is_running or self._last is None or not is_too_long:
             return None
@@ -113,7 +112,7 @@ class FailureMonitor:
         return self._detected(kind, Cause.NO_FRAMES, began_ns, began_ns + int(for_s * 1e9))
 
     def _is_lost(self, estimate: Estimate, radius_m: float, is_driving: bool, *, may_be_mapped: bool) -> bool:
-        """Whether the robot has searched for itself for too long."""
+        """Return True if the robot has had no pose for too long."""
         before_ns = estimate.stamp_ns if self._last is None else self._last.stamp_ns
         has_fix = estimate.fix is not None
         localised = is_localised(estimate.status, has_fix, radius_m, (estimate.stamp_ns - before_ns) * 1e-9)
@@ -172,7 +171,7 @@ class FailureMonitor:
 
 
 def failure_cause(estimate: Estimate) -> Cause:
-    """Cause of a frame without a reliable position: the estimate's own, or in more detail what the map lacks."""
+    """Return the cause of a frame without a reliable position: the estimate's own, or a more specific one about the map."""
     if estimate.cause not in {Cause.NONE, Cause.UNMATCHED}:
         return estimate.cause
     if estimate.map_version is None:

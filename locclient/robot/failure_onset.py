@@ -1,4 +1,4 @@
-"""Onset of a failure: what the robot believed when it began, and pictures from before. Pure."""
+"""Onset of a failure: the robot's pose belief at its beginning, and earlier pictures. Pure."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -17,17 +17,17 @@ from locclient.localization.estimate import Estimate
 PICTURE_WIDTH_PX = 240
 _BEFORE_NS = (2_000_000_000, 500_000_000)
 _EVERY_NS, _KEPT = 250_000_000, 10  # pictures of the last 2.5 s, four a second
-_BREAK_NS = 3_000_000_000  # from a break of the odometry until a failure that it explains; fixes and status need up to two seconds
-_AGREEING_FIXES = 3  # that make a place elsewhere more than chance, as for a kidnapped robot
+_BREAK_NS = 3_000_000_000  # from lost tracks to a failure caused by them; fixes and status need up to 2 s
+_AGREEING_FIXES = 3  # that make another place significant, as for a kidnapped robot
 _RECENT_FIX_NS = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """The last pose that a robot claimed: map_from_body (4, 4), cov_rot_trans (6, 6) of the frame at stamp_ns.
+    """The last claimed pose of a robot: map_from_body (4, 4), cov_rot_trans (6, 6) of the frame at stamp_ns.
 
     odom_from_body (4, 4) of the same frame, in an odometry frame that is never redefined. fix_ns: stamp of the last fix until then;
-    recall: the share of the expected landmarks that it found.
+    recall: share of the expected landmarks found by it.
     """
 
     stamp_ns: int
@@ -42,15 +42,15 @@ class Belief:
 
     @property
     def radius_95_m(self) -> float:
-        """Radius that held the position with 95 %."""
+        """Return the 95 % radius of the position."""
         return radius_95_m(self.cov_rot_trans)
 
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """The first frame of what became a failure. left: its left image; pictures: stamps and small images, the oldest first.
+    """The first frame of a failure. left: its left image; pictures: stamps and small images, the oldest first.
 
-    map_from_body (4, 4): what the robot believed, carried on to this frame; None, as belief, where it had claimed no pose.
+    map_from_body (4, 4): the belief, propagated to this frame; None, as is belief, if the robot had claimed no pose.
     """
 
     stamp_ns: int
@@ -62,11 +62,11 @@ class Onset:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What speaks for a cause when a failure is detected.
+    """Evidence for a cause when a failure is detected.
 
-    wrong_by_m: how far from the belief fixes that agree with each other put the robot, None without such fixes. broke: the odometry lost
-    every track between two sound images. had_fix: a fix had agreed with the belief shortly before. places: how many places elsewhere
-    have several fixes each.
+    wrong_by_m: distance from the belief to the place of agreeing fixes, None without such fixes. broke: the odometry lost all tracks
+    between two good images. had_fix: a fix had agreed with the belief shortly before. places: number of other places with several
+    fixes each.
     """
 
     wrong_by_m: float | None = None
@@ -76,7 +76,7 @@ class Evidence:
 
 
 def refined_cause(cause: Cause, evidence: Evidence) -> Cause:
-    """The cause of a failure by the evidence; faults of the image, of the calibration and of the source stay what they are."""
+    """Return the cause of a failure by the evidence; faults of the image, of the calibration and of the source are not changed."""
     if cause not in {Cause.AMBIGUOUS, Cause.NO_MATCH, Cause.FIX_REFUSED, Cause.MOVED, Cause.ODOMETRY}:
         return cause
     if evidence.wrong_by_m is not None and evidence.broke:
@@ -87,7 +87,7 @@ def refined_cause(cause: Cause, evidence: Evidence) -> Cause:
 
 
 class OnsetRecorder:
-    """Keeps small pictures of the last seconds, and the onset of everything that goes on and may become a failure."""
+    """Keeps small pictures of the last seconds, and the onset of every ongoing condition that may become a failure."""
 
     def __init__(self) -> None:
         self._pictures: deque[tuple[int, Image]] = deque(maxlen=_KEPT)
@@ -101,7 +101,7 @@ class OnsetRecorder:
     def handle(
         self, estimate: Estimate, left: Image, odom_from_body: Array, begun_ns: Mapping[FailureKind, int]
     ) -> None:
-        """Follows a frame. begun_ns: since when what may become a failure goes on, by kind; odom_from_body as of `Belief`."""
+        """Add a frame. begun_ns: start of conditions that may become a failure, by kind; odom_from_body as of `Belief`."""
         stamp_ns, self._last = estimate.stamp_ns, (estimate, odom_from_body)
         self._note_belief(estimate, odom_from_body)
         if self._breaks(estimate):
@@ -116,11 +116,11 @@ class OnsetRecorder:
 
     @property
     def search(self) -> Onset | None:
-        """Of the search for itself that goes on."""
+        """Return the onset of the ongoing search for the pose."""
         return self._open.get(FailureKind.NOT_FOUND)
 
     def onset(self, kind: FailureKind, began_ns: int, left: Image, *, was_carried: bool = False) -> Onset:
-        """Of a failure that has been detected; of the break of the odometry for a robot that was carried then."""
+        """Return the onset of a detected failure; for a carried robot, that of the lost tracks."""
         assert self._last is not None
         if was_carried and self._break is not None and self._is_break_of(began_ns):
             return self._break
@@ -128,7 +128,7 @@ class OnsetRecorder:
         return found if found is not None else self._onset(began_ns, left, self._last[1])
 
     def evidence(self, estimate: Estimate, kind: FailureKind, began_ns: int, odom_from_body: Array) -> Evidence:
-        """For the cause of a failure that is detected with this estimate."""
+        """Return evidence for the cause of a failure detected with this estimate."""
         found = self._open.get(kind)
         belief = self._belief if found is None else found.belief
         elsewhere = [
@@ -147,13 +147,13 @@ class OnsetRecorder:
         return self._break is not None and self._break.stamp_ns >= began_ns - _BREAK_NS
 
     def _breaks(self, estimate: Estimate) -> bool:
-        """Whether the odometry lost its tracks with this frame though the image is sound."""
+        """Return True if the odometry lost its tracks in this frame although the image is good."""
         is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
         begins, self._was_odometry_lost = is_lost and not self._was_odometry_lost, is_lost
         return begins and estimate.image.cause is Cause.NONE
 
     def _note_belief(self, estimate: Estimate, odom_from_body: Array) -> None:
-        """A pose without competitors is claimed; that of a candidate which must be confirmed is not."""
+        """Store a claimed pose: one without competitors that is not an unconfirmed candidate."""
         if estimate.fix is not None:
             self._fix = (estimate.stamp_ns, estimate.fix.landmark_recall)
         if estimate.map_from_body is None or estimate.cov_rot_trans is None or estimate.hypotheses:
@@ -169,14 +169,14 @@ class OnsetRecorder:
         return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, _small(left))), belief, map_from_body)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
-        """The picture nearest to a stamp, among those before another one and not more than 0.5 s off."""
+        """Return the picture nearest to a stamp, at most 0.5 s off and before `before_ns`."""
         known = [picture for picture in self._pictures if picture[0] < before_ns]
         nearest = min(known, key=lambda picture: abs(picture[0] - wanted_ns), default=None)
         return nearest if nearest is not None and abs(nearest[0] - wanted_ns) <= 2 * _EVERY_NS else None
 
 
 def _is_beyond(map_from_body: Array, belief: Belief, odom_from_body: Array) -> bool:
-    """Whether a pose contradicts a belief: farther than an error may be, and than the belief's own radius."""
+    """Return True if a pose contradicts a belief: farther than the error limit and than the belief's radius."""
     off_m = _distance_m(map_from_body, belief.carried_on(odom_from_body))
     return off_m > max(ERROR_LIMIT_M, belief.radius_95_m)
 
@@ -186,7 +186,7 @@ def _distance_m(one: Array, other: Array) -> float:
 
 
 def _small(left: Image) -> Image:
-    """Means of whole blocks of pixels, which cost a tenth of a free choice of the size; less than twice PICTURE_WIDTH_PX wide."""
+    """Return means of whole blocks of pixels, at a tenth of the cost of a free scale; narrower than twice PICTURE_WIDTH_PX."""
     height, width = left.shape
     step = max(1, width // PICTURE_WIDTH_PX)
     whole = left[: height // step * step, : width // step * step]

@@ -1,4 +1,4 @@
-"""Report of a failure: its context in numbers and small images. Pure; the caller gives the id and the wall clock."""
+"""Failure report: context in numbers and small images. Pure; the caller provides id and wall clock."""
 
 import math
 from collections.abc import Iterable
@@ -23,16 +23,16 @@ from locclient.robot.robot import FailureContext
 Canvas = NDArray[np.uint8]
 Matches = tuple[Array, Array, NDArray[np.int64]]
 _FOUND, _MISSING, _OTHER, _INK = (60, 200, 60), (70, 70, 230), (150, 150, 150), (255, 255, 255)
-_LETTERS = 0.55  # size of the title, where it fits
-_COARSE_PX = 32  # what is left of a blurred picture's width
-_WINDOW_PX = 25.0  # the place may be off: the view shows whether anything would match nearby
+_LETTERS = 0.55  # font scale of the title, if it fits
+_COARSE_PX = 32  # width of a blurred picture's content
+_WINDOW_PX = 25.0  # generous, as the pose may be off: shows possible matches nearby
 
 
 def expected_matches(
     left: Image, camera: StereoCamera, map_from_cam: Array, tiles: Iterable[Tile], settings: LocalizerSettings
 ) -> Matches:
-    """Pixels (E, 2) of the landmarks that should be seen from map_from_cam (4, 4), pixels (N, 2) of the image's features, and (E,) the
-    feature that matches each landmark near its pixel, -1 for none."""
+    """Return pixels (E, 2) of landmarks expected from map_from_cam (4, 4), pixels (N, 2) of the image's features, and (E,) the index of
+    the feature that matches each landmark near its pixel, -1 for none."""
     tiles = list(tiles)
     max_angle_rad = np.radians(settings.fix.max_view_angle_deg)
     expected = visible_landmarks(cones_of_tiles(tiles), map_from_cam, camera, 0.0, max_angle_rad)
@@ -46,9 +46,9 @@ def expected_matches(
 
 
 def match_view(left: Image, matches: Matches, title: str) -> Canvas:
-    """(H + 30, 2 W, 3) BGR: the left image with its features, and the landmarks that should be in it.
+    """Draw (H + 30, 2 W, 3) BGR: the left image with its features, and with its expected landmarks.
 
-    Green: features and landmarks that match near the projected pixel, joined in the right half; red: landmarks that do not.
+    Green: features and landmarks that match near the projected pixel, joined in the right half; red: unmatched landmarks.
     """
     pixels, features, hit = matches
     seen = cv2.cvtColor(np.ascontiguousarray(left), cv2.COLOR_GRAY2BGR)
@@ -70,7 +70,7 @@ def match_view(left: Image, matches: Matches, title: str) -> Canvas:
 
 
 def without_detail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image (H, W) as 32 pixels of its width show it, in the size that it had: places of light and dark, no faces and no words."""
+    """Return an image (H, W) reduced to 32 pixels of width and enlarged again: light and dark areas, without faces and text."""
     height_px, width_px = image.shape
     coarse = _COARSE_PX, max(1, round(_COARSE_PX * height_px / width_px))
     few = cv2.resize(image, coarse, interpolation=cv2.INTER_AREA)
@@ -78,7 +78,7 @@ def without_detail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def small_jpeg(image: NDArray[np.uint8], width_px: int, max_bytes: int) -> bytes:
-    """JPEG of an image (H, W) or (H, W, 3), not wider than width_px; quality gives way to max_bytes, then size does."""
+    """Encode an image (H, W) or (H, W, 3) as JPEG, at most width_px wide; reduce quality, then size, to fit max_bytes."""
     while True:
         scale = min(1.0, width_px / image.shape[1])
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
@@ -99,8 +99,8 @@ _MATCHES_WIDTH_PX = 800
 
 @dataclass(frozen=True)
 class RobotProfile:
-    """What is the same in all reports of a robot: names of its site and itself, mounting, rectified camera, settings, noise and clock of
-    the IMU, and how its pictures are seen by others: full, blurred or off (not at all)."""
+    """Common data of all reports of a robot: site, name, mounting, rectified camera, settings, noise and clock of the IMU, and the
+    privacy of its pictures: full, blurred or off (none)."""
 
     site: str
     robot: str
@@ -114,7 +114,7 @@ class RobotProfile:
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
-    """The message. wall_ns: the robot's wall clock when the failure began."""
+    """Return the message. wall_ns: the robot's wall clock when the failure began."""
     failure, onset, image = context.failure, context.onset, context.failure.image
     belief, map_from_base = onset.belief, None
     if onset.map_from_body is not None:
@@ -172,7 +172,7 @@ def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, in
 
 
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
-    """What the map expects in the image in which no fix was found, where the robot believed to be; None without a pose or a map."""
+    """Return expected matches at the believed pose, in the image without a fix; None without a pose or a map."""
     onset, running = context.unmatched, context.running
     if onset.map_from_body is None or running is None:
         return None
@@ -181,9 +181,9 @@ def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
 
 
 def _has_map_changed(context: FailureContext, profile: RobotProfile, expected: int, seen: int) -> bool:
-    """Whether sound images and a sound odometry at a place that was known found far less than the map holds of it.
+    """Return True if far fewer landmarks than expected were found at a known place, with good images and odometry.
 
-    The map must expect twice what a fix needs, at the share of landmarks that the robot found until then, and not half of that is seen.
+    The map must expect twice the landmarks of a fix, at the robot's recall until then, and less than half of them are seen.
     """
     failure, belief = context.failure, context.unmatched.belief
     if failure.cause is not Cause.NO_MATCH or belief is None or context.evidence.broke:

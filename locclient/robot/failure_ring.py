@@ -1,7 +1,7 @@
-"""Ring of the last seconds: what the robot perceived, what it answered, and a few pictures, kept for the replay of a failure. Pure.
+"""Ring buffer of the last seconds: percepts, results and a few pictures, for the replay of a failure. Pure.
 
-The odometry knows no map: its estimates are kept as they were, not its samples alone, so that no image is needed to repeat what the map
-made of them. A replay begins with the pose that the robot had then.
+The odometry does not depend on the map: its estimates are stored, not only its samples, so that a replay in the map needs no images.
+It starts with the robot's pose at that time.
 """
 
 from collections import deque
@@ -25,16 +25,16 @@ from locclient.localization.pose_tracker import Start
 from locclient.maps.loaded_map import LoadedMap
 
 BEFORE_NS, AFTER_NS = 5_000_000_000, 5_000_000_000  # of a failure's onset
-_QUERY_NS = 2_000_000_000  # longer than a map query lasts: a replay begins between two of them
-_PICTURES_NS, _LATEST_PICTURE_NS = 450_000_000, 900_000_000  # between two, of map queries and of any frame
-_SAME_ONSET_NS = 3_500_000_000  # a carried robot's onset is the break of its odometry, up to three seconds earlier
+_QUERY_NS = 2_000_000_000  # longer than a map query: a replay begins between two of them
+_PICTURES_NS, _LATEST_PICTURE_NS = 450_000_000, 900_000_000  # between two pictures: of map queries, of any frames
+_SAME_ONSET_NS = 3_500_000_000  # a carried robot's onset is the loss of its tracks, up to three seconds earlier
 _MAX_FRAMES = 1000  # 90 a second: a camera that is faster has a shorter ring
 _NO_TRACKS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class UsedMap:
-    """The map that the localizer used: its version, and the cells of its tiles in their order."""
+    """Map of the localizer: its version, and the cells of its tiles in order."""
 
     version: int
     manifest_sha256: str
@@ -43,7 +43,7 @@ class UsedMap:
 
 @dataclass(slots=True, eq=False)
 class Commands:
-    """What came before a frame, in this order."""
+    """Commands before a frame, in this order."""
 
     used: UsedMap | None = None
     forgets: bool = False
@@ -52,9 +52,9 @@ class Commands:
 
 @dataclass(slots=True, eq=False)
 class RingFrame:
-    """A frame of the ring. imu, wheel: since the frame before. picture: its images, for a few frames only. moment: what the robot said.
+    """A frame of the ring. imu, wheel: since the previous frame. picture: its images, for a few frames only. moment: result.
 
-    after, used: where a replay of the frames behind it begins; None where it cannot.
+    after, used: start state and map of a replay of the following frames; None if it cannot start here.
     """
 
     commands: Commands
@@ -73,9 +73,9 @@ class RingFrame:
 
 @dataclass(slots=True, eq=False)
 class FailureCut:
-    """The part of the ring around an onset; frames is None until all of it has come. is_wanted: of a failure that was reported.
+    """Part of the ring around an onset; frames is None until complete. is_wanted: of a reported failure.
 
-    start, used: where its replay begins.
+    start, used: start state and map of its replay.
     """
 
     onset_ns: int
@@ -86,7 +86,7 @@ class FailureCut:
 
 
 def moment_of(estimate: Estimate) -> Moment:
-    """What the robot says of a frame, for people."""
+    """Return the result of a frame in a form for display."""
     said = Moment(estimate.stamp_ns, estimate.status.value, estimate.cause.value)
     map_from_body, covariance = estimate.map_from_body, estimate.cov_rot_trans
     if map_from_body is None:
@@ -98,15 +98,15 @@ def moment_of(estimate: Estimate) -> Moment:
 
 
 class FailureRing:
-    """Frames of the last seconds, and what is cut out of them. For the thread that localizes; cuts are for any."""
+    """Frames of the last seconds, and cuts from them. For the localizing thread; cuts are for any thread."""
 
     def __init__(self) -> None:
         self._frames: deque[RingFrame] = deque()
         self._is_whole = True  # since the robot began
         self._commands, self._imu, self._wheel = Commands(), list[ImuSamples](), list[WheelSample]()
         self._used: UsedMap | None = None
-        self._cuts: list[FailureCut] = []  # that are not complete
-        self._held: FailureCut | None = None  # of what goes on and may become a failure
+        self._cuts: list[FailureCut] = []  # incomplete ones
+        self._held: FailureCut | None = None  # of an ongoing condition that may become a failure
         self._query: QueryInput | None = None  # of the last map query
         self._pictured_ns = -(2**62)
 
@@ -115,7 +115,7 @@ class FailureRing:
         self._used = self._commands.used = used
 
     def handle_samples(self, bundle: SensorBundle) -> None:
-        """What came with a bundle before its frame."""
+        """Add the samples of a bundle before its frame."""
         self._imu.append(bundle.imu)
         self._wheel.extend(bundle.wheel)
         self._commands.forgets |= bundle.forget
@@ -131,7 +131,7 @@ class FailureRing:
         start: Start | None,
         begun_ns: Mapping[FailureKind, int],
     ) -> None:
-        """Ends a frame. start: where a replay may begin behind it. begun_ns: since when what may become a failure goes on, by kind."""
+        """Finish a frame. start: state for a replay from the next frame. begun_ns: start of possible failures, by kind."""
         if percept.query is not None:
             if self._query is not None and self._query.features is not None:
                 self._query.features.frame = None  # nothing more is measured in it
@@ -154,7 +154,7 @@ class FailureRing:
             self._is_whole = False
 
     def cut(self, onset_ns: int) -> FailureCut:
-        """What was and will be kept around the onset of a failure."""
+        """Return the cut around the onset of a failure, with frames still to come."""
         held = self._held
         if held is not None and abs(held.onset_ns - onset_ns) <= _SAME_ONSET_NS:
             held.is_wanted = True
@@ -164,7 +164,7 @@ class FailureRing:
         return cut
 
     def finish(self) -> None:
-        """No frame follows: completes what waits."""
+        """Complete waiting cuts: no frame follows."""
         for cut in list(self._cuts):
             self._complete(cut)
 
@@ -178,7 +178,7 @@ class FailureRing:
             self._cuts.append(self._held)
 
     def _complete(self, cut: FailureCut) -> None:
-        """Gives a cut its frames; what still changes is copied."""
+        """Set the frames of a cut; copy data that still change."""
         self._cuts.remove(cut)
         frames = list(self._frames)
         begins = [number for number, frame in enumerate(frames) if frame.after is not None]

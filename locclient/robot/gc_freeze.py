@@ -1,4 +1,4 @@
-"""Garbage collection that leaves alone what was there before a drive."""
+"""Exemption of startup objects from garbage collection."""
 
 import gc
 from collections.abc import Iterator
@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 @contextmanager
 def gc_frozen() -> Iterator[None]:
-    """Exempts present objects from garbage collection while it lasts: libraries hold some hundred thousand that are never dropped,
-    and now and then a frame would have to wait until all of them were traversed."""
+    """Exempt existing objects from garbage collection: libraries hold several hundred thousand permanent objects, whose traversal
+    would delay a frame from time to time."""
     gc.collect()
     gc.freeze()
     try:

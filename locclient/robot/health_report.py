@@ -1,4 +1,4 @@
-"""Figures of a robot's health report, gathered frame by frame; how far it has driven without finding itself, and why. Pure."""
+"""Figures of a robot's health report, collected frame by frame; distance driven without localization, and its cause. Pure."""
 
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from locclient.localization.estimate import Estimate
 from locclient.robot.failure_monitor import failure_cause
 from locclient.robot.robot import Outcome
 
-_ENOUGH_M = 5.0  # of driving: tens of looks from places apart, any of which finds a robot that drives in its map
+_ENOUGH_M = 5.0  # of driving: tens of queries from different places, enough to localize a robot in its map
 _OFF_MAP_WORDS = "the map has no tile where the robot believes to be: is its prior right, and the map of this building?"
 _MAP_WORDS = (
     "nothing in the map agrees with the pictures: is it the map of this building, and is the calibration the camera's?"
@@ -29,9 +29,9 @@ _CAUSE_WORDS = {
 
 @dataclass
 class SearchWay:
-    """The way since a robot was last found, tracking or with a fix and a usable position, or since its start.
+    """Path since a robot was last localized, tracking or with a fix and a usable position, or since its start.
 
-    metres: by wheels or odometry; unknown_s: seconds of driving whose speed neither knows. seconds: all of its duration. was_found: ever.
+    metres: by wheels or odometry; unknown_s: seconds of driving at unknown speed. seconds: total duration. was_found: localized before.
     """
 
     metres: float = 0.0
@@ -44,9 +44,9 @@ class SearchWay:
     _last_ns: int | None = None
 
     def handle(self, estimate: Estimate, speed_mps: float | None, *, may_be_mapped: bool) -> None:
-        """Counts a frame, which speaks for the time since the one before unless that was a pause."""
+        """Count a frame, which represents the time since the previous one unless that was a pause."""
         dt_ns = 0 if self._last_ns is None else max(0, estimate.stamp_ns - self._last_ns)
-        dt_s = dt_ns * 1e-9 if dt_ns <= PAUSE_NS else 0.0  # no speed is that of a whole pause
+        dt_s = dt_ns * 1e-9 if dt_ns <= PAUSE_NS else 0.0  # a speed does not hold for a whole pause
         self._last_ns = estimate.stamp_ns
         self._frames += 1
         is_fixed = estimate.fix is not None and is_usable(estimate.status, radius_95_m(estimate.cov_rot_trans))
@@ -70,32 +70,32 @@ class SearchWay:
 
     @property
     def is_long(self) -> bool:
-        """True once a robot in its map would have found itself."""
+        """True once a robot in its map would have been localized."""
         return self.metres >= _ENOUGH_M or self.unknown_s >= FIND_DRIVING_S
 
     @property
     def is_off_map(self) -> bool:
-        """True if the robot knows that the map does not cover most of this way."""
+        """True if the robot knows that the map does not cover most of this path."""
         return bool(self._causes) and self._causes.most_common(1)[0][0] == _OFF_MAP_WORDS
 
     @property
     def is_lost_run(self) -> bool:
-        """True if a run that ends here did not find itself: not once, or no longer for more than half of its frames."""
+        """True if a run that ends here was not localized: never, or not any more for more than half of its frames."""
         is_most = self._lost_frames > self._frames / 2 and not self.is_off_map
         return self.is_long and (is_most or not self.was_found)
 
     @property
     def words(self) -> str:
-        """What a user should know, empty while the robot is found or has been until just now."""
+        """Return a text for users, empty while the robot is localized or was until recently."""
         way = f"{self.metres:.1f} m" + (
             f" and {self.unknown_s:.0f} s at an unknown speed" if self.unknown_s >= 1 else ""
         )
         if self.is_long:
-            return f"not localised over {way}: {self._causes.most_common(1)[0][0]}"
+            return f"not localized over {way}: {self._causes.most_common(1)[0][0]}"
         if self.was_found or not self._frames:
             return ""
         return (
-            f"no frame was localised, but {way} in {self.seconds:.1f} s are too short to say why: drive {_ENOUGH_M:g} m"
+            f"no frame was localized, but {way} in {self.seconds:.1f} s are too short to say why: drive {_ENOUGH_M:g} m"
         )
 
 
@@ -104,10 +104,10 @@ Figure = float | int | str | bool | None
 
 
 class FixFigures:
-    """Those of HEALTH_FIGURES that come from fixes, docks and odometry; the largest since the report before.
+    """Figures of HEALTH_FIGURES from fixes, docks and odometry; the largest since the last report.
 
-    Metres count only where the robot was TRACKING: one that says it is lost, and is found elsewhere, was not wrong. A claimed pose
-    that later fixes disproved beyond its covariance counts too.
+    Errors in metres count only while TRACKING: a robot that reports LOST and is found elsewhere was not wrong. A claimed pose
+    disproved by later fixes beyond its covariance counts as well.
     """
 
     def __init__(self) -> None:
@@ -129,7 +129,7 @@ class FixFigures:
             self._seen += estimate.fix.seen
 
     def take(self) -> dict[str, Figure]:
-        """The figures of a report; the largest values are reset."""
+        """Return the figures of a report, and reset the largest values."""
         figures: dict[str, Figure] = {
             name: self._largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")
         }
@@ -147,7 +147,7 @@ class FixFigures:
 
 
 class HealthFigures:
-    """Counts since the start, and the times of the last frames."""
+    """Counts since the start, and durations of the last frames."""
 
     def __init__(self) -> None:
         self._all_frames = self._frames = self._localised = self._failures = 0
@@ -177,7 +177,7 @@ class HealthFigures:
         self._failures += 1
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
-        """The message; more: figures of other parts. silent: whether the source has stopped sending frames."""
+        """Return the message; more: figures of other parts. silent: True if the source has stopped sending frames."""
         last = None if self.last is None else self.last.estimate
         flags: list[Flag | Cause] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {

@@ -1,4 +1,4 @@
-"""A robot's speed by wheels or odometry, and what disagrees: wheels and IMU with the images, estimates with docks. Pure."""
+"""Speed of a robot by wheels or odometry, and consistency checks: wheels and IMU with images, estimates with docks. Pure."""
 
 from collections.abc import Iterable, Sequence
 from math import dist, hypot
@@ -11,13 +11,13 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate
 
-_EXACT_M = 0.1  # sigma up to which a position prior is a dock's; three sigmas are the limit of a failure
-_LEFT_M = 1.0  # distance travelled after which the next report of a dock is another arrival
-_STALE_M = 0.05  # distance travelled between a dock's report and the frame beyond which the two cannot be compared
+_EXACT_M = 0.1  # maximum sigma of a dock's position prior; three sigmas are the limit of a failure
+_LEFT_M = 1.0  # distance travelled until the next report of a dock is a new arrival
+_STALE_M = 0.05  # maximum distance travelled between a dock's report and the compared frame
 
 
 class DockCheck:
-    """Compares the reports of docks with estimates that were TRACKING before; once for each arrival."""
+    """Compares dock reports with estimates that were already TRACKING; once for each arrival."""
 
     def __init__(self, base_from_body: Array) -> None:
         self._body_from_base = se3_inverse(base_from_body)
@@ -26,9 +26,9 @@ class DockCheck:
         self._path_m = np.inf
 
     def handle(self, priors: Iterable[PositionPrior], estimate: Estimate) -> float | None:
-        """Horizontal distance between the estimate of a frame and the dock among the priors that came with it.
+        """Return the horizontal distance between the estimate of a frame and the dock among its priors.
 
-        None without a dock, where the robot was not TRACKING, and for docks that repeat themselves while it stands.
+        None without a dock, if the robot was not TRACKING, and for repeated reports while it stands.
         """
         self._follow(estimate)
         was_tracking, self._was_tracking = self._was_tracking, estimate.status is Status.TRACKING
@@ -45,7 +45,7 @@ class DockCheck:
         return float(np.linalg.norm(map_from_base[:2, 3] - dock.map_from_base[:2, 3]))
 
     def _follow(self, estimate: Estimate) -> None:
-        """Counts the distance travelled, also where the odometry redefines its frame."""
+        """Count the distance travelled, also when the odometry redefines its frame."""
         now_m, change = estimate.odometry.odom_from_body[:3, 3], estimate.odometry.new_odom_from_old_odom
         if self._last_m is not None:
             last_m = self._last_m if change is None else change[:3, :3] @ self._last_m + change[:3, 3]
@@ -54,19 +54,19 @@ class DockCheck:
 
 
 def _is_exact(prior: PositionPrior) -> bool:
-    """Whether this is a dock's report, not a zone or an operator's estimate."""
+    """Return True for a dock's report, not a zone or an operator's estimate."""
     covariance = prior.cov_rot_trans[3:5, 3:5]
     return not prior.is_revisable and bool(
         np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[-1] <= _EXACT_M**2
     )
 
 
-_WHEEL_NS = 500_000_000  # age from which wheel odometry says nothing of the present
-_SPAN_NS = 500_000_000  # over which a camera's motion is measured: a millimetre of noise is 2 mm/s
+_WHEEL_NS = 500_000_000  # maximum age of wheel odometry
+_SPAN_NS = 500_000_000  # baseline for a camera's speed: a millimetre of noise is 2 mm/s
 
 
 class SpeedGauge:
-    """Follows one robot frame by frame."""
+    """Measures the speed of one robot frame by frame."""
 
     def __init__(self) -> None:
         self._wheel: WheelSample | None = None
@@ -74,10 +74,10 @@ class SpeedGauge:
         self._camera_mps: float | None = None
 
     def handle(self, wheel: Sequence[WheelSample], odometry: OdometryEstimate, odom_from_base: Array) -> float | None:
-        """Metres a second at a frame; None where neither wheels nor odometry know it.
+        """Return metres per second at a frame, by wheels or odometry; None if unknown.
 
-        wheel: since the frame before. odom_from_base (4, 4): in an odometry frame that is never redefined. Without an IMU the odometry
-        estimates no velocity, and the distance moved within half a second gives it.
+        wheel: since the previous frame. odom_from_base (4, 4): in an odometry frame that is never redefined. Without an IMU the odometry
+        estimates no velocity; the speed is then the distance moved within half a second.
         """
         self._wheel = wheel[-1] if wheel else self._wheel
         self._measure(odometry, odom_from_base)
@@ -88,7 +88,7 @@ class SpeedGauge:
         return hypot(*odometry.velocity_odom_mps) if odometry.inertial else self._camera_mps
 
     def _measure(self, odometry: OdometryEstimate, odom_from_base: Array) -> None:
-        """Distance over time between frames at least _SPAN_NS apart; unknown while the odometry does not hold."""
+        """Compute distance over time between frames at least _SPAN_NS apart; unknown while the odometry is lost."""
         if odometry.status is OdometryStatus.DEGRADED:
             self._from = self._camera_mps = None
             return
@@ -104,11 +104,11 @@ _ASK = "record a drive and ask `mapserver doctor`"
 WHEELS_REFUSED = {
     Flag.WHEELS_REFUSED: f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
 }
-"""Flag of RobotHealth with its words: the camera's motion contradicts the sensor, which is not used."""
+"""Flag of RobotHealth with its text: the camera's motion contradicts the sensor, which is not used."""
 
 
 def imu_refused(late_s: float | None) -> dict[Flag, str]:
-    """The flag of an IMU that is used no more, with its words. late_s: of its stamps by the images' turns, None if it is not that."""
+    """Return the flag of a disabled IMU, with its text. late_s: delay of its stamps by the images' rotation, None if not the cause."""
     words = f"it turns otherwise than the images; {_ASK} which axis is wrong"
     if late_s is not None:
         when = (
@@ -119,21 +119,21 @@ def imu_refused(late_s: float | None) -> dict[Flag, str]:
 
 
 def accelerometer_refused(fault: str) -> dict[Flag, str]:
-    """The flag of an accelerometer with such a fault, with its words; empty without one."""
+    """Return the flag of an accelerometer with this fault, with its text; empty without a fault."""
     words = f"the accelerometer is left out, the images contradict it: {fault}; mend its driver, or how the calibration mounts it"
     return {Flag.ACCELEROMETER_REFUSED: words} if fault else {}
 
 
-_OFF_SHARE, _OFF_MPS = 0.5, 0.3  # of the speed, and of slow ones: slip of a tyre is far less
-_LIMIT_M = 3.0  # of driving against the images: a spinning wheel or a person before the camera takes less
+_OFF_SHARE, _OFF_MPS = 0.5, 0.3  # relative, and absolute for low speeds: slip of a tyre is far less
+_LIMIT_M = 3.0  # of contradicting motion: a spinning wheel or a person in front of the camera takes less
 _FOLLOWED_SHARE = 0.5  # of the tracks
-_REST_SHARE = 0.2  # wheels that rest may be those of a robot that is carried: that counts for so much
+_REST_SHARE = 0.2  # weight of resting wheels, as the robot may be carried
 
 
 class WheelAgreement:
-    """Follows wheels and odometry frame by frame.
+    """Compares wheels and odometry frame by frame.
 
-    is_refused: they have contradicted each other for metres, and not agreed for as long since.
+    is_refused: they have contradicted each other for metres, and have not agreed for as long since.
     """
 
     def __init__(self, base_from_body: Array) -> None:
@@ -143,10 +143,10 @@ class WheelAgreement:
         self.is_refused = False
 
     def handle(self, wheel: Sequence[WheelSample], odometry: OdometryEstimate) -> None:
-        """A frame; wheel: the samples since the one before."""
+        """Add a frame; wheel: samples since the previous one."""
         last_ns, self._last_ns = self._last_ns, odometry.stamp_ns
         moved = odometry.previous_from_body
-        # Pictures too far apart to be followed say nothing: then it is the odometry that may be wrong.
+        # Frames too far apart for tracking are no evidence: the odometry itself may be wrong.
         is_followed = odometry.inlier_share >= _FOLLOWED_SHARE and not odometry.after_gap
         is_known = odometry.status is OdometryStatus.TRACKING and odometry.scale_known and is_followed
         if last_ns is None or not wheel or not is_known or moved is None:

@@ -35,10 +35,10 @@ Clock = Callable[[], float]  # seconds
 
 @dataclass(frozen=True, slots=True)
 class FailureContext:
-    """A failure with what its report shows: its onset, the evidence for its cause, and the version that ran.
+    """A failure with the data of its report: its onset, the evidence for its cause, and the running version.
 
-    unmatched: the onset of the search for itself that it belongs to, when the robot knew its place best; else that of the failure.
-    cut: what is kept of the seconds around its onset, None where nothing is.
+    unmatched: onset of the search for the pose during which it occurred, when the pose was last known; else that of the failure.
+    cut: recording of the seconds around its onset, None without one.
     """
 
     failure: Failure
@@ -53,9 +53,9 @@ class FailureContext:
 class Outcome:
     """Results of one frame.
 
-    cpu_s: from the images as they came to the estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
-    an arrival. speed_mps: by the wheels, else by the odometry, None where neither knows it. may_be_mapped: False where the robot is not
-    localised and the map has no tile near. left_out: flags of sensors that everything else contradicts, with words.
+    cpu_s: from received images to estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
+    an arrival. speed_mps: by the wheels, else by the odometry, None if unknown. may_be_mapped: False if the robot is not localized and
+    the map has no tile nearby. left_out: flags of disabled sensors, which contradict all others, with texts.
     """
 
     estimate: Estimate
@@ -69,7 +69,7 @@ class Outcome:
     left_out: Mapping[Flag, str] = field(default_factory=dict)
 
     def pose_message(self) -> PoseMessage | None:
-        """The pose for the server; None while there is no single one with a covariance."""
+        """Return the pose for the server; None while there is no single one with a covariance."""
         estimate, map_from_base, cov = self.estimate, self.published.map_from_base, self.published.cov_rot_trans
         if map_from_base is None or cov is None:
             return None
@@ -89,7 +89,7 @@ class Robot:
         *,
         keeps_replay: bool = False,
     ) -> None:
-        """clock_s measures CPU; the default measures nothing. keeps_replay: whether the seconds around a failure are kept."""
+        """clock_s: measures CPU time; the default measures nothing. keeps_replay: record the seconds around a failure."""
         self._rectifier, self._clock_s = rectifier, clock_s
         self.base_from_body = calibration.base_from_body
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
@@ -110,7 +110,7 @@ class Robot:
 
     @property
     def held(self) -> list[LoadedMap]:
-        """The versions in memory, the confirmed one first."""
+        """Return the versions in memory, the confirmed one first."""
         return self._versions.held
 
     @property
@@ -118,21 +118,21 @@ class Robot:
         return self._versions.running
 
     def take_changes(self) -> list[VersionChange]:
-        """Changes of versions since the last call."""
+        """Return changes of versions since the last call."""
         taken, self._versions.changes = self._versions.changes, []
         return taken
 
     def use(self, loaded: LoadedMap) -> None:
-        """Takes other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
+        """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
         self._versions.use(loaded)
 
     def align(self, frame: BuildingFrame | None) -> None:
-        """Where the site's map lies in its building, whatever versions say of it; None: each version says it."""
+        """Set the pose of the site's map in its building, which overrides that of versions; None: each version defines it."""
         self._aligned = frame
         self._place_in_building()
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
-        """Results of a bundle with a frame; None without one. RecordingError for images that cannot be read."""
+        """Return results of a bundle with a frame; None without one. RecordingError for unreadable images."""
         self.localizer.handle_imu(bundle.imu)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
@@ -178,7 +178,7 @@ class Robot:
         return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
-        """The failure of a source that has sent no frame for so long."""
+        """Return the failure of a source without frames for so many seconds."""
         failure = self.monitor.handle_silence(for_s)
         context = None if failure is None else self._context(failure, None)
         if context is not None and self.ring is not None:
@@ -193,7 +193,7 @@ class Robot:
         return may_be_mapped(x_m, y_m, radius_95_m(estimate.cov_rot_trans), cells, manifest.tile_size_m)
 
     def _context(self, failure: Failure, odom_from_body: Array | None) -> FailureContext:
-        """odom_from_body: of the frame with which it was detected, None where none came."""
+        """Return the context of a failure. odom_from_body: of the frame of its detection, None without one."""
         assert self._last is not None
         frame, began_ns = self._last[0], failure.stamp_ns
         evidence = Evidence()

@@ -16,7 +16,7 @@ _DRIFT_SHARE = 0.02  # of the distance travelled, several times the odometry's d
 
 
 class TrialSettings(Section, frozen=True):
-    """Limits at which a new version is confirmed or given up."""
+    """Limits for the confirmation or rejection of a new version."""
 
     confirming_fixes: int = 5
     contradicting_looks: int = 2
@@ -35,7 +35,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VersionChange:
-    """A version that was adopted, refused for good, or postponed because nothing could be seen; reason in words."""
+    """A version that was adopted, refused for good, or postponed because of unusable images; reason: text."""
 
     wanted: WantedVersion
     change: Change
@@ -51,11 +51,11 @@ class TrialVerdict(StrEnum):
 
 
 class VersionTrial:
-    """Counts the fixes of one version, from the first frame that is compared with it.
+    """Counts the fixes of one version, from the first frame compared with it.
 
-    A fix confirms the version where the robot tracks and is where the version before and the odometry since predict. A refused fix
-    contradicts it; so does a pose somewhere else, which ends the trial at once, before the localizer could conclude that the robot
-    was carried there. Time in which nothing can be seen counts against no version: the caller then tries the other one.
+    A fix confirms the version if the robot tracks and is at the pose predicted by the previous version and odometry. A refused fix
+    contradicts it; so does a pose elsewhere, which ends the trial at once, before the localizer could conclude that the robot was
+    carried. Time without usable images counts against no version: the caller then tries the other one.
     """
 
     def __init__(self, settings: TrialSettings, begun: Estimate) -> None:
@@ -69,7 +69,7 @@ class VersionTrial:
         self.reason = "no frame was compared with it"
 
     def handle(self, estimate: Estimate) -> TrialVerdict:
-        """The verdict with this frame; `reason` tells why, in words."""
+        """Return the verdict with this frame; `reason` has its text."""
         off_m = self._off_m(estimate)
         limit_m = self._settings.agreement_m + _DRIFT_SHARE * self._path_m
         age_s = (estimate.stamp_ns - self._begun_ns) * 1e-9
@@ -88,7 +88,7 @@ class VersionTrial:
         return TrialVerdict.FAILED if age_s > self._settings.patience_s else TrialVerdict.UNDECIDED
 
     def _off_m(self, estimate: Estimate) -> float:
-        """Distance from the initial pose as propagated by odometry; 0 where either is unknown."""
+        """Return the distance from the initial pose as propagated by odometry; 0 if either is unknown."""
         odometry = estimate.odometry
         if odometry.new_odom_from_old_odom is not None:
             change = odometry.new_odom_from_old_odom
@@ -106,8 +106,8 @@ class VersionTrial:
 class VersionTrials:
     """Two versions while one of them is on trial.
 
-    good: the version whose fixes were confirmed; candidate: the one on trial. Where the candidate fails, the good version is tried again at
-    the same place: the candidate is refused where that gives fixes, else postponed, because nothing could be seen.
+    good: the confirmed version; candidate: the one on trial. If the candidate fails, the good version is tried again at the same
+    place: the candidate is refused if that gives fixes, else postponed.
     """
 
     def __init__(self, settings: TrialSettings, show: Callable[[LoadedMap], None]) -> None:
@@ -129,7 +129,7 @@ class VersionTrials:
         return self._good if self._candidate is None or self._failed_reason is not None else self._candidate
 
     def use(self, loaded: LoadedMap) -> None:
-        """Takes other tiles of a held version, or a new version."""
+        """Use other tiles of a held version, or a new version."""
         if self._good is not None and self._good.wanted == loaded.wanted:
             self._good = loaded
         elif self._candidate is not None and self._candidate.wanted == loaded.wanted:
@@ -146,7 +146,7 @@ class VersionTrials:
             self._show(loaded)
 
     def handle(self, estimate: Estimate) -> None:
-        """Counts a frame for the trial, if there is one."""
+        """Count a frame for the trial, if there is one."""
         self._last = estimate
         if self._candidate is None or self._good is None:
             return
@@ -175,5 +175,5 @@ class VersionTrials:
         self._candidate = self._trial = self._failed_reason = None
 
     def _begin_trial(self) -> None:
-        """At the last frame of the version before; without one, at the next frame."""
+        """Begin the trial at the last frame of the previous version; without one, at the next frame."""
         self._trial = None if self._last is None else VersionTrial(self._settings, self._last)

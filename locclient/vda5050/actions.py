@@ -1,4 +1,4 @@
-"""Instant actions that concern maps and position: their parameters, their states, and the errors that they leave."""
+"""Instant actions on maps and position: their parameters, states and errors."""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ PARAMETERS: Mapping[str, Mapping[str, str]] = {
     "factsheetRequest": {},
     "clearInstantActions": {},
 }
-"""By action, its parameters and their types; `?`: may be left out."""
+"""Parameters and their types by action; `?`: optional."""
 MAP_ACTIONS = ("downloadMap", "enableMap", "deleteMap")
 OVER = ("FINISHED", "FAILED")
 _MOST_STATES = 200
@@ -24,7 +24,7 @@ _MOST_SIGNS = 2000
 
 
 def parameters(action: Action) -> dict[str, Any]:
-    """The action's parameters by name; LinkError for missing, unknown or impossible ones."""
+    """Return the action's parameters by name; LinkError for missing, unknown or invalid ones."""
     kinds = PARAMETERS[action.action_type]
     given = {parameter.key: parameter.value for parameter in action.action_parameters}
     for key in given:
@@ -47,7 +47,7 @@ def _fits(value: object, kind: str) -> bool:
 
 
 class ActionBook:
-    """States of the instant actions that came, and errors by what ends them. For one thread at a time."""
+    """States of received instant actions, and errors by their end condition. For one thread at a time."""
 
     def __init__(self) -> None:
         self._states: dict[str, ActionState] = {}
@@ -57,7 +57,7 @@ class ActionBook:
         return action_id in self._states
 
     def set(self, action: Action, status: str, result: str = "") -> None:
-        """The state of an action; those that are over longest are forgotten where there are too many."""
+        """Set the state of an action; above the maximum number, drop those that finished first."""
         self._states[action.action_id] = ActionState(
             action_id=action.action_id,
             action_type=action.action_type,
@@ -73,7 +73,7 @@ class ActionBook:
         self._states = {key: state for key, state in self._states.items() if state.action_status not in OVER}
 
     def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
-        """The action has failed, and the error says why until another action of its kind is accepted."""
+        """Mark the action as failed, with an error until another action of its kind is accepted."""
         self.set(action, "FAILED", words)
         shown = {"actionId": action.action_id} | {
             parameter.key: str(parameter.value)[:_MOST_SIGNS] for parameter in action.action_parameters[:20]
@@ -82,7 +82,7 @@ class ActionBook:
         self.add_error(topic, error_type, words, shown, level)
 
     def accepted(self, action: Action) -> None:
-        """Ends the errors that last until an action of this kind is accepted."""
+        """End errors that last until an action of this kind is accepted."""
         self.end("instant")
         if action.action_type in MAP_ACTIONS:
             self.end("map")
@@ -90,7 +90,7 @@ class ActionBook:
     def add_error(
         self, until: str, error_type: str, words: str, references: Mapping[str, str], level: str = "WARNING"
     ) -> None:
-        """An error that stands until `end(until)`, at most as many as actions."""
+        """Add an error that lasts until `end(until)`; at most as many as actions."""
         error = Error(
             error_type=error_type,
             error_level=level,  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The adapter: instant actions and the robot's own part in, the state out. Knows no MQTT; may be called from any thread."""
+"""VDA 5050 adapter: instant actions and the robot program's part of the state in, the state out. Without MQTT; thread-safe."""
 
 import threading
 import time
@@ -24,16 +24,16 @@ from locclient.vda5050.messages import Action, Error, InstantActions, Order, Rob
 from locclient.vda5050.settings import Vda5050Section
 
 _MOST_JOBS = 16
-_ENABLE_S = 120.0  # for the trial of a version, and for the trial of the one before that follows where it fails
-_TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a floor, which is all that x, y and theta say about it
-_SIGMAS = 3.7  # as far from where the fleet manager put it a robot still agrees
+_ENABLE_S = 120.0  # for the trial of a version, and that of the previous one after a failure
+_TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a flat floor, as x, y and theta define neither
+_SIGMAS = 3.7  # maximum distance from the fleet manager's pose for agreement
 _ERRORS = {DuplicateMapError: ("DUPLICATE_MAP", "WARNING"), NoRoomError: ("INSUFFICIENT_MEMORY", "URGENT")}
 _UNKNOWN: dict[str, Any] = {
     "operatingMode": "STARTUP",
     "powerSupply": {"stateOfCharge": 0.0, "charging": False},
     "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": True},
 }
-"""While the robot's own program has said nothing: in STARTUP the standard lets values be incomplete or invalid."""
+"""State before the first message of the robot's own program: the standard allows incomplete or invalid values in STARTUP."""
 _EMPTY: dict[str, Any] = {
     **{"orderId": "", "orderUpdateId": 0, "lastNodeId": "", "lastNodeSequenceId": 0},
     **{"nodeStates": [], "edgeStates": [], "actionStates": []},
@@ -41,9 +41,9 @@ _EMPTY: dict[str, Any] = {
 
 
 class FleetAdapter:
-    """Takes what comes from the fleet manager, the robot's program and the localizer, works at maps in `work`, and says what the state is.
+    """Handles input of fleet manager, robot program and localizer, executes map actions in `work`, and returns the state.
 
-    changed: set whenever a new state should leave at once. factsheet_wanted: set when somebody asks for it.
+    changed: set whenever a new state should be sent at once. factsheet_wanted: set when it is requested.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class FleetAdapter:
         lost_radius_m: float,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """maps: None where the map server chooses the version. offer: gives a version to the localizer; put_prior: a pose.
+        """maps: None if the map server selects the version. offer: passes a version to the localizer; put_prior: a pose.
 
-        active: the version that the robot has whole, from the thread that calls `work`. lost_radius_m: of 95 %, beyond which it is LOST.
+        active: returns the robot's complete version, on the thread that calls `work`. lost_radius_m: 95 % radius beyond which it is LOST.
         """
         self._section, self._maps, self._clock_s = section, maps, clock_s
         self._active, self._offer, self._put_prior = active, offer, put_prior
@@ -73,22 +73,22 @@ class FleetAdapter:
         # Actions that wait for the localizer, and until when.
         self._enabling: tuple[Action, WantedVersion, float] | None = None
         self._placing: tuple[Action, Position, float] | None = None
-        # What the robot's own program has said last, and when; the node by initializePosition, and what the program said then.
+        # Last part of the state by the robot's program, and its time; the node by initializePosition, and the program's node then.
         self._part: RobotPart | None = None
         self._part_s = 0.0
         self._last_node: tuple[str, str] | None = None
         self._localization = Localization()
-        self._untold: Localization | None = None  # a loss that no state has told yet, however short it was
+        self._untold: Localization | None = None  # a loss not yet reported in a state, even if already over
         self._last_said: object = None
         self._versions: list[tuple[int, bool]] = []
         self._in_use: frozenset[int] = frozenset()
-        # None while the map does not say where it lies in the frame that the fleet manager speaks.
+        # None while the map does not define its pose in the fleet manager's frame.
         self._fleet_from_map = np.eye(4) if section.frame == "map" else None
 
     # --- from the fleet manager ---------------------------------------------------------------------------------------
 
     def instant_actions(self, payload: bytes) -> None:
-        """Topic instantActions."""
+        """Handle a message of the topic instantActions."""
         with self._lock:
             try:
                 message = decode(payload, InstantActions)
@@ -101,7 +101,7 @@ class FleetAdapter:
             self.changed.set()
 
     def order(self, payload: bytes) -> None:
-        """Topic order: only whether its maps are known. The robot's own program executes it, and says what is wrong with it otherwise."""
+        """Handle a message of the topic order: check only that its maps are known. The robot's program executes it and reports errors."""
         with self._lock:
             try:
                 message = decode(payload, Order)
@@ -117,7 +117,7 @@ class FleetAdapter:
             self.changed.set()
 
     def robot_part(self, payload: bytes) -> None:
-        """The robot's own part of the state; one that cannot be passed on is refused, with an error, and the last one stands."""
+        """Handle the robot program's part of the state; an invalid one is refused with an error, and the last one stays."""
         with self._lock:
             self._book.end("robot")
             try:
@@ -157,7 +157,7 @@ class FleetAdapter:
 
     def _queue(self, action: Action, given: dict[str, Any]) -> None:
         if self._maps is None:
-            words = 'the map server chooses this robot\'s map: [vda5050] versions = "map server"'
+            words = 'the map server selects this robot\'s map: [vda5050] versions = "map server"'
             return self._book.fail(action, "MAP_ACTION_FAILED", words)
         if given["mapId"] != self.map_id or not (given["mapVersion"].isascii() and given["mapVersion"].isdecimal()):
             words = f"map {given['mapId'][:80]!r} version {given['mapVersion'][:80]!r}: this robot's are {self.map_id!r} 1, 2, 3..."
@@ -171,7 +171,7 @@ class FleetAdapter:
         return None
 
     def work(self) -> None:
-        """One action on maps, which may take as long as a download; from the thread that owns the cache."""
+        """Execute one action on maps, which may take as long as a download; on the thread that owns the cache."""
         maps = self._maps
         active = self._active()
         versions = [] if active is None or active.version is None else [(active.version, True)]
@@ -213,7 +213,7 @@ class FleetAdapter:
         return None
 
     def changed_version(self, change: VersionChange) -> None:
-        """A version was adopted, refused or postponed by the localizer, and the disk knows; from the thread of `work`."""
+        """Handle a version that the localizer adopted, refused or postponed, after the change on the disk; on the thread of `work`."""
         with self._lock:
             enabling = self._enabling
             if enabling is None or enabling[1].manifest_sha256 != change.wanted.manifest_sha256:
@@ -224,14 +224,14 @@ class FleetAdapter:
             if change.change is Change.ADOPTED:
                 self._book.set(enabling[0], "FINISHED")
             else:
-                self._book.fail(enabling[0], "MAP_ACTION_FAILED", f"the robot did not take it: {change.reason}")
+                self._book.fail(enabling[0], "MAP_ACTION_FAILED", f"the robot did not adopt it: {change.reason}")
             self.changed.set()
 
     def _end_enabling(self) -> None:
         enabling = self._enabling
         if enabling is not None and self._clock_s() > enabling[2]:
             self._enabling = None
-            words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; does it see anything?"
+            words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; check its cameras"
             self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
             self.changed.set()
 
@@ -248,15 +248,15 @@ class FleetAdapter:
         elif now.stamp_ns is None or now.is_silent:
             words = "no images come from the cameras"
         elif fleet_from_map is None:
-            words = "the map does not say where it lies in the building, in which [vda5050] frame puts positions"
+            words = "the map does not define its pose in the building, the frame of positions by [vda5050] frame"
         if now.stamp_ns is None or fleet_from_map is None or words:
             return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
         if self._placing is not None:
-            self._book.set(self._placing[0], "FAILED", "another initializePosition came")
+            self._book.set(self._placing[0], "FAILED", "replaced by another initializePosition")
         place = Position(float(given["x"]), float(given["y"]), float(given["theta"]))
         self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
-        if now.status == Status.TRACKING:  # a pose that fixes confirm is not given up for what somebody says
+        if now.status == Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
             return self._judge_position(is_last=True)
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
@@ -265,7 +265,7 @@ class FleetAdapter:
         return None
 
     def after_frame(self, outcome: Outcome, in_use: frozenset[int]) -> None:
-        """The results of a frame, and the versions that the localizer holds; from the thread that localizes."""
+        """Handle the results of a frame, and the versions that the localizer holds; on the localizing thread."""
         with self._lock:
             self._in_use = in_use
             if self._section.frame == "building":
@@ -275,7 +275,7 @@ class FleetAdapter:
             self._judge_position()
 
     def silence(self) -> None:
-        """No frames come."""
+        """Handle missing frames."""
         with self._lock:
             self._see(replace(self._localization, is_silent=True))
             self._judge_position()
@@ -290,12 +290,12 @@ class FleetAdapter:
             self.changed.set()
 
     def _judge_position(self, *, is_last: bool = False) -> None:
-        """Whether the robot has come to be where it was put; is_last: there is no time left for it."""
+        """Check that the robot is localized at its initial pose; is_last: the time for it is over."""
         pending, now = self._placing, self._localization
         if pending is None:
             return
         action, wanted, until_s = pending
-        section, words = self._section, "the robot is not localized there; is it there?"
+        section, words = self._section, "the robot is not localized there; check its pose"
         if now.is_localized and not now.is_silent and now.position is not None:
             off_m, off_rad = now.position.away_from(wanted)
             reach_m = _SIGMAS * section.initial_sigma_m + now.position.radius_m
@@ -305,7 +305,7 @@ class FleetAdapter:
                 self._placing = None
                 self._book.set(action, "FINISHED")
                 return self.changed.set()
-            words = f"what the robot sees puts it {off_m:.2f} m and {off_rad:.2f} rad from there"
+            words = f"the robot is localized {off_m:.2f} m and {off_rad:.2f} rad from there"
         if is_last or self._clock_s() > until_s:
             self._placing = None
             self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
@@ -315,7 +315,7 @@ class FleetAdapter:
     # --- the state ----------------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """The state without its header."""
+        """Return the state without its header."""
         with self._lock:
             now = self._untold or self._localization
             if self._untold is not None:
@@ -342,7 +342,7 @@ class FleetAdapter:
         if self._part is not None and age_s <= self._section.robot_silent_s:
             own: dict[str, Any] = to_plain(self._part)
             return own
-        since = "has said nothing yet" if self._part is None else f"has said nothing for {age_s:.0f} s"
+        since = "has reported nothing yet" if self._part is None else f"has reported nothing for {age_s:.0f} s"
         missing = Error(
             error_type="ROBOT_PART_MISSING",
             error_level="CRITICAL",

@@ -1,4 +1,4 @@
-"""The factsheet: the manufacturer's file, completed by what the localization can do."""
+"""Factsheet: the manufacturer's file, completed by the capabilities of the localization."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,9 +70,9 @@ class _Factsheet(_Camel):
 
 
 def read_factsheet(path: Path) -> dict[str, Any]:
-    """The content of a factsheet without its header; the file's own actions and types of localization stay beside ours.
+    """Return the content of a factsheet without its header; the file's actions and localization types are kept beside ours.
 
-    Raises UsageError where the file cannot be read, or lacks what the standard requires at its upper levels.
+    Raises UsageError if the file cannot be read, or lacks required objects of the standard at its upper levels.
     """
     with disk_errors(f"[vda5050] factsheet {path} cannot be read", "check the path", UsageError):
         data = path.read_bytes()[: MAX_PAYLOAD_BYTES + 1]

@@ -1,4 +1,4 @@
-"""Versions that a fleet manager had the robot download. All of them stay on the disk until it deletes them."""
+"""Versions downloaded for a fleet manager. All of them stay on the disk until it deletes them."""
 
 import logging
 import tempfile
@@ -12,7 +12,7 @@ from fleetmap.messages import WantedVersion
 from locclient.maps.tile_cache import ActiveVersion, TileCache
 from locclient.maps.version_download import Origins, TooLargeError, download
 
-_TOGETHER = 2  # a file, and the blobs that are taken out of it
+_TOGETHER = 2  # space for a file, and for its extracted blobs
 _log = logging.getLogger(__name__)
 
 
@@ -21,11 +21,11 @@ class NoRoomError(StoreError):
 
 
 class DuplicateMapError(StateError):
-    """A version that is on the robot already."""
+    """A version that the robot already has."""
 
 
 class FleetMaps:
-    """For the thread that owns the cache. check_admitted: raises UntrustedError for what the site's signed list does not admit."""
+    """For the thread that owns the cache. check_admitted: raises UntrustedError for versions outside the site's signed list."""
 
     def __init__(
         self,
@@ -35,7 +35,7 @@ class FleetMaps:
         origins: Origins,
         check_admitted: Callable[[WantedVersion], None],
     ) -> None:
-        """folder: for files on their way. Raises UsageError for origins that are none. A disk that refuses now refuses downloads later."""
+        """folder: for files during download. Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
         origins.check()
         self._cache, self._site, self._folder, self._origins = cache, site, folder, origins
         self._check_admitted = check_admitted
@@ -51,14 +51,14 @@ class FleetMaps:
             _log.warning("maps of the fleet manager cannot be downloaded: %s", error)
 
     def versions(self) -> list[tuple[int, bool]]:
-        """The versions on the disk, oldest first, and which of them is enabled."""
+        """Return the versions on the disk, oldest first, each with True if enabled."""
         active = self._cache.active(self._site)
         return [(record.version, record == active) for record in self._cache.kept(self._site)]
 
     def download(self, version: int, link: str, sha256: str | None) -> None:
-        """Fetches a version's file, checks it by the signed list, and keeps the version. No other version is touched.
+        """Fetch a version's file, check it by the signed list, and keep the version. Other versions are not affected.
 
-        sha256: of the file, None where nobody told it.
+        sha256: of the file, None if unknown.
 
         Raises DuplicateMapError, NoRoomError, LinkError, UntrustedError, MapFormatError, StoreError.
         """
@@ -105,13 +105,13 @@ class FleetMaps:
         self._cache.keep(self._site, version, [head.blobs[0].sha256, *words, *(tile.sha256 for tile in manifest.tiles)])
 
     def wanted(self, version: int) -> WantedVersion:
-        """A version that may be run now; StateError for one that is not on the disk, UntrustedError for one that was withdrawn."""
+        """Return a version for use now; StateError if it is not on the disk, UntrustedError if it was withdrawn."""
         wanted = self._get(version).wanted(self._site)
         self._check_admitted(wanted)
         return wanted
 
     def delete(self, version: int, in_use: set[int]) -> None:
-        """Removes a version; StateError where it is enabled, in use or not there."""
+        """Remove a version; StateError if it is enabled, in use or absent."""
         record = self._get(version)
         if version in in_use or record == self._cache.active(self._site):
             raise StateError(f"version {version} is in use; enable another one first")

@@ -1,4 +1,4 @@
-"""What VDA 5050 says of a robot's localization, from its estimates: the position and LOCALIZATION_ERROR. Pure."""
+"""Localization in VDA 5050 terms, from a robot's estimates: position and LOCALIZATION_ERROR. Pure."""
 
 from dataclasses import dataclass
 from math import atan2, hypot, pi
@@ -9,29 +9,29 @@ from fleetmap.messages import Cause, Status
 from locclient.robot.robot import Outcome
 from locclient.vda5050.messages import Error
 
-_NO_FRAMES = "no images come from the cameras; look at them and their cables"
+_NO_FRAMES = "no images come from the cameras; check them and their cables"
 _NO_MAP = "the robot has no map; download and enable one"
-_NO_BUILDING = "the map does not say where it lies in the building; align the site and build a version, or set [vda5050] frame to map"
+_NO_BUILDING = "the map does not define its pose in the building; align the site and build a version, or set [vda5050] frame to map"
 _WORDS = {
     Cause.DARK: "the images are dark: lights out, or a covered lens",
     Cause.GLARE: "the images are overexposed",
     Cause.FROZEN: "a camera repeats its last image",
     Cause.BLURRED: "the images are blurred; clean the lenses",
-    Cause.OCCLUDED: "something stands close before the cameras",
-    Cause.ODOMETRY: "the odometry has lost its hold",
-    Cause.UNMATCHED: "nothing in the map agrees with what is seen: changed, not mapped, or seen from another side only",
-    Cause.CALIBRATION: "what is seen contradicts the map as only a wrong calibration does; check the cameras' mounting",
+    Cause.OCCLUDED: "an object is close in front of the cameras",
+    Cause.ODOMETRY: "the odometry is lost",
+    Cause.UNMATCHED: "nothing in the map matches the images: changed, not mapped, or mapped from another side only",
+    Cause.CALIBRATION: "images contradict the map as only a wrong calibration does; check the cameras' mounting",
 }
 _STATUS_WORDS = {
-    Status.AMBIGUOUS: "several places agree with what is seen; drive on, or send initializePosition",
-    Status.INITIALISING: "the robot has not found itself yet; drive on, or send initializePosition",
-    Status.LOST: "the robot has lost itself; drive on, or send initializePosition",
+    Status.AMBIGUOUS: "several places match the images; drive on, or send initializePosition",
+    Status.INITIALISING: "the robot is not localized yet; drive on, or send initializePosition",
+    Status.LOST: "the robot has lost its pose; drive on, or send initializePosition",
 }
 
 
 @dataclass(frozen=True)
 class Position:
-    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite where the robot is not localized."""
+    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized."""
 
     x_m: float
     y_m: float
@@ -39,14 +39,14 @@ class Position:
     radius_m: float = float("inf")
 
     def away_from(self, other: "Position") -> tuple[float, float]:
-        """Metres, and radians from 0 to pi."""
+        """Return the distance in metres, and the angle in radians from 0 to pi."""
         turn = abs(self.theta_rad - other.theta_rad) % (2 * pi)
         return hypot(self.x_m - other.x_m, self.y_m - other.y_m), min(turn, 2 * pi - turn)
 
 
 @dataclass(frozen=True)
 class Localization:
-    """The last estimate. position: also of a robot that is not localized, the last one that it knew; None before the first."""
+    """The last estimate. position: the last known one, also if the robot is not localized; None before the first."""
 
     status: str = Status.INITIALISING
     cause: str = ""
@@ -61,9 +61,9 @@ class Localization:
     def after(
         self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None, *, is_driving: bool
     ) -> "Localization":
-        """With the results of one frame. Beyond lost_radius_m (95 %) nobody can drive by a position, whatever the status.
+        """Update by the results of one frame. Beyond lost_radius_m (95 %) a position is unusable for driving at any status.
 
-        fleet_from_map: None where the map does not know the fleet manager's frame, in which nothing can be said then.
+        fleet_from_map: None if the map does not define the fleet manager's frame; there is then no position.
         """
         estimate, published = outcome.estimate, outcome.published
         position, is_localized = self.position, False
@@ -86,7 +86,7 @@ class Localization:
         )
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
-        """The object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m."""
+        """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m."""
         place, is_localized = self.position, self.is_localized and not self.is_silent
         if place is None:
             return None
@@ -98,7 +98,7 @@ class Localization:
         return found
 
     def error(self) -> Error | None:
-        """LOCALIZATION_ERROR with its cause in words; None for a robot that is localized."""
+        """Return LOCALIZATION_ERROR with the text of its cause; None for a localized robot."""
         if self.is_localized and not self.is_silent:
             return None
         hint = _WORDS.get(Cause(self.cause)) if self.cause in set(Cause) else self.cause
@@ -109,7 +109,7 @@ class Localization:
         elif not self.is_aligned:
             hint = _NO_BUILDING
         elif not hint:
-            hint = _STATUS_WORDS.get(Status(self.status), "the robot has no pose that can be relied upon")
+            hint = _STATUS_WORDS.get(Status(self.status), "the robot has no reliable pose")
         said = "no images" if self.is_silent else self.status
         return Error(
             error_type="LOCALIZATION_ERROR",

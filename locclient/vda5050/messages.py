@@ -1,6 +1,6 @@
-"""Messages of VDA 5050 3.0.0 as they come, and the robot's own part of the state. Names are those of the standard.
+"""Received messages of VDA 5050 3.0.0, and the robot program's part of the state. Names are those of the standard.
 
-What is taken over into a message that leaves is decoded strictly, so that it cannot make that message invalid.
+Objects copied into sent messages are decoded strictly, so that they cannot make a message invalid.
 """
 
 from datetime import UTC, datetime
@@ -24,11 +24,11 @@ Angle = Annotated[float, msgspec.Meta(ge=-3.14159265359, le=3.14159265359)]
 
 
 class Struct(msgspec.Struct, rename="camel", omit_defaults=True, kw_only=True):
-    """An object of the standard; what it does not know of one is ignored."""
+    """An object of the standard; unknown fields are ignored."""
 
 
 class Strict(Struct, forbid_unknown_fields=True):
-    """An object that is passed on."""
+    """An object that is copied into sent messages."""
 
 
 class ActionParameter(Struct):
@@ -162,7 +162,7 @@ class RobotPart(Strict):
 
 
 def decode(payload: bytes, kind: type[T]) -> T:
-    """The message in a payload; LinkError for anything else."""
+    """Decode the message of a payload; LinkError if invalid."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise LinkError(f"{len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}")
     try:
@@ -172,6 +172,6 @@ def decode(payload: bytes, kind: type[T]) -> T:
 
 
 def timestamp(wall_ns: int) -> str:
-    """A moment as the standard writes it."""
+    """Format a time as the standard requires."""
     moment = datetime.fromtimestamp(wall_ns // 1_000_000 / 1000, UTC)
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"

@@ -1,4 +1,4 @@
-"""The adapter's connection to the broker, MQTT 5 by paho-mqtt: topics, headers, last will, states at their time."""
+"""Connection of the adapter to the broker, MQTT 5 by paho-mqtt: topics, headers, last will, timing of states."""
 
 import logging
 import ssl
@@ -25,12 +25,12 @@ _log = logging.getLogger(__name__)
 
 
 class MqttLink:
-    """Connects in the background, again and again; what cannot be sent now is not sent later, because the next state replaces it."""
+    """Connects and reconnects in the background. A message that cannot be sent is dropped, because the next state replaces it."""
 
     def __init__(
         self, broker: Broker, section: Vda5050Section, adapter: FleetAdapter, factsheet: dict[str, Any] | None
     ) -> None:
-        """Raises UsageError where paho-mqtt is missing, or the broker's authorities cannot be read."""
+        """Raises UsageError if paho-mqtt is missing, or the broker's authorities cannot be read."""
         self.adapter, self._broker, self._section, self._factsheet = adapter, broker, section, factsheet
         self._prefix = f"{section.interface}/{MAJOR}/{section.manufacturer}/{section.serial_number}"
         self._sent: Counter[str] = Counter()
@@ -49,7 +49,7 @@ class MqttLink:
         self._thread.start()
 
     def stop(self) -> None:
-        """Says OFFLINE, where anybody hears it, and ends the connection."""
+        """Publish OFFLINE, if connected, and disconnect."""
         self._stop.set()
         self.adapter.changed.set()
         self._thread.join(_GOODBYE_S)
@@ -69,7 +69,7 @@ class MqttLink:
             ) from error
         name = f"{self._section.manufacturer}-{self._section.serial_number}"
         client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, protocol=mqtt.MQTTv5)
-        client.suppress_exceptions = True  # they would end paho's thread; its logger has them
+        client.suppress_exceptions = True  # exceptions would end paho's thread; its logger has them
         client.enable_logger(_log)
         client.reconnect_delay_set(1, 30)
         if self._broker.username is not None:
@@ -111,7 +111,7 @@ class MqttLink:
 
     def _on_message(self, _: object, __: object, message: Any) -> None:
         handle = self._heard.get(message.topic.rpartition("/")[2])
-        if handle is not None and not message.retain:  # what was retained may be of another day
+        if handle is not None and not message.retain:  # retained messages may be outdated
             handle(message.payload)
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""Settings of the connection to a fleet manager, and of what is said there of the robot."""
+"""Settings of the connection to a fleet manager, and of the reported state."""
 
 import re
 from pathlib import Path
@@ -12,11 +12,11 @@ from locclient.maps.version_download import Origins
 _LEVEL = re.compile(r"[^/+#\0]{1,128}")
 _BROKER = re.compile(r"(mqtts?)://([^/:@\s]+|\[[0-9a-fA-F:]+\])(?::(\d{1,5}))?/?")
 _MAX_SECRET_BYTES = 4096
-_LEAST_SIGMA_M = 0.15  # up to 0.1 a prior is a dock's, against which estimates are checked
+_LEAST_SIGMA_M = 0.15  # priors up to 0.1 count as a dock's, against which estimates are checked
 
 
 class Vda5050Section(Section, frozen=True):
-    """The broker, the robot's name there, and who chooses its map. Without a broker nothing is said."""
+    """Broker, name of the robot there, and selection of its map. Without a broker nothing is reported."""
 
     broker: str | None = None
     manufacturer: str = ""
@@ -41,7 +41,7 @@ class Vda5050Section(Section, frozen=True):
 
 
 class Broker(NamedTuple):
-    """Where to connect. ca: file of the authorities, None for the machine's."""
+    """Address of the broker. ca: file of the authorities, None for the machine's."""
 
     host: str
     port: int
@@ -52,7 +52,7 @@ class Broker(NamedTuple):
 
 
 def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
-    """Where the section leads; UsageError for what is missing or cannot be right."""
+    """Return the broker of the section; UsageError for missing or invalid settings."""
     match = _BROKER.fullmatch(section.broker or "")
     if match is None:
         raise UsageError(f"[vda5050] broker = {section.broker!r} is not like mqtts://HOST or mqtts://HOST:PORT")
@@ -82,7 +82,7 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
 
 
 def origins_of(section: Vda5050Section, *, insecure: bool) -> Origins:
-    """Servers that maps may come from; UsageError where a file cannot be read or an origin is none."""
+    """Return the allowed servers of maps; UsageError if a file cannot be read or an origin is invalid."""
     token = None if section.download_token_file is None else read_secret(section.download_token_file)
     ca = None if section.download_ca is None else Path(section.download_ca)
     origins = Origins(section.download_from, token, ca, insecure)
@@ -91,7 +91,7 @@ def origins_of(section: Vda5050Section, *, insecure: bool) -> Origins:
 
 
 def read_secret(path: str) -> str:
-    """The first line of a file; UsageError where it cannot be one."""
+    """Return the first line of a file; UsageError if it cannot be a secret."""
     with disk_errors(f"[vda5050] {path} cannot be read", "check the path and its rights", UsageError):
         data = Path(path).read_bytes()[: _MAX_SECRET_BYTES + 1]
     lines = data.decode("utf-8", "replace").splitlines()

@@ -135,7 +135,7 @@ def _story(master: Master, store: MapStore, http: str) -> None:
     until(lambda: abs(master.state["mobileRobotPosition"]["x"] - x_m) < 0.1, lambda: master.state)
     assert abs(master.state["mobileRobotPosition"]["y"] - y_m) < 0.1
     elsewhere = master.act("initializePosition", x=x_m + 9, y=y_m, theta=yaw_rad, mapId="room", lastNodeId="n-3")
-    assert "what the robot sees puts it" in str(master.done(elsewhere, "FAILED")["errors"])
+    assert "the robot is localized" in str(master.done(elsewhere, "FAILED")["errors"])
 
     robot_world.save(store)
     update_lists(store)

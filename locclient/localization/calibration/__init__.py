@@ -1,1 +1,1 @@
-"""Watch over a robot's calibration: what its cameras show, against the map in which it is localized."""
+"""Monitoring of a robot's calibration: camera observations against the map in which the robot is localized."""

@@ -1,4 +1,4 @@
-"""What one frame says of the cameras' parameters, its own pose marginalized. Pure."""
+"""Information of one frame on the camera parameters, with its pose marginalized. Pure."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from locclient.localization.calibration.parameters import IMAGE
 
 _POSE = 6
-_CENTRE_SIGMA_PX = 1.0  # of the principal point, which is not told from a turn of the rig
-# Widths of the robust weight in sigmas, one for each step: a wrong calibration moves all disparities at once.
+_CENTRE_SIGMA_PX = 1.0  # of the principal point, which is not distinguishable from a rotation of the rig
+# Widths of the robust weight in sigmas, one for each iteration: a wrong calibration shifts all disparities at once.
 _WIDTHS = (30.0, 6.0, 3.0)
 _ROW_POINTS, _ROW_WINDOW_PX, _ROW_BACK_PX, _ROW_SIGMA_PX = 40, 11, 0.5, 0.2
 _MIN_POINTS = 15
@@ -22,7 +22,7 @@ _NEAREST_M = 0.3
 class CameraView(NamedTuple):
     """information (6, 6) and score (6,) = information @ estimate of the first parameters of `PARAMETERS`.
 
-    pose_per_parameter (6, 6): how the pose of a fix, a left perturbation in camera axes of cam_from_map, follows each parameter.
+    pose_per_parameter (6, 6): derivative of a fix's pose, a left perturbation of cam_from_map in camera axes, by each parameter.
     """
 
     information: Array
@@ -31,9 +31,9 @@ class CameraView(NamedTuple):
 
 
 def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: Array) -> Array:
-    """(N, 2) of points in the right image: column, and row minus that in the left one, px; NaN where not looked for or not found.
+    """Return (N, 2) of points in the right image: column, and row minus the left row, px; NaN where not searched or not found.
 
-    Looked for around where the map says, in both directions, so that a pair that is turned up or down still shows it.
+    Searched around the map's prediction in both directions, so that a pitch error of the pair is still visible.
     """
     out = np.full((len(matched), 2), np.nan)
     if frame.right is None:
@@ -51,7 +51,7 @@ def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: 
 
 
 def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -> CameraView | None:
-    """The view of a frame near map_from_cam with all that it matched, before any gate; None where too little has depth.
+    """Return the view of a frame near map_from_cam, with all its matches before any gate; None if too few have depth.
 
     rows_px (N,): from `pair_offsets`. Source: Triggs et al. 2000, sections 6.1 (Schur complement) and 2.2 (self-calibration).
     """
@@ -86,9 +86,9 @@ def camera_view(matched: Correspondences, map_from_cam: Array, rows_px: Array) -
 def _normal_equations(
     matched: Correspondences, rows_px: Array, cam_from_map: Array, theta: Array, width: float
 ) -> tuple[Array, Array]:
-    """Hessian and gradient of pose (a left perturbation), parameters and principal point, with Geman-McClure weights.
+    """Return Hessian and gradient of pose (a left perturbation), parameters and principal point, with Geman-McClure weights.
 
-    The right camera's focal length, roll and yaw change disparities, and the rows of the right image.
+    The right camera's focal length, roll and yaw change disparities and the rows of the right image.
     """
     focal_px, cx_px, cy_px, _ = lens = matched.camera.lens
     x, y, z = transform_points(cam_from_map, matched.points_source).T
@@ -142,5 +142,5 @@ def _normal_equations(
 
 
 def _robust(squared: Array, width: float) -> Array:
-    """Weight of a squared normalized residual. Source: Geman and McClure 1985."""
+    """Return the weight of a squared normalized residual. Source: Geman and McClure 1985."""
     return np.asarray((width * width / (width * width + squared)) ** 2)

@@ -1,4 +1,4 @@
-"""Monitor of the calibration beside the localizer: the pair's order, the watch, and what is published of them. Pure."""
+"""Calibration monitor beside the localizer: order of the stereo pair, drift of parameters, effect on estimates. Pure."""
 
 from dataclasses import replace
 
@@ -17,16 +17,16 @@ from locclient.localization.calibration.watch import CalibrationWatch, Mounting
 from locclient.localization.estimate import Estimate
 from locclient.localization.map_query import FinishedQuery
 
-# Between two tests of the pair's order: until one has decided, after one has found it reversed, and while the robot is not localized.
+# Seconds between tests of the pair's order: before the first decision, after a reversed one, and while the robot is not localized.
 _UNDECIDED_S, _REVERSED_S, _NOT_LOCALIZED_S = 0.5, 5.0, 20.0
-_WITHOUT_DEPTH_S = 1.0  # between two searches without depth, while the frames agree with nothing in the map
-_HELD_S = 1.0  # by a fix of this age, a pose by wrong cameras is published
+_WITHOUT_DEPTH_S = 1.0  # between two searches without depth, while frames match nothing in the map
+_HELD_S = 1.0  # maximum age of the fix for which a pose of wrongly calibrated cameras is published
 _ORDER_CORNERS = 500
 
 
 class CalibrationMonitor:
-    """Holds what the localizer need not know of the watch. Its work is done in slices, in frames after the one that it is about; but that
-    of the first confirmed pose is done at once, before it is published."""
+    """Runs the calibration watch for the localizer. Its work is spread over the frames after a query, except for the first confirmed
+    pose: that is judged at once, before it is published."""
 
     def __init__(self, rig: Mounting, settings: RelocalizerSettings, imu_minus_cam_s: float = 0.0) -> None:
         self._settings = settings
@@ -36,7 +36,7 @@ class CalibrationMonitor:
         self._order, self._order_ns = PairOrder.UNKNOWN, -(2**62)
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        """Whether the pair is known to be exchanged or mirrored; tests this frame where that is due."""
+        """Return True if the images of the pair are known to be exchanged or mirrored; test this frame if due."""
         age_s = (frame.stamp_ns - self._order_ns) * 1e-9
         undecided = {PairOrder.UNKNOWN: _UNDECIDED_S, PairOrder.REVERSED: _REVERSED_S}
         if age_s >= undecided.get(self._order, np.inf if is_localized else _NOT_LOCALIZED_S):
@@ -46,7 +46,7 @@ class CalibrationMonitor:
         return self._order is PairOrder.REVERSED
 
     def add(self, query: FinishedQuery) -> None:
-        """Takes a finished look at the map; a frame that agrees with nothing in it is looked for without its depth, from time to time."""
+        """Add a finished map query; from time to time, search for an unmatched frame without its depth."""
         if query.fix is not None:
             self._job = self._view(query)
             if query.is_confirmed and not self.watch.has_confirmed:
@@ -58,12 +58,12 @@ class CalibrationMonitor:
                 self._job = self._search(query)
 
     def work(self) -> None:
-        """One slice of what is to be done."""
+        """Do one slice of the pending work."""
         if self._job is not None and next(self._job, self) is self:
             self._job = None
 
     def give_up(self) -> None:
-        """Forgets work that is under way: the map has changed."""
+        """Drop pending work: the map has changed."""
         self._job = None
 
     @property
@@ -75,7 +75,7 @@ class CalibrationMonitor:
         yield
 
     def _search(self, query: FinishedQuery) -> TimeSliced[None]:
-        """A wrong pair is wrong in depth first, and a fix needs that. Sought by the left camera alone."""
+        """Search by the left camera alone: a wrong stereo calibration spoils depth first, which a fix needs."""
         fixes = yield from query.relocalizer.anywhere(query.features.without_depth())
         if fixes and is_reliable(fixes[0], self._settings.fix):
             yield
@@ -85,11 +85,11 @@ class CalibrationMonitor:
 def with_calibration(
     estimate: Estimate, state: CalibrationState, rig: Mounting, last_fix_ns: int | None, *, was_localized: bool
 ) -> Estimate:
-    """The estimate with what is known of the calibration: where that is wrong, not TRACKING, and with a wider covariance; with that
-    also where it may be wrong by more than may pass.
+    """Return the estimate with the state of the calibration: if wrong, not TRACKING and with a larger covariance; the covariance
+    also grows if an error beyond the limit is not excluded.
 
-    last_fix_ns: of a confirmed pose, None for a reversed pair. One that no fix holds is not published then, since the odometry is as
-    wrong as the cameras.
+    last_fix_ns: of a confirmed pose, None for a reversed pair. With a wrong calibration, a pose without a recent fix is dropped,
+    since the odometry is as wrong as the cameras.
     """
     if not state.is_wrong:
         return replace(estimate, calibration=state, cov_rot_trans=_widened(estimate, state, rig))

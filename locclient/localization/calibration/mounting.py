@@ -1,4 +1,4 @@
-"""What one fix says of how the cameras are mounted: gravity, the driving direction, and the floor. Pure."""
+"""Information of one fix on the mounting of the cameras, by gravity, driving direction and floor. Pure."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import WheelSample
 
-_ACCEL_BIAS_RAD = 0.003  # gravity in the IMU's axes, from moment to moment
+_ACCEL_BIAS_RAD = 0.003  # short-term error of gravity in the IMU's axes
 _FLOOR_RADIUS_M, _FLOOR_SIGMA_M = 4.0, 0.02
 _SLAB_M = 0.06  # landmarks of a floor lie within this height
-# landmarks of a floor, and how much more of them than in the slabs above, in the mean
+# minimum number of landmarks of a floor, and ratio to the mean of the slabs above
 _MIN_IN_SLAB, _MIN_DENSITY = 12, 3.0
-_BELOW_SHARE = 0.05  # of the landmarks, below the floor: reflections, and errors of depth
-_MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step that shows the driving direction
-_KEPT_SAMPLES = 2000  # of wheel odometry: 20 s at 100 Hz, a hundred times what a fix takes
+_BELOW_SHARE = 0.05  # of the landmarks may lie below the floor: reflections, and errors of depth
+_MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step that determines the driving direction
+_KEPT_SAMPLES = 2000  # of wheel odometry: 20 s at 100 Hz, a hundred times the duration of a fix
 
 
 class BasePose(NamedTuple):
-    """The base by a fix, and by the wheels at the moment of that frame: `WheelTravel.at`."""
+    """Pose of the base by a fix, and by the wheels at the same frame (`WheelTravel.at`)."""
 
     map_from_base: Array
     cov_rot_trans: Array
@@ -30,7 +30,7 @@ class BasePose(NamedTuple):
 
 
 class WheelTravel:
-    """The base's path by the wheels alone. is_heard: whether there are wheels, so that the robot stands on a floor."""
+    """Path of the base by the wheels alone. is_heard: True if wheel samples were received, so that the robot stands on a floor."""
 
     def __init__(self) -> None:
         self._stamps_ns: deque[int] = deque(maxlen=_KEPT_SAMPLES)
@@ -52,15 +52,15 @@ class WheelTravel:
             self._x_y_yaw.append(x_y_yaw)
 
     def at(self, stamp_ns: int) -> Array:
-        """(3,) x, y in metres and yaw in radians since the first sample; NaN before the samples that are kept and after the newest."""
+        """Return (3,) x, y in metres and yaw in radians since the first sample; NaN before the oldest kept sample and after the newest."""
         elapsed_ns = np.array(self._stamps_ns) - stamp_ns
         return np.array([np.interp(0, elapsed_ns, values, np.nan, np.nan) for values in np.array(self._x_y_yaw).T])
 
 
 def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Array, Array]:
-    """(2, 4) Jacobian and (2,) measurement, in sigmas: how far gravity lies from the map's vertical about the body's x and y axes.
+    """Return (2, 4) Jacobian and (2,) measurement, in sigmas: angle of gravity to the map's vertical about the body's x and y axes.
 
-    Columns: the cameras' turn against the body about its x and y, and the map's own tilt about its x and y.
+    Columns: rotation of the cameras against the body about its x and y, and the map's own tilt about its x and y.
     """
     map_from_body = fix.map_from_cam[:3, :3] @ cam_from_body[:3, :3]
     up_by_map, up_by_imu = map_from_body.T[:, 2], odometry.odom_from_body[:3, :3].T[:, 2]
@@ -71,10 +71,10 @@ def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Ar
 
 
 def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:
-    """The cameras' turn against the body about its z, and its sigma; None where a step does not show it.
+    """Return the rotation of the cameras against the body about its z, and its sigma; None if the step does not determine it.
 
-    That is the angle from where the map says the base went to where the wheels say. What the wheels turned less than the map says is
-    taken to have come evenly, so that it turns the step by its half; were it all at one end, by all or nothing.
+    It is the angle from the base's direction of travel by the map to that by the wheels. A turn missing in the wheels is assumed to
+    be spread evenly over the step, which rotates it by half of that; at one end, it would rotate it by all or nothing.
     """
     before_from_now = se3_inverse(before.map_from_base) @ now.map_from_base
     turn_rad = float(so3_log(before_from_now[:3, :3])[2])
@@ -96,9 +96,9 @@ def _turned(vector: Array, by_rad: float) -> Array:
 
 
 def height(base: BasePose, points_map: Array) -> tuple[float, float] | None:
-    """Height of the base above the floor of the map around it, and its sigma; None where landmarks show no floor.
+    """Return the height of the base above the map's floor around it, and its sigma; None if the landmarks show no floor.
 
-    A floor is the lowest height at which many more landmarks lie than above, and below which hardly any do.
+    A floor is the lowest height with many more landmarks than above it and hardly any below.
     """
     place_m = base.map_from_base[:3, 3]
     near = np.abs(points_map[:, :2] - place_m[:2]).max(axis=1) < _FLOOR_RADIUS_M

@@ -1,4 +1,4 @@
-"""Order of a stereo pair: whether what is seen lies farther left in the right image, as it must. Pure."""
+"""Order of a stereo pair: in the right order, features lie farther left in the right image. Pure."""
 
 from enum import StrEnum
 
@@ -14,10 +14,10 @@ REVERSED_TEXT = (
     "or switch the mirroring off in the camera's driver"
 )
 _MIN_MATCHES = 40
-# a disparity with a sign; rows and columns as shares of the image
+# minimum size of a signed disparity; rows and columns as shares of the image
 _DECIDED_PX, _ROW_SHARE, _WIDTH_SHARE = 1.0, 0.03, 0.3
 _MAX_BITS, _RATIO = 48, 0.9
-_ODDS = 3.0  # chance spreads matches over both signs alike
+_ODDS = 3.0  # random matches have both signs equally often
 
 
 class PairOrder(StrEnum):
@@ -29,7 +29,7 @@ class PairOrder(StrEnum):
 
 
 def pair_order(frame: RectifiedFrame, settings: OrbSettings) -> PairOrder:
-    """The order that one frame shows, at half its size; UNKNOWN for a single camera, and where too little is seen or all of it is far."""
+    """Return the order by one frame at half its size; UNKNOWN for a single camera, too few features or only distant ones."""
     if frame.right is None:
         return PairOrder.UNKNOWN
     left, right = extract(frame.half_left, settings), extract(frame.half_right, settings)

@@ -1,4 +1,4 @@
-"""Parameters of a calibration that the map can judge, and what is said of them. Pure."""
+"""Calibration parameters that the map determines, and reports of their drift. Pure."""
 
 from typing import NamedTuple
 
@@ -8,18 +8,18 @@ from fleetmap.geometry import Array, turn_both
 from locclient.localization.pose_covariance import transport_cov
 
 DRIFT_SIGMAS = 5.0
-"""Of a parameter's sigma, beyond which it has drifted: p = 6e-7 for one test. Ten parameters and three windows, corrected for by
-Bonferroni's inequality, make at most 1.8e-5 for each independent window, some 30 m of driving: 3.3 % for a robot-day of 57 km, if the
-errors are normally distributed. That the drift must also be large makes it less. The first view of a start is judged alone, by the six
-parameters of the images: 3.4e-6 for each start, 8e-5 for one in every hour of a day."""
+"""Drift limit in sigmas of a parameter: p = 6e-7 for one test. Ten parameters and three windows, corrected by Bonferroni's inequality,
+give at most 1.8e-5 for each independent window, about 30 m of driving: 3.3 % for a robot-day of 57 km if errors are normally
+distributed, and less because the drift must also be large. The first view after a start is judged alone, by the six parameters of
+the images: 3.4e-6 for each start, 8e-5 per day with one start per hour."""
 
 
 class Parameter(NamedTuple):
-    """One parameter: truth minus calibration, as a share where it is a scale, else in radians or metres.
+    """One parameter: truth minus calibration; relative for a scale, else in radians or metres.
 
-    figure: its name in health reports, with its unit; per_unit: units of the figure in one of the value. floor: sigma of what no number
-    of views averages away, because the map shares it. limit: size that matters whatever is in view; below it, the error of the position
-    that a parameter of the cameras causes where the robot is decides (`BIAS_LIMIT_M`). text: for people.
+    figure: its name in health reports, with its unit; per_unit: units of the figure in one of the value. floor: sigma of the error
+    shared with the map, which no number of views averages away. limit: size that counts as drift in any view; below it, a camera
+    parameter is judged by the position error that it causes at the robot's place (`BIAS_LIMIT_M`). text: for display.
     """
 
     figure: str
@@ -42,28 +42,28 @@ PARAMETERS = (
     Parameter("camera_yaw_deg", _DEG, 0.0026, 0.01, "turn of the cameras against the driving direction"),
     Parameter("camera_height_m", 1.0, 0.01, 0.03, "height of the cameras above the floor"),
 )
-"""Images decide the first six, gravity the next two, wheels the ninth, floors the last.
+"""Images determine the first six, gravity the next two, wheels the ninth, floors the last.
 
-Floors: scales and turns of good pairs differ from the survey's by so much, by their own calibration and by what stereo matching makes
-of another light. Limits: focal length, 1.5 cm at 3 m; the pair, what costs some centimetres at 3 m in one place or another (0.05 degrees
-of turn are a third of a pixel of disparity). pair_pitch_deg: half a pixel beside the row costs stereo matching a third of its points.
-The turns of the camera: beyond what the published covariance admits (`TrackSettings.map_sigma_rad`).
+Floors: usual difference of scales and rotations between good pairs and the survey's, by calibration and by the effect of lighting on
+stereo matching. Limits: focal length, 1.5 cm at 3 m; the pair, an error of a few centimetres at 3 m in some places (0.05 degrees of
+yaw are a third of a pixel of disparity). pair_pitch_deg: half a pixel off the row costs stereo matching a third of its points.
+Rotations of the camera: beyond the published covariance (`TrackSettings.map_sigma_rad`).
 """
 TIME_OFFSET = Parameter("time_offset_s", 1.0, 0.0005, 0.01, "time of the cameras against the IMU")
-"""As the odometry estimates it: corrected there, so that a drift is reported and costs nothing. Limit: 2 cm at 2 m/s."""
+"""Estimated and corrected by the odometry, so that a drift is reported but causes no error. Limit: 2 cm at 2 m/s."""
 IMAGE = 6  # of PARAMETERS, the first ones
 FOCAL, BASELINE, YAW, RIGHT_FOCAL, ROLL, PITCH = range(IMAGE)
 TILT, HEADING, HEIGHT = slice(6, 8), 8, 9
 COUNT = len(PARAMETERS)
 BIAS_LIMIT_M = 0.015
-"""Error of the position at the depths that the robot sees. A robot may be 3 cm off without a word; half of that is the limit, because
-elsewhere the same parameter costs more. Where the mean square of what all parameters may cost, by value and sigma, is below its square,
-more than 3 cm (two sigmas) are excluded; else the published covariance holds them."""
+"""Limit of the position error at the robot's present scene depths: half of the 3 cm that may stay unreported, because the same
+parameter causes more elsewhere. If the mean square error by all parameters, from value and sigma, is below its square, errors above
+3 cm (two sigmas) are excluded; otherwise the published covariance includes them."""
 
 
 class Drift(NamedTuple):
-    """A parameter's estimate with its sigma, as `Parameter` says; bias_m: the error of the position that it causes, 0 where that is not
-    how it is judged; is_drifted: whether it is beyond DRIFT_SIGMAS and beyond the size that matters."""
+    """A parameter's estimate with its sigma, in units of `Parameter`; bias_m: the position error that it causes, 0 if it is not judged
+    by that; is_drifted: True beyond both DRIFT_SIGMAS and the parameter's limit."""
 
     parameter: Parameter
     value: float
@@ -84,8 +84,8 @@ class Drift(NamedTuple):
 
 
 class CalibrationState(NamedTuple):
-    """What the watch knows: an estimate of each parameter that could be judged, and the covariance that the calibration adds to the pose
-    (6, 6), rotation first, camera axes; None where an error of 3 cm is excluded. text: what is wrong, the costliest first."""
+    """Result of the watch: an estimate of each observable parameter, and the covariance (6, 6) that the calibration adds to the pose,
+    rotation first, camera axes, None if an error of 3 cm is excluded. text: drifted parameters, the largest error first."""
 
     drifts: tuple[Drift, ...] = ()
     cov_bias_cam: Array | None = None
@@ -96,7 +96,7 @@ class CalibrationState(NamedTuple):
         return bool(self.text)
 
     def cov_bias(self, map_from_cam: Array, map_from_body: Array) -> Array:
-        """(6, 6) what the wrong parameters add to a pose's covariance: map axes, rotation first, about the body."""
+        """Return the covariance (6, 6) that wrong parameters add to a pose: map axes, rotation first, about the body."""
         if self.cov_bias_cam is None:
             return np.zeros((6, 6))
         turn = turn_both(map_from_cam[:3, :3])
@@ -104,7 +104,7 @@ class CalibrationState(NamedTuple):
 
     @property
     def figures(self) -> dict[str, float | str]:
-        """Of a health report: estimates and sigmas by name, and the names of those that have drifted."""
+        """Return figures of a health report: estimates and sigmas by name, and the names of drifted parameters."""
         told: dict[str, float | str] = {}
         for drift in self.drifts:
             name, scale = f"calibration_{drift.parameter.figure}", drift.parameter.per_unit

@@ -1,4 +1,4 @@
-"""Watch over the calibration: independent views gathered while the robot drives, and a test of each parameter. Pure."""
+"""Calibration watch: independent views collected while the robot drives, and a test of each parameter. Pure."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -32,26 +32,26 @@ from locclient.localization.calibration.parameters import (
 from locclient.localization.map_query import FinishedQuery
 from locclient.localization.pose_covariance import transport_cov
 
-_STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and while they are few
-_MIN_NEW_SHARE = 0.1  # weight of a view that shows no landmark that was not in the window
-# Views: of the window, and of a judgement. One is enough where its fix is a confirmed pose: a fix at a wrong place shows any parameter.
+_STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and between the first ones
+_MIN_NEW_SHARE = 0.1  # weight of a view without landmarks new to the window
+# Number of views: of the window, and for a test. One is enough for a confirmed pose: a fix at a wrong place may show any parameter.
 _WINDOW, _MIN_VIEWS, _MIN_CONFIRMED_VIEWS = 40, 2, 1
-# Views of the window's end that show a sudden change, and of what they are held against.
+# Number of latest views that show a sudden change, and of earlier ones to compare with.
 _RECENT, _MIN_BEFORE = (4, 10), 6
-_FEW = 10  # views, before which they are taken more often
-# A stand: so slow for so long. Odometry that has begun in motion may take it for a stand, and what hides that for gravity.
+_FEW = 10  # views; until then they are taken more often
+# A standstill: maximum speed and duration. Odometry initialized in motion may mistake it for a standstill, with a wrong gravity.
 _STOOD_M, _STOOD_S = 0.03, 0.35
-# Of a parameter's floor: what a view shares with its neighbours, which few views do not show by their scatter.
+# Share of a parameter's floor: error common to neighbouring views, which the scatter of a few views does not show.
 _LOCAL_FLOORS = 2.0
-_MAP_TILT_SIGMA_RAD = 0.05  # of a map whose survey had no IMU: it is levelled by its cameras
-_GRAVITY_MPS2, _UNHELD_S = 9.81, 0.9  # the age of a fix, beyond which no pose is TRACKING
-_PRIOR_SIGMA = 10.0  # of a parameter: none, but what nothing shows must not make the equations singular
+_MAP_TILT_SIGMA_RAD = 0.05  # of a map surveyed without IMU, which is levelled by its cameras
+_GRAVITY_MPS2, _UNHELD_S = 9.81, 0.9  # age of a fix beyond which no pose is TRACKING
+_PRIOR_SIGMA = 10.0  # of a parameter: practically none; keeps the equations regular for unobserved parameters
 _JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the prior was not judged
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the camera is mounted: cam_from_body, base_from_body (4, 4)."""
+    """Mounting of the camera: cam_from_body, base_from_body (4, 4)."""
 
     cam_from_body: Array
     base_from_body: Array
@@ -59,7 +59,7 @@ class Mounting:
 
 @dataclass(frozen=True)
 class _View:
-    """information, score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
+    """Information and score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
 
     information: Array
     score: Array
@@ -68,32 +68,32 @@ class _View:
 
 
 class CalibrationWatch:
-    """Compares what the robot sees with the map in which it is localized. It observes: no estimate changes until something has drifted.
+    """Compares observations with the map in which the robot is localized. Estimates do not change until a parameter has drifted.
 
-    Each view is linearized about the calibration with a pose of its own, so that information adds up; a view counts by the share of
-    its landmarks that no other of the window showed, because a landmark's error is the same in all views. A parameter's sigma is the
-    larger of what the information and what the scatter of the views says, and of its floor. One view has no scatter.
+    Each view is linearized about the calibration with its own pose, so that information adds up; its weight is the share of its
+    landmarks that no other view of the window showed, because a landmark's error is the same in all views. A parameter's sigma is the
+    largest of three: by the information, by the scatter of the views, and its floor. One view has no scatter.
 
     Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
     """
 
     def __init__(self, rig: Mounting, stereo_settings: StereoSettings, imu_minus_cam_s: float = 0.0) -> None:
-        """imu_minus_cam_s: the time offset of the calibration."""
+        """imu_minus_cam_s: time offset of the calibration."""
         self._rig, self._stereo, self._imu_minus_cam_s = rig, stereo_settings, imu_minus_cam_s
         self._views: deque[_View] = deque(maxlen=_WINDOW)
         self._wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
-        self._stood_from: tuple[int, Array] | None = None  # the oldest look from so near
+        self._stood_from: tuple[int, Array] | None = None  # the oldest query from nearly the same place
         self._has_stood = False
         self.state = NOT_JUDGED
-        self.has_confirmed = False  # whether a view of a confirmed pose was taken
+        self.has_confirmed = False  # a view of a confirmed pose was added
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self._wheels.handle(samples)
 
     def handle(self, query: FinishedQuery) -> None:
-        """Takes a look at the map, where it is a new view."""
+        """Add a map query if it is a new view."""
         fix, frame = query.fix, query.frame
         assert fix is not None
         matched = fix.matched
@@ -123,7 +123,7 @@ class CalibrationWatch:
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
     def handle_unmatched(self, query: FinishedQuery) -> None:
-        """As `handle`, for a frame that agrees with the map only without its depth: that is measured here for what was matched."""
+        """As `handle`, for a frame that matches the map only without its depth: measure the depth of the matched features."""
         matched = None if query.fix is None else query.fix.matched
         if query.fix is None or matched is None:
             return
@@ -147,7 +147,7 @@ class CalibrationWatch:
         self._has_stood |= (stamp_ns - self._stood_from[0]) * 1e-9 >= _STOOD_S
 
     def _new_share(self, ids: frozenset[int]) -> float:
-        """Share of landmarks that no view of the window has shown."""
+        """Return the share of landmarks that no view of the window has shown."""
         known = frozenset[int]().union(*(ids & view.ids for view in self._views))
         return max(1.0 - len(known) / len(ids), _MIN_NEW_SHARE) if ids else 1.0
 
@@ -186,7 +186,7 @@ class CalibrationWatch:
     # --- judgement ----------------------------------------------------------------------------------------------------
 
     def _judged(self, min_views: int) -> CalibrationState:
-        """By the window. Views before a change that its end shows are dropped: knocks and repairs show at once."""
+        """Judge the window. Views before a sudden change at its end are dropped, so that knocks and repairs show at once."""
         views = list(self._views)
         if len(views) < min_views:
             return NOT_JUDGED
@@ -205,14 +205,14 @@ class CalibrationWatch:
 
 
 def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
-    """With the columns of the right image where stereo matching, which keeps to the row, found none."""
+    """Add columns of the right image where stereo matching, which searches the row only, found none."""
     has_none = np.isnan(matched.pixels[:, 2])
     columns = np.where(has_none, right_px, matched.pixels[:, 2])
     return replace(matched, pixels=np.column_stack([matched.pixels[:, :2], columns]))
 
 
 def _estimate(views: Sequence[_View]) -> tuple[Array, Array]:
-    """Values and sigmas (COUNT,) of PARAMETERS by some views, infinite where nothing showed one; one view judges the images alone."""
+    """Return values and sigmas (COUNT,) of PARAMETERS by views, infinite if unobserved; one view determines those of the images alone."""
     prior = np.array([_PRIOR_SIGMA] * COUNT + [_MAP_TILT_SIGMA_RAD] * 2) ** -2.0
     information = np.array([view.information for view in views])
     score = np.array([view.score for view in views])
@@ -251,7 +251,7 @@ def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationSta
 
 
 def _tilt_in_doubt(views: Sequence[_View], value: Array, sigma: Array) -> float:
-    """The turn of the cameras about the body's x or y, rad, that gravity shows unless the map is tilted; 0 where turns have excluded it."""
+    """Return the camera rotation about the body's x or y, rad, by gravity if the map is level; 0 if turns of the robot exclude it."""
     information = sum((view.information[TILT, TILT] for view in views), 1e-9 * np.eye(2))
     covariance = np.linalg.inv(information)
     in_level_map = np.abs(covariance @ sum(view.score[TILT] for view in views))
@@ -263,17 +263,17 @@ def _tilt_in_doubt(views: Sequence[_View], value: Array, sigma: Array) -> float:
 
 
 def _in_bends_m(tilt_rad: float) -> float:
-    """Error of odometry since a fix, after a bend in which gravity and the accelerometer's bias, which hid a tilt, come apart."""
+    """Return the odometry error since a fix, after a bend that separates gravity from the accelerometer bias that hid a tilt."""
     return 0.5 * _GRAVITY_MPS2 * tilt_rad * _UNHELD_S**2
 
 
 def _squared_m(covariance: Array) -> float:
-    """Mean square of a pose's position error."""
+    """Return the mean square of a pose's position error."""
     return float(np.trace(covariance[3:, 3:]))
 
 
 def _cov_bias(shifts: Array, value: Array, sigma: Array) -> Array:
-    """(6, 6) mean square of the poses' errors by all parameters, rotation first, camera axes: their values and their uncertainty."""
+    """Return (6, 6), the mean square of pose errors by values and uncertainty of all parameters; rotation first, camera axes."""
     total = shifts @ value[:IMAGE]
     known = np.where(np.isfinite(sigma[:IMAGE]), sigma[:IMAGE], 0.0)
     covariance = (total[:, :, None] * total[:, None, :]).mean(axis=0)
@@ -281,7 +281,7 @@ def _cov_bias(shifts: Array, value: Array, sigma: Array) -> Array:
 
 
 def _cov_elsewhere(value: Array, sigma: Array) -> Array:
-    """(6, 6) what drifted parameters cost where the window has not been: BIAS_LIMIT_M for each at its limit, in any direction."""
+    """Return (6, 6), the error by drifted parameters outside the window's places: BIAS_LIMIT_M for each at its limit, isotropic."""
     share = value[:IMAGE] / np.array([parameter.limit for parameter in PARAMETERS[:IMAGE]])
     of_mount = np.where(np.isfinite(sigma[IMAGE:]), value[IMAGE:], 0.0)
     squared = [float((of_mount[:3] ** 2).sum())] * 3

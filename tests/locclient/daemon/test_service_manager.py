@@ -72,11 +72,11 @@ def test_a_status_can_be_read_at_once(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("later_s", "text", "words"),
     [
-        (11.0, "{now} TRACKING", "last said 'TRACKING' 11 s ago; it hangs"),
+        (11.0, "{now} TRACKING", "last reported 'TRACKING' 11 s ago; it hangs"),
         (-1e6, "{now} TRACKING", "before this machine was started"),
-        (0.0, "nan TRACKING", "last said"),
-        (0.0, "", "holds '' and no status of a daemon"),
-        (0.0, "\x00\udcff" * 99, "no status of a daemon"),
+        (0.0, "nan TRACKING", "last reported"),
+        (0.0, "", "holds '', not the status of a daemon"),
+        (0.0, "\x00\udcff" * 99, "not the status of a daemon"),
     ],
 )
 def test_an_old_or_broken_status_is_none(

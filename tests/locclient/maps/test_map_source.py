@@ -9,7 +9,7 @@ from locclient.maps.map_source import LocalMapSource
 
 
 def test_a_folder_without_sites_is_no_store(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no map store"):
+    with pytest.raises(StoreError, match="not a map store"):
         LocalMapSource(tmp_path, "lab")
 
 

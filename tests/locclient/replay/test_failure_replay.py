@@ -71,7 +71,7 @@ def test_the_same_client_says_the_same(carried: Carried) -> None:
     assert len({*carried.said}) > 1, "the robot failed meanwhile"
     assert found.first_difference_ns is None
     assert found.apart_m <= SAME_M
-    assert "says the same" in found.answer
+    assert "gives the same result" in found.answer
 
 
 def test_it_begins_where_the_recording_says(carried: Carried) -> None:
@@ -299,7 +299,7 @@ def test_the_command_answers(
         said = capsys.readouterr()
         assert status == 0, said.err
         assert "then:" in said.out
-        assert ("this client says the same of every frame" in said.out) == is_same
+        assert ("this client gives the same result for every frame" in said.out) == is_same
         assert json.loads((tmp_path / "report.json").read_text())["is_same"] == is_same
     assert _replayed(monkeypatch, *given, "--frames", "1:20") == 2
     assert "--frames is not for a failure's recording" in capsys.readouterr().err
@@ -323,7 +323,7 @@ def test_the_server_replays_it_in_a_process_with_limits(
 
     status, said = run()
     assert status == 0, said
-    assert "says the same of every frame" in said
+    assert "gives the same result for every frame" in said
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--json"])
     status, said = run()
     assert (status, json.loads(said[: said.rindex("}") + 1])["is_same"]) == (0, True)

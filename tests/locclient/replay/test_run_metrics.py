@@ -238,7 +238,7 @@ def test_errors_against_a_truth_in_another_frame_are_aligned() -> None:
     assert found["frames"] == 70
     assert [found[name] for name in ("median", "max", "scale")] == pytest.approx([0.01, 0.01, 1.0], abs=1e-3)
     assert "another frame" in run.alignment_note()
-    assert "70 localised frames" in run.alignment_note()
+    assert "70 localized frames" in run.alignment_note()
 
 
 def test_a_truth_of_another_scale_shows_and_one_of_few_frames_is_no_truth() -> None:
@@ -249,4 +249,4 @@ def test_a_truth_of_another_scale_shows_and_one_of_few_frames_is_no_truth() -> N
     assert twice["median"] > 0.1
     few = result([np.eye(4)] * 2 + [None] * 98, frames)
     assert few.aligned_error_m() is None
-    assert "fewer than 3 localised frames" in few.alignment_note()
+    assert "fewer than 3 localized frames" in few.alignment_note()

@@ -36,8 +36,8 @@ def drive(*parts: Part) -> HealthFigures:
 @pytest.mark.parametrize(
     ("parts", "words", "flags", "is_lost_run"),
     [
-        ([(220, LOST, 1.0, MAPPED, True)], "not localised over 21.9 m: nothing in the map agrees", {Flag.NOT_LOCALISED}, True),
-        ([(220, LOST, None, MAPPED, True)], "not localised over 0.0 m and 22 s at an unknown speed: nothing", {Flag.NOT_LOCALISED}, True),
+        ([(220, LOST, 1.0, MAPPED, True)], "not localized over 21.9 m: nothing in the map agrees", {Flag.NOT_LOCALISED}, True),
+        ([(220, LOST, None, MAPPED, True)], "not localized over 0.0 m and 22 s at an unknown speed: nothing", {Flag.NOT_LOCALISED}, True),
         ([(99, LOST, 1.0, COVERED, True)], "9.8 m: most pictures look occluded", {Flag.NOT_LOCALISED, Cause.OCCLUDED}, True),
         ([(99, AMBIGUOUS, 1.0, MAPPED, True)], "several places of the map look alike", {Flag.NOT_LOCALISED}, True),
         ([(99, LOST, 1.0, {"map_version": None}, True)], "no map is loaded", {Flag.NOT_LOCALISED, Cause.NO_MAP}, True),
@@ -45,9 +45,9 @@ def drive(*parts: Part) -> HealthFigures:
         ([(20, LOST, 1.0, MAPPED, True)], "1.9 m in 1.9 s are too short to say why: drive 5 m", set(), False),
         ([(300, LOST, 0.0, MAPPED, True)], "0.0 m in 29.9 s are too short", set(), False),
         ([(99, LOST, 1.0, MAPPED, True), (20, TRACKING, 1.0, MAPPED, True)], "", set(), False),
-        ([(20, TRACKING, 1.0, MAPPED, True), (99, LOST, 1.0, MAPPED, True)], "not localised over 9.9 m", {Flag.NOT_LOCALISED}, True),
+        ([(20, TRACKING, 1.0, MAPPED, True), (99, LOST, 1.0, MAPPED, True)], "not localized over 9.9 m", {Flag.NOT_LOCALISED}, True),
         ([(20, TRACKING, 1.0, MAPPED, True), (99, LOST, 1.0, MAPPED, False)], "no tile where", {Flag.OFF_MAP}, False),
-        ([(99, TRACKING, 1.0, MAPPED, True), (60, LOST, 1.0, MAPPED, True)], "not localised over 6.0 m", {Flag.NOT_LOCALISED}, False),
+        ([(99, TRACKING, 1.0, MAPPED, True), (60, LOST, 1.0, MAPPED, True)], "not localized over 6.0 m", {Flag.NOT_LOCALISED}, False),
         ([(99, TRACKING, 1.0, MAPPED, True), (30, LOST, 1.0, MAPPED, True)], "", set(), False),
     ],
 )  # fmt: skip

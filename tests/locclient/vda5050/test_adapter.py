@@ -145,7 +145,7 @@ def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
     unknown = drive(None)
     assert "mobileRobotPosition" not in unknown
     (lost,) = (error for error in unknown["errors"] if error["errorType"] == "LOCALIZATION_ERROR")
-    assert "where it lies in the building" in lost["errorHint"]
+    assert "its pose in the building" in lost["errorHint"]
     assert adapter.ask("initializePosition", "a", **given)["actionStatus"] == "FAILED"
     place = drive(building_from_map)["mobileRobotPosition"]
     assert (place["x"], place["y"], place["theta"]) == pytest.approx((9.0, -17.0, np.pi / 2))

@@ -138,7 +138,7 @@ def test_links_lead_to_named_servers_alone(tmp_path: Path, file: bytes) -> None:
 
     with web_server(remember) as other, web_server(serve(b"", 302, Location=f"{other}/file")) as http:
         robot = Robot(tmp_path, http)
-        robot.refuses(LinkError, "leads to", f"{other}/file")
+        robot.refuses(LinkError, "points to", f"{other}/file")
         robot.refuses(LinkError, "answers 302", f"{http}/file")  # redirections are not followed
         host = http.removeprefix("http://")
         for link in (
