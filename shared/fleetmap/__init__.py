@@ -67,11 +67,11 @@ def _version() -> str:
     try:
         return metadata.version("fleetmap")
     except metadata.PackageNotFoundError:
-        return "0+source"  # a source tree that nobody installed
+        return "0+source"  # a source tree that is not installed
 
 
 def __getattr__(name: str) -> object:
-    """Imports a public name when it is first used (PEP 562)."""
+    """Import a public name at its first use (PEP 562)."""
     if name == "__version__":
         return _version()
     if name not in _MODULES:

@@ -1,6 +1,6 @@
-"""Who may say what on the bus: from the names in certificates to the rules that zenoh obeys.
+"""Access control of the bus: zenoh's rules, derived from the names in certificates.
 
-Nothing is allowed that no rule names. The list of certificates is therefore the list of who is not revoked.
+Messages without a rule are denied, so a certificate is revoked by removing it from the list.
 """
 
 from collections.abc import Iterable
@@ -13,9 +13,9 @@ from fleetmap.messages import MAP_PARTS, robot_key
 REPORTS = ("ack", "health", "pose", "estimate")
 QUESTIONS = ("wanted", "failures", "replays", "renew")
 ORDERS = ("wanted", "initial_pose")
-"""What the server alone publishes, to the robot that it is for: a copied identity could move its original otherwise."""
+"""Topics that only the server publishes, each to one robot: otherwise a copied identity could move the original robot."""
 ALIVE = ("alive",)
-# Far above what robots send: one message is dropped where two come closer together, without a burst.
+# Far above the rates of robots: zenoh drops a message that follows another one sooner than this; it allows no burst.
 _MOST_HZ = {"ack": 10.0, "health": 10.0, "pose": 60.0, "estimate": 60.0}
 _REPORT_BYTES, _QUESTION_BYTES = 1 << 16, 1 << 20
 _NOBODY = "-"
@@ -41,7 +41,7 @@ class Act(StrEnum):
 
 
 class Purpose(StrEnum):
-    """What a certificate is for: a robot's work, its first certificate of its own, or showing a survey under way."""
+    """Purpose of a certificate: operation of a robot, its first renewal (enrolment), or the display of a running survey."""
 
     ROBOT = "robot"
     ENROL = "enrol"
@@ -50,7 +50,7 @@ class Purpose(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who holds a certificate. certificate: its common name; site and robot: empty for a survey."""
+    """Holder of a certificate. certificate: its common name; site and robot: empty for a survey."""
 
     certificate: str
     site: str = ""
@@ -69,7 +69,7 @@ class Rule:
 
 
 class Access:
-    """The rules for some holders of certificates; nobody else may say anything."""
+    """Rules for the holders of certificates; all other participants are denied everything."""
 
     def __init__(self, holders: Iterable[Holder]) -> None:
         self._holders = {holder.certificate: holder for holder in holders}
@@ -82,19 +82,19 @@ class Access:
 
     @property
     def robot_count(self) -> int:
-        """How many robots are enrolled."""
+        """Number of enrolled robots."""
         return len(self._robots)
 
     def holder(self, certificate: str) -> Holder | None:
-        """Who holds a certificate of this name; None where nobody may."""
+        """Holder of the certificate of this name; None if unknown or revoked."""
         return self._holders.get(certificate)
 
     def has_robot(self, site: str, robot: str) -> bool:
-        """Whether such a robot is enrolled."""
+        """True if the robot is enrolled."""
         return (site, robot) in self._robots
 
     def zenoh_config(self) -> dict[str, Any]:
-        """Sections of zenoh's configuration that enforce the rules, and bound how often and how much a participant sends."""
+        """Sections of zenoh's configuration that enforce the rules and limit rate and size of a participant's messages."""
         groups: dict[tuple[Rule, ...], list[str]] = {}  # the certificates of one robot have the same rules
         for holder in self._holders.values():
             groups.setdefault(_rules(holder), []).append(holder.certificate)
@@ -134,7 +134,7 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
         return tuple(robot_key(holder.site, holder.robot, what) for what in whats)
 
     name = f"{holder.site}/{holder.robot}"
-    # A question and its answer are two messages in two directions; an answer that is an error is one too.
+    # A query and its reply are two messages in opposite directions; an error reply counts as a reply.
     if holder.purpose is Purpose.ENROL:
         renew = own(("renew",))
         return (

@@ -9,7 +9,7 @@ from itertools import pairwise
 from fleetmap.errors import FleetmapError, UsageError
 
 PRINTED = re.compile(r"`(mapserver [a-z][^`]*)`")
-# Commands that need each option, by their first words
+# Commands that need each option, by their first arguments
 _NEEDS = {
     "--site": re.compile(
         r"mapserver (build|live|nightly|publish|promote|rollback|versions|inspect|diff|export|align|areas|grid|map"
@@ -21,9 +21,9 @@ INTERRUPTED = 130  # the status that shells use for Ctrl-C
 
 
 def run_cli(app: Callable[[], object]) -> None:
-    """Runs a command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130.
+    """Run a command line; a FleetmapError becomes its message on stderr and its exit status, Ctrl-C becomes 130.
 
-    A library that is not installed becomes the name of the extra that brings it.
+    A missing library is reported with the extra that installs it.
     """
     try:
         app()
@@ -44,7 +44,7 @@ def run_cli(app: Callable[[], object]) -> None:
 
 
 def runnable(text: str, arguments: list[str]) -> str:
-    """The text, its commands of mapserver with the site and store, or the settings file, of this command line: they run as printed."""
+    """Add site and store, or the settings file, of this command line to the `mapserver` commands in a text: they run as printed."""
     given = dict(pair for pair in pairwise(arguments) if pair[0].startswith("--"))
     given |= dict(word.split("=", 1) for word in arguments if word.startswith("--") and "=" in word)
 
@@ -62,7 +62,7 @@ def runnable(text: str, arguments: list[str]) -> str:
 
 
 def require_extra(extra: str, program: str) -> None:
-    """UsageError where libraries of an extra are not installed, with what to install; a source tree that is not installed passes."""
+    """Raise UsageError if libraries of an extra are missing, with the install command; a source tree that is not installed passes."""
     from importlib import metadata  # takes a tenth of a second
 
     try:

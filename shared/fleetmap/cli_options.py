@@ -1,6 +1,6 @@
 """Options of commands: frozen dataclasses that typer shows as options, and a TOML file that gives their defaults.
 
-A command takes a train of options as one value of a dataclass whose fields are annotated as typer's parameters are;
+A command takes a group of options as one value of a dataclass whose fields are annotated as typer's parameters are;
 `expand_options` shows typer the fields. The configuration file has a section for each command, derived from its signature.
 """
 
@@ -23,12 +23,12 @@ Command = Callable[..., None]
 Options = dict[str, Any]  # values by option; by command and option for a program or a group
 ReadConfig = Callable[[Path | None], tuple[Any, Options]]  # a file's settings, and the options that it sets
 
-COMMON_KEYS = ("site", "store")  # said once at the top of a file, they reach every command that needs them
+COMMON_KEYS = ("site", "store")  # set once at the top of a file, they apply to every command that needs them
 _FILE = "fleetmap.config"
 
 
 class Group(NamedTuple):
-    """Commands behind a common first word."""
+    """Commands with a common prefix."""
 
     help: str
     commands: Mapping[str, Command]
@@ -45,7 +45,7 @@ class Program(NamedTuple):
 
 
 def expand_options(command: Command) -> Command:
-    """The command with the fields of its dataclass parameters in their place, as options of their own."""
+    """Replace the dataclass parameters of a command by their fields, as separate options."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
@@ -80,13 +80,13 @@ def _fields(kind: Any) -> list[inspect.Parameter]:
 
 
 def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> typer.Typer:
-    """A program of these commands; `callback` holds its own options, `read_config` serves --config."""
+    """Create a program of these commands; `callback` holds its own options, `read_config` serves --config."""
     settings: dict[str, Any] = {"obj": Program(commands, read_config), "max_content_width": 140}
     app = typer.Typer(
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,  # help in frames would cost every call 0.3 s
+        rich_markup_mode=None,  # framed help would cost every call 0.3 s
         context_settings=settings,
     )
     app.callback()(callback)
@@ -102,10 +102,10 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> 
 
 
 class RetiringCommand(typer.core.TyperCommand):
-    """A command that refuses an option which is gone with what replaces it."""
+    """A command that refuses removed options and names their replacement."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As typer's; UsageError for an option that is gone."""
+        """As typer's; UsageError for a removed option."""
         known = {option for parameter in self.params for option in parameter.opts}
         for option in {word.partition("=")[0] for word in args if word.startswith("--")} - known:
             from fleetmap.config import RETIRED
@@ -116,7 +116,7 @@ class RetiringCommand(typer.core.TyperCommand):
 
 
 def options_of(command: Command) -> dict[str, inspect.Parameter]:
-    """A command's options by their keys in the file; --config has none."""
+    """Options of a command by their keys in the file; --config has none."""
     return {
         name.rstrip("_"): parameter
         for name, parameter in inspect.signature(command, eval_str=True).parameters.items()
@@ -159,7 +159,7 @@ def toml_type(parameter: inspect.Parameter) -> Any:
 
 
 def command_defaults(given: Mapping[str, Any], commands: Commands) -> Options:
-    """Options that a file's content sets, by command; the common keys where a command needs one and its section has none."""
+    """Options that a file sets, by command; a common key applies if a command needs it and its section lacks it."""
     common = {key: given[key] for key in COMMON_KEYS if key in given}
     found: Options = {}
     for name, command in commands.items():
@@ -175,7 +175,7 @@ def command_defaults(given: Mapping[str, Any], commands: Commands) -> Options:
 
 
 def take_defaults(context: typer.Context, path: Path | None) -> Path | None:
-    """Callback of --config: the file's section becomes the command's defaults (before the command: all sections)."""
+    """Callback of --config: make the file's section the command's defaults (before the command: all sections)."""
     if path is None or context.resilient_parsing:
         return path
     _, sections = context.obj.read_config(path)
@@ -187,7 +187,7 @@ def take_defaults(context: typer.Context, path: Path | None) -> Path | None:
 
 
 def _words(context: typer.Context) -> list[str]:
-    """The command's words behind the program's name: none for the program itself, two for a command of a group."""
+    """Names after the program's name: none for the program itself, two for a command of a group."""
     parent: Any = context.parent
     return [] if parent is None else [*_words(parent), context.info_name or ""]
 

@@ -73,7 +73,7 @@ class Setting(NamedTuple):
 
 
 def load_toml(path: Path, section_type: type[S]) -> S:
-    """The settings of the file at `path`; keys that it leaves out keep their defaults.
+    """Load the settings in the file at `path`; missing keys keep their defaults.
 
     Raises UsageError naming the file and the offending key for unreadable files, unknown keys and wrong types.
     """
@@ -82,7 +82,7 @@ def load_toml(path: Path, section_type: type[S]) -> S:
 
 
 def read_given(path: Path, file_type: type[Section]) -> dict[str, Any]:
-    """The keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`."""
+    """Return the keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`."""
     _decoded(path, file_type)
     given: dict[str, Any] = _decoded(path, dict[str, Any])
     return given
@@ -97,7 +97,7 @@ def _decoded(path: Path, kind: Any) -> Any:
         return msgspec.toml.decode(data, type=kind)
     except OSError as error:
         raise UsageError(f"configuration file {path} cannot be read ({error.strerror}); check the path") from error
-    # tomllib's own errors for bytes that are no UTF-8, for impossible dates, and for deep nesting
+    # tomllib's own errors for invalid UTF-8, impossible dates and deep nesting
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         text = str(error)[:500]
         unknown = re.search(r"unknown field `(\w+)`(?: - at `\$\.([\w.]+)`)?", text)
@@ -117,13 +117,13 @@ def settings_in(section: Section, name: str = "") -> Iterator[Setting]:
 
 
 def tier_of(setting: Setting, tiers: Tiers) -> str | None:
-    """The tier of a setting, None for an internal constant."""
+    """Tier of a setting, None for an internal constant."""
     fitting = (name for name, keys in tiers.items() if {setting.key, "*"} & set(keys.get(setting.section, "").split()))
     return next(fitting, None)
 
 
 def refuse_internal(path: Path, given: Mapping[str, Any], defaults: Section, tiers: Tiers) -> None:
-    """Raises UsageError where the file at `path`, with the keys `given`, sets an internal constant of `defaults`."""
+    """Raise UsageError if the file at `path`, with the keys `given`, sets an internal constant of `defaults`."""
     for setting in settings_in(defaults):
         section: Any = given
         for word in filter(None, setting.section.split(".")):
@@ -137,7 +137,7 @@ def refuse_internal(path: Path, given: Mapping[str, Any], defaults: Section, tie
 
 
 def over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Two contents of files as one: where both set a key, that of `above` counts."""
+    """Merge the contents of two files; `above` takes precedence."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)

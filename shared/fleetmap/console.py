@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 
 
 def plain_console(*, stderr: bool = False) -> "Console":
-    """A console that shows words as they are: in names of sites, files and people `[red]` is no colour and `:smile:` no picture."""
+    """Create a console that prints text literally: in names of sites, files and users `[red]` and `:smile:` are not markup."""
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False)

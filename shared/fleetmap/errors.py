@@ -1,19 +1,19 @@
-"""Everything that can go wrong with what comes from outside: files, network, users.
+"""Errors caused by external input: files, network, users.
 
 FleetmapError                      exit status 3
-├── UsageError                     exit status 2: a command line or setting that cannot be right
-│   └── StateError                 what is asked for does not fit the state that something is in
+├── UsageError                     exit status 2: an invalid command line or setting
+│   └── StateError                 a request that does not fit the current state
 ├── RecordingError                 a recording that cannot be read or contradicts itself
 │   └── CalibrationError           missing or impossible calibration
 ├── SurveyError                    a recording from which no correct map can be made
-├── MapFormatError                 tile, manifest or vocabulary bytes that are not what they claim
-│   └── NewerFormatError           made by a newer fleetmap; names the version that is needed
+├── MapFormatError                 invalid tile, manifest or vocabulary bytes
+│   └── NewerFormatError           made by a newer fleetmap; names the required version
 ├── StoreError                     a store that cannot be opened, read or written
-├── LinkError                      the other side cannot be reached, refuses or answers nonsense
-│   ├── UnreachableError           nobody answered in time; asking again later may help
-│   └── UntrustedError             signed lists refuse it; begins with rollback:, freeze:, signature: or size:
+├── LinkError                      the other side cannot be reached, refuses or sends an invalid reply
+│   ├── UnreachableError           no reply in time; a later retry may help
+│   └── UntrustedError             refused by signed lists; begins with rollback:, freeze:, signature: or size:
 ├── GateRefusedError               exit status 4: the draft is not good enough to publish
-└── BusyError                      exit status 5: another process is at the same work
+└── BusyError                      exit status 5: another process does the same work
 
 The message holds the offending value and the next step. Caught only in the commands' `main` and the HTTP API.
 "I do not know where I am" is a value with a status, never one of these.
@@ -31,13 +31,13 @@ class FleetmapError(Exception):
 
 
 class UsageError(FleetmapError):
-    """A command line or a setting that cannot be right."""
+    """An invalid command line or setting."""
 
     exit_status = 2
 
 
 class StateError(UsageError):
-    """Something that does not fit the state of what it is asked of, such as promoting a draft."""
+    """A request that does not fit the current state, such as promoting a draft."""
 
 
 class RecordingError(FleetmapError):
@@ -53,7 +53,7 @@ class SurveyError(FleetmapError):
 
 
 class MapFormatError(FleetmapError):
-    """Tile, manifest or vocabulary bytes that are not what they claim to be."""
+    """Invalid tile, manifest or vocabulary bytes."""
 
 
 class NewerFormatError(MapFormatError):
@@ -65,15 +65,15 @@ class StoreError(FleetmapError):
 
 
 class LinkError(FleetmapError):
-    """The other side cannot be reached, refuses or answers nonsense."""
+    """The other side cannot be reached, refuses or sends an invalid reply."""
 
 
 class UnreachableError(LinkError):
-    """Nobody answered in time; asking again later may help."""
+    """No reply in time; a later retry may help."""
 
 
 class UntrustedError(LinkError):
-    """Something that the signed lists of maps do not allow. The message begins with the kind of attack that it would be."""
+    """A map or list that the signed lists do not allow. The message begins with the kind of attack."""
 
     def __init__(self, kind: Literal["rollback", "freeze", "signature", "size"], words: object) -> None:
         self.kind, self.words = kind, str(words)
@@ -87,14 +87,14 @@ class GateRefusedError(FleetmapError):
 
 
 class BusyError(FleetmapError):
-    """Another process is at the same work; it ends by itself."""
+    """Another process does the same work; it ends by itself."""
 
     exit_status = 5
 
 
 @contextmanager
 def disk_errors(fault: object, advice: str, kind: type[FleetmapError] = StoreError) -> Iterator[None]:
-    """Raises `kind` in the place of an OSError of the block: "FAULT (the system's reason); ADVICE"."""
+    """Turn an OSError of the block into `kind`: "FAULT (the system's reason); ADVICE"."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,6 @@
-"""What robots tell servers of a failure's seconds: the parts in which a recording of them travels, and the summary in it.
+"""Messages about a failure's recording from robot to server: its parts in transfer, and the summary in it.
 
-No reader of recordings is needed for either: who only forwards them does not load OpenCV.
+Neither needs a reader of recordings: programs that only forward them do not load OpenCV.
 """
 
 from itertools import pairwise
@@ -20,7 +20,7 @@ Stamp = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 
 
 class ReplayPart(msgspec.Struct, frozen=True, kw_only=True):
-    """Some of total_bytes of a failure's recording, from offset on, as they travel; id: of its report."""
+    """Part of a failure's recording in transfer, from offset on; total_bytes: of the whole recording; id: of its report."""
 
     id: Text
     total_bytes: Annotated[int, msgspec.Meta(ge=1, le=1 << 40)]
@@ -29,7 +29,7 @@ class ReplayPart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Moment(msgspec.Struct, frozen=True, array_like=True):
-    """What the robot said of one frame; position, heading (of the body's x axis, from x towards y) and radius None without a pose."""
+    """The robot's estimate for one frame; position, heading (of the body's x axis, from x towards y) and radius None without a pose."""
 
     stamp_ns: Stamp
     status: Text
@@ -40,15 +40,15 @@ class Moment(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def figures(self) -> tuple[float, ...]:
-        """All numbers of the pose."""
+        """All numbers of the pose, in one tuple."""
         found = (*(self.position_map_m or ()), self.heading_rad, self.radius_95_m)
         return tuple(value for value in found if value is not None)
 
 
 class FailureSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """Whose failure it is, and what the robot said meanwhile.
+    """Robot and time of a failure, with the robot's estimates during it.
 
-    id: of the report. began_ns: its stamp_ns. version, manifest_sha256: the map that the robot used at the beginning, None without one.
+    id: of the report. began_ns: its stamp_ns. version, manifest_sha256: the robot's map at the beginning, None without one.
     client: version of fleetmap. pictures: `full` or `blurred`.
     """
 
@@ -64,7 +64,7 @@ class FailureSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decode_summary(data: bytes) -> FailureSummary:
-    """The summary; RecordingError for bytes that are none."""
+    """Decode a summary; RecordingError for invalid bytes."""
     if len(data) > _MAX_SUMMARY_BYTES:
         raise RecordingError(f"a failure's summary of {len(data)} bytes; the limit is {_MAX_SUMMARY_BYTES}")
     try:

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, also after a kill and a power cut. Every call goes through `os`, where tests make it fail."""
+"""Atomic writes of files, safe against kills and power cuts. Every call goes through `os`, where tests inject failures."""
 
 import os
 import secrets
@@ -10,18 +10,18 @@ from typing import BinaryIO
 
 from fleetmap.errors import disk_errors
 
-OWN_FILE = 0o600  # maps, positions and pictures are nobody else's business on a shared machine
+OWN_FILE = 0o600  # maps, positions and images are private on a shared machine
 TEMPORARY_SUFFIX = ".tmp"
-_LEFT_AFTER_S = 86_400.0  # nobody writes one file for a day: what is older is of a process that was killed
+_LEFT_AFTER_S = 86_400.0  # no write takes a day: an older temporary file belongs to a killed process
 
 
 def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) -> None:
-    """The file at `path` holds the chunks afterwards, or what it held before.
+    """Write the chunks to the file at `path`, or leave the file as it was.
 
-    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either; what a killed process
-    left of the same file goes after a day.
+    Temporary file, fsync, rename, fsync of the folder. An error of the iterable leaves nothing behind either; files that a killed process
+    left of the same file are removed after a day.
 
-    Raises OSError where the disk refuses.
+    Raises OSError if the disk refuses.
     """
     prefix = f".{path.name[:16]}."
     _remove_leftovers(path.parent, prefix)
@@ -43,7 +43,7 @@ def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) 
 
 
 def sync_path(path: Path) -> None:
-    """Makes the bytes of a file, or the names in a folder, survive a power cut."""
+    """Sync the bytes of a file, or the names in a folder, to the disk, so that they survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -53,7 +53,7 @@ def sync_path(path: Path) -> None:
 
 @contextmanager
 def appearing_file(path: Path) -> Iterator[BinaryIO]:
-    """The file at a path, which appears there when the block ends well. Raises StoreError where the disk refuses."""
+    """Open a file that appears at its path when the block succeeds. Raises StoreError if the disk refuses."""
     part = path.with_name(path.name + ".part")
     with disk_errors(f"{part} cannot be written", "choose another place"):
         file = part.open("wb")

@@ -1,10 +1,10 @@
-"""Memory that a process no longer uses, back to the system."""
+"""Return of unused memory to the system."""
 
 import ctypes
 
 
 def give_back_free_memory() -> None:
-    """Returns to the system what the C library holds for later: a third of a long survey's peak. Without glibc nothing."""
+    """Return memory cached by the C library to the system: a third of a long survey's peak. Does nothing without glibc."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

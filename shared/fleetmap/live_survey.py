@@ -1,4 +1,4 @@
-"""The message of a survey under way, and the key of the bus that carries it."""
+"""Message of a running survey, and its key on the bus."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ _Bytes = Annotated[bytes, msgspec.Meta(max_length=MAX_ARRAY_BYTES)]
 
 
 class LivePart(msgspec.Struct, frozen=True, kw_only=True):
-    """Keyframes that are known to lie to each other, from start_s to end_s of the recording; is_map: it has most of them."""
+    """Keyframes with known relative poses, from start_s to end_s of the recording; is_map: it has most of the keyframes."""
 
     start_s: float
     end_s: float
@@ -26,7 +26,7 @@ class LivePart(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LiveRevisit(msgspec.Struct, frozen=True, kw_only=True):
-    """A candidate for a revisit: keyframe at at_s seconds against that at seen_s; its verdict, why in words, matches that agreed."""
+    """A candidate for a revisit: keyframe at at_s seconds against that at seen_s; its verdict, the reason as text, agreeing matches."""
 
     at_s: float
     seen_s: float
@@ -36,7 +36,7 @@ class LiveRevisit(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LiveMissing(msgspec.Struct, frozen=True, kw_only=True):
-    """A heading (E along x, N along y of the survey's frame) that nothing looks at around a place that was passed the other way."""
+    """A heading (E along x, N along y of the survey's frame) that no image covers, at a place passed only in the opposite direction."""
 
     x_m: float
     y_m: float
@@ -45,17 +45,17 @@ class LiveMissing(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
-    """A survey under way, as of the frame at stamp_ns; coordinates are metres in its own upright frame.
+    """State of a running survey at the frame at stamp_ns; coordinates are metres in its own upright frame.
 
-    phase: `tracking`, `adjusting` while the finished map is made, `stored` as draft `version`, or `failed`, why being in `words`.
-    seconds: of the recording so far. behind: keyframes that mapping has not taken yet. latency_ms: 0.99 of the frames were answered in
-    less, None where frames were not played at their own speed; late_frames: those that took longer than the time to the next one.
+    phase: `tracking`, `adjusting` while the finished map is made, `stored` as draft `version`, or `failed`, with the reason in `words`.
+    seconds: of the recording so far. behind: keyframes waiting for mapping. latency_ms: 99th percentile of the processing time of a
+    frame, None unless frames were played in real time; late_frames: those that took longer than the time to the next one.
     path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: little-endian float32, thinned evenly. quality (N,): bytes, 0 where
-    tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART where too little was seen to belong
-    to any. More than one part: the survey lost itself, and no sure revisit has joined them yet. loops, refused: how many, and of which
+    tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART if too little was seen to belong
+    to any. More than one part: tracking was lost, and no certain revisit has joined them yet. loops, refused: how many, and of which
     verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
-    estimate: where the newest keyframe is in this map, odometry's frame in the place of `odom`.
-    scale_known: False for one camera: the map that grows is in a unit of its own, with an IMU too. picture: JPEG of the newest keyframe.
+    estimate: pose of the newest keyframe in this map, with odometry's frame as `odom`.
+    scale_known: False for one camera: the growing map has an arbitrary unit, even with an IMU. picture: JPEG of the newest keyframe.
     """
 
     site: Name
@@ -86,13 +86,13 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     words: Text = ""
 
     def path(self) -> Array:
-        """(N, 3) x, y and quality from 0 to 1; raises LinkError where they do not fit each other."""
+        """(N, 3) x, y and quality from 0 to 1; raises LinkError if their sizes differ."""
         places, quality = _rows(self.path_m, 2, "path_m"), np.frombuffer(self.quality, np.uint8)
         _check_length(len(places), len(quality), "qualities")
         return np.column_stack([places, quality / 255.0])
 
     def part_numbers(self) -> NDArray[np.uint8]:
-        """(N,) of the path's places, NO_PART where none were sent; raises LinkError where they do not fit the path or name no part."""
+        """(N,) part numbers along the path, NO_PART if none were sent; raises LinkError for a wrong size or an invalid part number."""
         if not self.part:
             return np.full(len(self.path_m) // 8, NO_PART, np.uint8)
         numbers = np.frombuffer(self.part, np.uint8)
@@ -103,15 +103,15 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
         return numbers
 
     def landmarks(self) -> Array:
-        """(M, 2); raises LinkError for bytes that are no places."""
+        """(M, 2); raises LinkError for invalid bytes."""
         return _rows(self.landmarks_m, 2, "landmarks_m")
 
     def loop_lines(self) -> Array:
-        """(L, 4) x and y from and to; raises LinkError for bytes that are no lines."""
+        """(L, 4) x and y from and to; raises LinkError for invalid bytes."""
         return _rows(self.loops_m, 4, "loops_m")
 
     def covered(self) -> Array:
-        """(T, 3); raises LinkError for bytes that are no squares."""
+        """(T, 3); raises LinkError for invalid bytes."""
         return _rows(self.cells, 3, "cells")
 
 
@@ -132,5 +132,5 @@ def _rows(data: bytes, columns: int, name: str) -> Array:
 
 
 def live_key(site: str) -> str:
-    """Key of a site's survey under way; '*' for any."""
+    """Key of a site's running survey; '*' for any site."""
     return f"fleetmap/{site}/live/survey"

@@ -1,4 +1,4 @@
-"""Lines of the log: one line a message, whatever robots and browsers write into it, and few lines where they write much."""
+"""Log lines: one line per message, whatever text robots and browsers send, and a rate limit."""
 
 import logging
 import threading
@@ -8,18 +8,18 @@ from types import TracebackType
 
 _FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 _MINUTE_S = 60.0
-_MAX_KEYS = 60  # lines a minute of all keys together: whoever floods under invented names gets no more
+_MAX_KEYS = 60  # lines a minute of all keys together: a flood under invented names gets no more
 
 
 def log_to_stderr(level: int, line_format: str = _FORMAT) -> None:
-    """Sends the log of this program to stderr, each message as one line."""
+    """Send the log of this program to stderr, each message as one line."""
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter(line_format))
     logging.basicConfig(level=level, handlers=[handler])
 
 
 def printable(words: str) -> str:
-    """The words with everything that cannot be shown as Python escapes it: line breaks, control signs, halves of surrogates."""
+    """Escape unprintable characters as Python does: line breaks, control characters, lone surrogates."""
     return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in words)
 
 
@@ -38,7 +38,7 @@ class LineFormatter(logging.Formatter):
 
 
 class LogLimit:
-    """One line a key and minute of something that others cause, however often they do; methods may be called from any thread."""
+    """Limits the log to one line per key and minute for events caused by clients; methods may be called from any thread."""
 
     def __init__(self, log: logging.Logger, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._log, self._clock_s = log, clock_s
@@ -48,7 +48,7 @@ class LogLimit:
         self._others = 0
 
     def warning(self, key: str, words: str, *values: object) -> None:
-        """Logs the words unless this key has a line in the running minute, or too many others have."""
+        """Log the text unless this key has a line in the current minute, or too many other keys have."""
         key = key[:200]
         with self._lock:
             now_s, told = self._clock_s(), ""
@@ -66,7 +66,7 @@ class LogLimit:
             self._log.warning(words, *values)
 
     def _summary(self) -> str:
-        """What was not logged, in words."""
+        """Text about suppressed lines."""
         most = sorted(((count, key) for key, count in self._counts.items() if count > 1), reverse=True)[:5]
         parts = [f"{count - 1} more of {key!r}" for count, key in most]
         return ", ".join([*parts, *([f"{self._others} of further keys"] if self._others else [])])

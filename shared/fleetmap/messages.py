@@ -1,19 +1,19 @@
 """Messages between robots and the server, as MessagePack, and the keys of the bus that carry them.
 
-fleetmap/{site}/robots/{robot}/wanted    asked by the robot; published by the server when it changes: WantedVersion
-fleetmap/{site}/robots/{robot}/initial_pose published by the server when a person says where the robot stands: InitialPoseMessage
+fleetmap/{site}/robots/{robot}/wanted    queried by the robot; published by the server when it changes: WantedVersion
+fleetmap/{site}/robots/{robot}/initial_pose published by the server when an operator sets the robot's pose: InitialPoseMessage
 fleetmap/{site}/robots/{robot}/ack       published by the robot: RobotAck
 fleetmap/{site}/robots/{robot}/health    published by the robot: RobotHealth
 fleetmap/{site}/robots/{robot}/pose      published by the robot: PoseMessage
 fleetmap/{site}/robots/{robot}/estimate  published by the robot for every frame: EstimateMessage
-fleetmap/{site}/robots/{robot}/failures  asked by the robot, FailureReport: FailureAck, once the server has it on its disk
-fleetmap/{site}/robots/{robot}/replays   asked by the robot, ReplayPart: FailureAck, with how much of a failure's recording has come
+fleetmap/{site}/robots/{robot}/failures  queried by the robot, FailureReport: FailureAck, once the server has stored it
+fleetmap/{site}/robots/{robot}/replays   queried by the robot, ReplayPart: FailureAck, with the received bytes of a failure's recording
 fleetmap/{site}/robots/{robot}/alive     liveliness token of the robot
-fleetmap/{site}/robots/{robot}/renew     asked by the robot with its next key: fleetmap.trust.enrolment
-fleetmap/{site}/robots/{robot}/manifests/{version} asked by the robot, ChunkRequest: Part of a manifest
-fleetmap/{site}/robots/{robot}/blobs/{sha256} asked by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
-fleetmap/{site}/robots/{robot}/trust/{file} asked by the robot, ChunkRequest: Part of a file of the signed lists, empty where there is none
-fleetmap/{site}/live/survey              published by a survey under way: fleetmap.live_survey
+fleetmap/{site}/robots/{robot}/renew     queried by the robot with its next key: fleetmap.trust.enrolment
+fleetmap/{site}/robots/{robot}/manifests/{version} queried by the robot, ChunkRequest: Part of a manifest
+fleetmap/{site}/robots/{robot}/blobs/{sha256} queried by the robot, ChunkRequest: Part of a tile, vocabulary or manifest
+fleetmap/{site}/robots/{robot}/trust/{file} queried by the robot, ChunkRequest: Part of a file of the signed lists, empty if absent
+fleetmap/{site}/live/survey              published by a running survey: fleetmap.live_survey
 """
 
 import math
@@ -28,10 +28,10 @@ from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
 MAX_MESSAGE_BYTES = 1 << 20
-PART_BYTES = 256 << 10  # small enough to come within seconds over a poor radio, and to be asked for again
+PART_BYTES = 256 << 10  # small enough to arrive within seconds over a poor radio link, and to be repeated
 MAX_THUMBNAIL_BYTES = 64 << 10  # four of them and the rest of a failure's report stay far below a message's limit
 _ROOT = "fleetmap"
-MAP_PARTS = ("manifests", "blobs", "trust")  # of what a robot asks for a map, behind its own name
+MAP_PARTS = ("manifests", "blobs", "trust")  # of a robot's map queries, after its name
 _MAX_KEY = 256  # two names and two addresses of bytes
 
 Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -44,8 +44,8 @@ Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
 class Status(StrEnum):
     """Status of a robot's estimate.
 
-    Messages carry statuses, causes and kinds as text, not as these types: another version of fleetmap may send others, which the
-    receiver keeps and shows as they are.
+    Messages carry statuses, causes and kinds as text, not as these types: another version of fleetmap may send unknown ones, which
+    the receiver keeps and shows unchanged.
     """
 
     INITIALISING = "INITIALISING"
@@ -79,7 +79,7 @@ class Cause(StrEnum):
 
 
 class Flag(StrEnum):
-    """What a robot raises in its health report beside causes; docs/service.md explains each."""
+    """Flag in a robot's health report, in addition to causes; docs/service.md explains each."""
 
     BLIND = "blind"
     NOT_LOCALISED = "not_localised"
@@ -91,7 +91,7 @@ class Flag(StrEnum):
 
 
 class FailureKind(StrEnum):
-    """`blind`: no position that may be relied upon. `suspected`: tracking, but fixes contradict it. `not_found`: it searches for itself."""
+    """`blind`: no reliable position. `suspected`: tracking, but fixes contradict it. `not_found`: it still searches for its place."""
 
     BLIND = "blind"
     SUSPECTED = "suspected"
@@ -99,14 +99,14 @@ class FailureKind(StrEnum):
 
 
 class ChunkRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """Asks for at most max_bytes from offset on; an empty payload asks for the first part."""
+    """Query for at most max_bytes from offset on; an empty payload requests the first part."""
 
     offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)] = 0
     max_bytes: Annotated[int, msgspec.Meta(ge=1, le=PART_BYTES)] = PART_BYTES
 
 
 class Part(msgspec.Struct, frozen=True, kw_only=True):
-    """Some of total_bytes, from offset on; empty only beyond their end."""
+    """Part of a file of total_bytes, from offset on; empty only beyond the end."""
 
     total_bytes: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
     offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
@@ -114,7 +114,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
-    """The version that a robot should run; None while the site has none."""
+    """Version that a robot should run; None while the site has none."""
 
     site: Name
     version: Version | None
@@ -122,9 +122,9 @@ class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class InitialPoseMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """A person's word of where the robot's base stands on the floor of `map`, as ROS's `initialpose`.
+    """Pose of the robot's base on the floor of `map`, set by an operator, as ROS's `initialpose`.
 
-    heading_rad: from x towards y, None where nobody said it. sigma_m: standard deviation along x and along y.
+    heading_rad: from x towards y, None if not given. sigma_m: standard deviation along x and along y.
     """
 
     site: Name
@@ -136,7 +136,7 @@ class InitialPoseMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
-    """The version that a robot runs. refused: why it does not run the wanted one, empty if it does."""
+    """Version that a robot runs. refused: why it does not run the wanted one, empty if it does."""
 
     site: Name
     robot: Name
@@ -158,10 +158,10 @@ HEALTH_FIGURES = (
     "landmarks_expected",
     "landmarks_seen",
 )
-"""Metrics of RobotHealth that the server evaluates; a robot leaves out what it does not know. Since the report before:
+"""Metrics of RobotHealth that the server evaluates; a robot omits unknown ones. Since the previous report:
 fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
 fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
-both in metres only where the robot was TRACKING. Since the run began: frames, frames_dropped, landmarks_expected and
+both in metres only where the robot was TRACKING. Since the start of the run: frames, frames_dropped, landmarks_expected and
 landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix. The others are current."""
 
 
@@ -189,7 +189,7 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, target_from_source: Array) -> Self:
-        """The message part of a transform (4, 4)."""
+        """Convert a transform (4, 4) to a message."""
         x, y, z = target_from_source[:3, 3].tolist()
         qw, qx, qy, qz = quat_wxyz_from_rotation(target_from_source[:3, :3]).tolist()
         return cls(position_m=(x, y, z), quat_wxyz=(qw, qx, qy, qz))
@@ -214,7 +214,7 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
     def of(
         cls, stamp_ns: int, map_from_base: Array, cov_rot_trans: Array, status: str, map_version: int | None
     ) -> Self:
-        """The message of map_from_base (4, 4) with cov_rot_trans (6, 6)."""
+        """Convert map_from_base (4, 4) with cov_rot_trans (6, 6) to a message."""
         assert map_from_base.shape == (4, 4)
         assert cov_rot_trans.shape == (6, 6)
         placed = Placement.of(map_from_base)
@@ -236,9 +236,9 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
 class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Estimate of one frame for the navigation of the robot itself.
 
-    cause: a `Cause`, what stands in the way of TRACKING. odom_from_base is continuous; map_from_odom moves with every fix and is None
+    cause: a `Cause`, why the status is not TRACKING. odom_from_base is continuous; map_from_odom moves with every fix and is None
     while there is no single pose. cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it.
-    hypotheses: competing poses while AMBIGUOUS. calibration: which parameter is wrong by how much, where the cause is that.
+    hypotheses: competing poses while AMBIGUOUS. calibration: the wrong parameter and its error, if that is the cause.
     """
 
     stamp_ns: int
@@ -255,8 +255,8 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
 class FixNote(msgspec.Struct, frozen=True, kw_only=True):
     """One comparison of a frame with the map before a failure.
 
-    position_map_m is None without a fix; refused: why it was not used. innovation: its squared Mahalanobis distance, None
-    where nothing was predicted.
+    position_map_m is None without a fix; refused: reason why it was not used. innovation: its squared Mahalanobis distance, None
+    without a prediction.
     """
 
     stamp_ns: int
@@ -268,7 +268,7 @@ class FixNote(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
-    """A small JPEG. kind: `frame`, the left image; `matches`, the same beside the landmarks that the map expects in it."""
+    """A small JPEG. kind: `frame`, the left image; `matches`, the same beside the landmarks expected by the map."""
 
     stamp_ns: int
     kind: Name
@@ -276,7 +276,7 @@ class Thumbnail(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot's left camera after rectification, without distortion, and its mounting; reports of older robots have none."""
+    """A robot's left camera after rectification, without distortion, and its mounting; older robots do not report it."""
 
     size_px: tuple[int, int]
     focal_px: float
@@ -287,14 +287,14 @@ class CameraNote(msgspec.Struct, frozen=True, kw_only=True):
 class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     """A position failure with its context, as docs/reports.md defines failures.
 
-    Sent until it is acknowledged; (site, robot, id) is unique for ever, so that what arrives twice is stored once.
+    Sent until it is acknowledged; (site, robot, id) is unique forever, so that duplicates are stored once.
 
-    stamp_ns: when it began, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: how long it had lasted
-    when it was detected. kind: a `FailureKind`; suspected ones estimate silent failures and are not a count. cause: a `Cause`.
-    tile, map_from_base, radius_95_m: what the robot believed when it began, None where it had claimed no pose. wrong_by_m: how far from
-    there fixes that agree with each other put it, None where none do. landmarks_expected, landmarks_seen: in the image from which on
-    the robot was not localised, by its belief then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
-    between neighbouring pixels of a row, 1 is typical for the robot. calibration: which parameter is wrong by how much, empty for none.
+    stamp_ns: start, sensor clock; wall_ns: the same moment by the robot's wall clock. duration_s: its duration
+    when it was detected. kind: a `FailureKind`; suspected ones estimate silent failures and are not counted. cause: a `Cause`.
+    tile, map_from_base, radius_95_m: the robot's estimate at the start, None without a pose. wrong_by_m: distance from it to
+    the place of fixes that agree with each other, None without such fixes. landmarks_expected, landmarks_seen: in the first image in which
+    the robot was not localised, by its estimate then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
+    between neighbouring pixels of a row, 1 is typical for the robot. calibration: the wrong parameter and its error, empty for none.
     """
 
     site: Name
@@ -324,8 +324,8 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
-    """The server has this report on its disk, now or since before. refused: why it never will, so that it is not sent again.
-    received_bytes: of the failure's recording, from its beginning on; all of them once it is kept."""
+    """The server has stored this report, now or earlier. refused: reason for a permanent refusal, so that it is not sent again.
+    received_bytes: of the failure's recording, from its beginning on; its size once it is stored."""
 
     id: Name
     refused: Text = ""
@@ -336,12 +336,12 @@ M = TypeVar("M", bound=msgspec.Struct)
 
 
 def encode_message(message: msgspec.Struct) -> bytes:
-    """MessagePack of a message."""
+    """Encode a message as MessagePack."""
     return to_msgpack(message)
 
 
 def decode_message(data: bytes, message_type: type[M]) -> M:
-    """The message of `data`; raises LinkError for bytes that are not one of that type."""
+    """Decode the message in `data`; raises LinkError for bytes of another type."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise LinkError(f"{message_type.__name__} of {len(data)} bytes, the limit is {MAX_MESSAGE_BYTES}")
     try:
@@ -353,7 +353,7 @@ def decode_message(data: bytes, message_type: type[M]) -> M:
 
 
 def part_of(data: bytes, question: bytes) -> bytes:
-    """The encoded Part of `data` that an encoded ChunkRequest asks for; raises LinkError as `decode_message`."""
+    """Return the encoded Part of `data` for an encoded ChunkRequest; raises LinkError as `decode_message`."""
     asked = decode_message(question, ChunkRequest) if question else ChunkRequest()
     part = data[asked.offset : asked.offset + asked.max_bytes]
     return encode_message(Part(total_bytes=len(data), offset=asked.offset, data=part))
@@ -366,7 +366,7 @@ def report_dict(message: msgspec.Struct) -> dict[str, Any]:
 
 
 def finite(value: Any) -> Any:
-    """Plain values with null for every number that JSON does not have."""
+    """Plain values with null for numbers that JSON lacks."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -375,12 +375,12 @@ def finite(value: Any) -> Any:
 
 
 def robot_key(site: str, robot: str, what: str) -> str:
-    """Key of what a robot asks or tells, such as `wanted` or `blobs/{sha256}`; '*' for any site or robot."""
+    """Key of a robot's queries or publications, such as `wanted` or `blobs/{sha256}`; '*' for any site or robot."""
     return f"{_ROOT}/{site}/robots/{robot}/{what}"
 
 
 def split_key(key: str) -> tuple[str, str, str]:
-    """Site, robot (or 'live') and last chunk of a key; raises LinkError for any other."""
+    """Site, robot (or 'live') and last chunk of a key; raises LinkError for any other key."""
     chunks = key.split("/") if len(key) <= _MAX_KEY else []
     if chunks[:1] == [_ROOT]:
         if chunks[2:3] == ["robots"] and (len(chunks) == 5 or (len(chunks) == 6 and chunks[4] in MAP_PARTS)):

@@ -11,14 +11,14 @@ from fleetmap.errors import disk_errors
 from fleetmap.geometry import Array, so3_log
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-# Those of map_saver, but for free_thresh: with its 0.25 the grey of unknown cells is read as free.
+# Thresholds of map_saver, except for free_thresh: with its 0.25 the grey of unknown cells is read as free.
 _SHADES = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
 
 
 @dataclass(frozen=True, slots=True)
 class OccupancyGrid:
-    """cells (H, W) int8: 0 free to 100 occupied, -1 unknown; row 0 has the lowest y. map_from_grid (4, 4): of its corner there."""
+    """cells (H, W) int8: 0 free to 100 occupied, -1 unknown; row 0 has the lowest y. map_from_grid (4, 4): of the corner of cell (0, 0)."""
 
     cells: NDArray[np.int8]
     resolution_m: float
@@ -26,7 +26,7 @@ class OccupancyGrid:
 
 
 def write_grid(path: Path, grid: OccupancyGrid) -> None:
-    """Writes NAME.yaml and NAME.pgm beside it, as of `map_server_files`. Raises StoreError where the disk refuses."""
+    """Write NAME.yaml and NAME.pgm beside it, as of `map_server_files`. Raises StoreError if the disk refuses."""
     text, image = map_server_files(grid, path.with_suffix(".pgm").name)
     with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
         path.with_suffix(".pgm").write_bytes(image)
@@ -34,7 +34,7 @@ def write_grid(path: Path, grid: OccupancyGrid) -> None:
 
 
 def map_server_files(grid: OccupancyGrid, image_name: str) -> tuple[bytes, bytes]:
-    """A map_server YAML file and its PGM image; mode trinary where cells are free, occupied or unknown, else raw."""
+    """A map_server YAML file and its PGM image; mode trinary if all cells are free, occupied or unknown, else raw."""
     values, trinary = grid.cells[::-1], bool(np.isin(grid.cells, list(_SHADES)).all())
     shades = np.where(values < 0, 255, values).astype(np.uint8)
     if trinary:

@@ -12,9 +12,9 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def ended_by_threads(stop: Callable[[], None]) -> Iterator[None]:
-    """Ends a program with the thread that dies: its error is logged, `stop` is called, and the block's end raises the reason.
+    """End a program if one of its threads dies: its error is logged, `stop` is called, and the block's end raises the reason.
 
-    The reason is a FleetmapError: the thread's own, or one that names the thread and its error. An error of the block itself goes first.
+    The reason is a FleetmapError: the thread's own, or one that names the thread and its error. An error of the block takes precedence.
     """
     errors: list[FleetmapError] = []
 

@@ -1,14 +1,14 @@
-"""Work in slices, for callers that must not stop for long."""
+"""Work in slices, for callers that must not block for long."""
 
 from collections.abc import Generator
 from typing import TypeVar, cast
 
 T = TypeVar("T")
-TimeSliced = Generator[None, None, T]  # work that may be interrupted wherever it yields
+TimeSliced = Generator[None, None, T]  # work that may be interrupted at each yield
 
 
 def finished(work: TimeSliced[T]) -> T:
-    """The result of work in slices, all of them at once."""
+    """Run all slices at once and return the result."""
     while True:
         try:
             next(work)

@@ -1,6 +1,6 @@
-"""The grid of a version: as bytes (an index, and one blob for each tile; docs/map_format.md), and what it is for a robot of some height.
+"""The grid of a version: encoding (an index, and one blob per tile; docs/map_format.md), and occupancy for a robot's height.
 
-A cell is a square column of the map. What lies below FLOOR_M is floor; above stand SLICES voxels of SLICE_M each.
+A cell is a square column of the map: floor below FLOOR_M, then SLICES voxels of SLICE_M each.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,13 +33,13 @@ Tiles = dict[tuple[int, int], Counts]
 """By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
 
 GRID_KEY = "grid"
-"""In `report` of a manifest, where readers of before pass over it; it names the index."""
+"""Key in `report` of a manifest, where older readers ignore it; it names the index."""
 
 _MAX_TILES, _MAX_CELLS = 1 << 16, 1 << 25
 
 
 class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the tiles' numbers mean (see grid.h of the core), and the tiles by place and address; landmarks are 0."""
+    """Parameters of the tiles' numbers (see grid.h of the core), and the tiles by place and address; landmarks are 0."""
 
     format_version: Positive = GRID_FORMAT
     tile_size_m: float = TILE_SIZE_M
@@ -53,9 +53,9 @@ class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class GridReport(msgspec.Struct, frozen=True, kw_only=True):
-    """In the report of a build. sha256: of the index, None without a grid; bytes: of it and its tiles; tiles: how many.
+    """Grid entry in a build's report. sha256: of the index, None without a grid; bytes: of it and its tiles; tiles: number of tiles.
 
-    without: by recording, why it adds nothing.
+    without: by recording, the reason why it adds nothing.
     """
 
     sha256: Sha256 | None = None
@@ -65,7 +65,7 @@ class GridReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
-    """The index and then each tile; nothing for a grid without tiles. The same grid gives the same bytes."""
+    """Encode the index and each tile; nothing for a grid without tiles. Equal grids give equal bytes."""
     blobs, entries = [], []
     for (x, y), cells in sorted(tiles.items()):
         data = encode_grid_tile((x, y), cells)
@@ -75,15 +75,15 @@ def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
 
 
 def grid_report(blobs: list[bytes], without: dict[str, str]) -> GridReport:
-    """Of what `encode_grid` returned."""
+    """Report of the blobs that `encode_grid` returned."""
     sha256 = sha256_hex(blobs[0]) if blobs else None
     return GridReport(sha256=sha256, bytes=sum(map(len, blobs)), tiles=max(0, len(blobs) - 1), without=without)
 
 
 def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
-    """The grid of a version; blob: the verified bytes of an address.
+    """Return the grid of a version; blob: the verified bytes of an address.
 
-    Raises StateError for a version without one, saying why, and MapFormatError or NewerFormatError for bytes that are none.
+    Raises StateError, with the reason, for a version without a grid, and MapFormatError or NewerFormatError for invalid bytes.
     """
     where = f"version {manifest.version} of site {manifest.site}"
     report = report_of(manifest)
@@ -104,15 +104,15 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 
 
 def grid_index(manifest: Manifest) -> str | None:
-    """Address of the index of a version's grid, None where it has none; errors as of `report_of`."""
+    """Address of the index of a version's grid, None if absent; errors as of `report_of`."""
     report = report_of(manifest)
     return None if report is None else report.sha256
 
 
 def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> list[TileEntry]:
-    """The tiles of a version's grid, none where it has none. blob: the verified bytes of an address, of at most so many bytes.
+    """The tiles of a version's grid, none if absent. blob: the verified bytes of an address, up to a given size.
 
-    Raises MapFormatError where they are more than the manifest says; errors as of `read_index`.
+    Raises MapFormatError if they exceed the size in the manifest; errors as of `read_index`.
     """
     report = report_of(manifest)
     if report is None or report.sha256 is None:
@@ -130,7 +130,7 @@ def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 
 
 def report_of(manifest: Manifest) -> GridReport | None:
-    """What the build said of its grid, None where it was to make none. MapFormatError for words that are none of ours."""
+    """The build's report of its grid, None if the build had to make none. MapFormatError for invalid content."""
     found = manifest.report.get(GRID_KEY)
     try:
         return None if found is None else msgspec.convert(found, GridReport)
@@ -139,7 +139,7 @@ def report_of(manifest: Manifest) -> GridReport | None:
 
 
 def read_index(data: bytes) -> GridIndex:
-    """The index of `data`; MapFormatError for anything else, NewerFormatError for one that counts otherwise."""
+    """Decode the index in `data`; MapFormatError for anything else, NewerFormatError for other parameters."""
     try:
         index = msgspec.json.decode(data, type=GridIndex)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -152,10 +152,10 @@ def read_index(data: bytes) -> GridIndex:
 
 
 def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) -> OccupancyGrid:
-    """What a robot of this height may drive on, in `map`, cut to what is known.
+    """Occupancy in `map` for a robot of this height, cropped to known cells.
 
-    A cell is occupied where something is between floor and robot, free where all of that was seen to be empty, else unknown.
-    Raises UsageError for a height that the grid does not reach, and for a grid with more cells than a planner's map may have.
+    A cell is occupied if anything is between the floor and the robot's top, free if all of that was seen empty, else unknown.
+    Raises UsageError for a height outside the grid, and for a grid with more cells than a planner's map may have.
     """
     levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
     if not 1 <= levels <= SLICES:
@@ -172,7 +172,7 @@ def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) ->
 
 
 def whole_grid(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *, is_cut: bool = True) -> OccupancyGrid:
-    """Tiles (N, N) beside each other in `map`; empty: where none is, and what is cut off at the edges. UsageError for too many cells."""
+    """Join tiles (N, N) in `map`; empty: value of missing tiles, cropped at the edges. UsageError for too many cells."""
     places = np.array(list(parts))
     first, last = places.min(axis=0), places.max(axis=0) + 1
     columns, rows = ((last - first) * TILE_CELLS).tolist()

@@ -4,7 +4,7 @@
 
     record_order(Order("small-loop", robot="tote-1", frames=100), Path("tote.mcap"), "mcap")
 
-`prepare` gives the samples and the renderer of a run without writing them. Names are imported when they are first used.
+`prepare` gives the samples and the renderer of a run without writing them. Names are imported at their first use.
 """
 
 from importlib import import_module
@@ -26,7 +26,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> object:
-    """Imports a public name when it is first used (PEP 562)."""
+    """Import a public name at its first use (PEP 562)."""
     if name == "__version__":
         return import_module("fleetmap").__version__
     if name not in _MODULES:

@@ -21,7 +21,7 @@ def fleetsim(version: Version = False) -> None:
 
 @app.command()
 def scenarios() -> None:
-    """One line per scenario, smallest first: its name, its robots, what it is."""
+    """One line per scenario, smallest first: name, robots, description."""
     from fleetsim.scenarios import SCENARIOS
 
     for name, make in SCENARIOS.items():
@@ -33,32 +33,32 @@ def scenarios() -> None:
 def record(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")],
     out: Annotated[Path, Option(help="File to write (.mcap).")],
-    seed: Annotated[int, Option(help="Everything random follows from it: the site, its stock, noise, motion.")] = 0,
-    day: Annotated[int, Option(help="Day of the site's life: stock moves from day to day.")] = 0,
+    seed: Annotated[int, Option(help="Seed of all randomness: the site, its stock, noise, motion.")] = 0,
+    day: Annotated[int, Option(help="Day in the site's history: stock moves from day to day.")] = 0,
     light: Annotated[str, Option(help="day, evening or night.")] = "day",
-    robot: Annotated[str | None, Option(help="Which of the scenario's robots; its first one unless given.")] = None,
+    robot: Annotated[str | None, Option(help="Robot of the scenario; its first one unless given.")] = None,
     lens: Annotated[
         str | None,
         Option(help="pinhole, radial-tangential, plumb-bob, rational or equidistant instead of the robot's own."),
     ] = None,
     size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None,
-    frames: Annotated[int | None, Option(min=1, help="At most so many frames.")] = None,
+    frames: Annotated[int | None, Option(min=1, help="Maximum number of frames.")] = None,
     fault: Annotated[list[str] | None, Option(metavar="NAME@START+SECONDS", help="A fault; repeatable.")] = None,
     camera_delay_ms: Annotated[
-        float, Option(min=-100.0, max=100.0, help="Frames carry stamps this much too early.")
+        float, Option(min=-100.0, max=100.0, help="Frame stamps are too early by this much.")
     ] = 0.0,
     camera_turn_deg: Annotated[
-        float, Option(min=0.0, max=5.0, help="Each camera is turned this much from its calibration.")
+        float, Option(min=0.0, max=5.0, help="Each camera is rotated by this much from its calibration.")
     ] = 0.0,
     camera_shift_mm: Annotated[
-        float, Option(min=0.0, max=50.0, help="Each camera sits this far from its calibrated place.")
+        float, Option(min=0.0, max=50.0, help="Each camera is shifted by this much from its calibrated position.")
     ] = 0.0,
     camera_pipeline: Annotated[
-        str, Option(metavar="NAME", help="What lens, sensor and codec make of the pictures: clean, soft, phone, ...")
+        str, Option(metavar="NAME", help="Effects of lens, sensor and codec on the images: clean, soft, phone, ...")
     ] = "clean",
-    force: Annotated[bool, Option("--force", help="Write over an existing file.")] = False,
+    force: Annotated[bool, Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
-    """Records one robot's run: pictures, IMU, wheels, position priors, exact ground truth."""
+    """Record one robot's run: images, IMU, wheels, position priors, exact ground truth."""
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
     from fleetsim.recorder import Order
@@ -84,5 +84,5 @@ def _size_px(text: str | None) -> tuple[int, int] | None:
 
 
 def main() -> None:
-    """Runs the command line."""
+    """Run the command line."""
     run_cli(app)

@@ -20,7 +20,7 @@ def _progress() -> Progress:
 
 
 def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Session:
-    """Builds the site and takes one picture, so that lighting it has its own line."""
+    """Build the site and take one image, so that its lighting has its own progress line."""
     task = progress.add_task("building the warehouse", total=2)
     session = prepare(order, workers)
     progress.update(task, advance=1, description="lighting it")
@@ -30,10 +30,10 @@ def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Ses
 
 
 class _PngWriter(McapRecordingWriter):
-    """Stores pictures as PNG: half the size of raw ones, without loss."""
+    """Stores images as PNG: half the size of raw ones, lossless."""
 
     def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """One frame; pictures that are encoded already stay as they are."""
+        """Write one frame; already encoded images stay unchanged."""
         if isinstance(frame, CameraFrame):
             assert frame.right is not None
             frame = StoredFrame(frame.stamp_ns, png_image(frame.left), png_image(frame.right))
@@ -41,7 +41,7 @@ class _PngWriter(McapRecordingWriter):
 
 
 def record_order(order: Order, out: Path) -> str:
-    """Records to `out`; a line with the amount and the time."""
+    """Record to `out`; print a line with amount and time."""
     started = time.monotonic()
     with _progress() as progress, ThreadPoolExecutor(2) as workers:
         session = _ready(order, progress, workers)

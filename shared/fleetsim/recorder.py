@@ -32,7 +32,7 @@ _TRUTH_STEP_S = 0.02
 class Order:
     """A run to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
 
-    hidden: errors of mounting and clock that the recording's calibration does not admit. camera_pipeline: a key of
+    hidden: errors of mounting and clock missing in the recording's calibration. camera_pipeline: a key of
     IMAGE_PIPELINES.
     """
 
@@ -51,7 +51,7 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A run made ready: the rig as it is believed and as it is, the motion, the samples other than pictures."""
+    """A prepared run: nominal and true rig, motion, and samples other than images."""
 
     order: Order
     world: World
@@ -66,7 +66,7 @@ class Session:
     truth: Trajectory
 
     def frames(self) -> Iterator[CameraFrame]:
-        """The pictures, one pair at a time; stamps on the cameras' clock. The next pair is made while one is used."""
+        """The images, one pair at a time; stamps on the cameras' clock. The next pair is rendered meanwhile."""
         pipeline = find_pipeline(self.order.camera_pipeline)
 
         def made(time_s: float, stamp_ns: int) -> CameraFrame:
@@ -82,7 +82,7 @@ class Session:
                 yield frame
 
     def frame_stamps_ns(self) -> list[int]:
-        """Stamps of the frames: late ones late, all shifted by the rig's hidden delay."""
+        """Stamps of the frames, with late frames and the rig's hidden delay."""
         delay_s, plan = self.renderer.imu_minus_cam_s, self.renderer.faults
         shifted = [t - delay_s + (LATE_S if plan.has("frames-late", t) else 0.0) for t in self.frame_times_s]
         return [int(stamp) for stamp in stamps_from_s(np.array(shifted))]
@@ -94,7 +94,7 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
 
 
 def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
-    """The run's motion; UsageError where it comes too near to a solid thing."""
+    """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
     motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
     positions = motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3]
@@ -103,7 +103,7 @@ def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -
 
 
 def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
-    """Everything of a run but its pictures. Raises UsageError for unknown names and routes through solid things."""
+    """Prepare a run without its images. Raises UsageError for unknown names and routes through obstacles."""
     scenario = find_scenario(order.scenario)
     if order.light not in LIGHT_STATES:
         raise UsageError(f"unknown light {order.light!r}; known are {', '.join(LIGHT_STATES)}")
@@ -153,7 +153,7 @@ def write_session(
     writer: McapRecordingWriter,
     on_frame: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Writes everything in the order of time, a frame's worth at a time."""
+    """Write all samples and images in time order, frame by frame."""
     start_ns = 0
     for done, frame in enumerate(session.frames(), start=1):
         _write_between(session, writer, start_ns, frame.stamp_ns)
@@ -164,7 +164,7 @@ def write_session(
 
 
 def _write_between(session: Session, writer: McapRecordingWriter, start_ns: int, end_ns: int) -> None:
-    """Writes the samples with start <= stamp < end."""
+    """Write the samples with start <= stamp < end."""
     truth = session.truth
     first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
     writer.write_prior(tuple(prior for prior in session.priors if start_ns <= prior.stamp_ns < end_ns))

@@ -48,7 +48,7 @@ class Scenario:
         return name, self.runs[name]
 
 
-_END_M = 2.7  # how far from the end walls the robots drive
+_END_M = 2.7  # distance of the robots' routes from the end walls
 
 
 def _loop(layout: Layout, first: int, last: int, *, overlap_m: float = 8.0, shift_m: float = 0.0) -> Route:
@@ -59,7 +59,7 @@ def _loop(layout: Layout, first: int, last: int, *, overlap_m: float = 8.0, shif
 
 
 def _snake(layout: Layout, aisles: range) -> Route:
-    """Every aisle in turn, back along the ends, and into the first one again."""
+    """Route through every aisle in turn, back along the ends, and into the first one again."""
     left, right = _END_M, layout.length_m - _END_M
     points: list[tuple[float, float]] = []
     for number, aisle in enumerate(aisles):

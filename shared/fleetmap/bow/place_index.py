@@ -10,10 +10,10 @@ _FIRST_CAPACITY = 64
 
 
 class PlaceIndex:
-    """Places and their vectors, growing."""
+    """Growing index of places and their bag-of-words vectors."""
 
     def __init__(self, word_count: int) -> None:
-        """An empty index for the words of one vocabulary."""
+        """Create an empty index for the words of one vocabulary."""
         self._place_ids, self._count = np.zeros(_FIRST_CAPACITY, np.int64), 0
         self._known: set[int] = set()
         self._file = core.InvertedFile(word_count)
@@ -23,11 +23,11 @@ class PlaceIndex:
 
     @property
     def place_ids(self) -> NDArray[np.int64]:
-        """(P,) ids in the order in which they were added: what a candidates mask goes along."""
+        """(P,) ids in the order of insertion, which is the order of a candidates mask."""
         return self._place_ids[: self._count]
 
     def add(self, place_id: int, vector: BowVector) -> None:
-        """Adds a place; its id must be new."""
+        """Add a place; its id must be new."""
         assert place_id not in self._known, place_id
         self._known.add(place_id)
         if self._count == len(self._place_ids):
@@ -39,9 +39,9 @@ class PlaceIndex:
     def query(
         self, vector: BowVector, candidates_mask: NDArray[np.bool_] | None = None, top_k: int = 10
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Ids and scores of the up to `top_k` most similar places, best first; those that share no word are left out.
+        """Return ids and scores of the up to `top_k` most similar places, best first; places without a common word are left out.
 
-        candidates_mask (P,) in the order of `place_ids` says which may be returned. The score is 1 - |a - b|_1 / 2, in
+        candidates_mask (P,), in the order of `place_ids`, marks the places that may be returned. The score is 1 - |a - b|_1 / 2, in
         0..1, 1 for equal vectors (DBoW2's L1 score). Ties go to the lower id.
         """
         scores = self.scores(vector)

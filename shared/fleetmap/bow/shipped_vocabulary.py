@@ -1,6 +1,6 @@
-"""The vocabulary that ships with fleetmap: servers and robots have it already, so that maps name it by hash and do not carry it.
+"""The vocabulary that ships with fleetmap. Maps refer to it by hash instead of carrying it.
 
-Trained on simulated warehouses by `tests/benchmarks/survey/default_vocabulary.py`, which writes the same bytes again.
+Trained on simulated warehouses by `tests/benchmarks/survey/default_vocabulary.py`, which reproduces the same bytes.
 """
 
 from functools import lru_cache
@@ -14,16 +14,16 @@ _FILE = "vocabulary.fmvb"
 
 @lru_cache(maxsize=1)
 def default_vocabulary_bytes() -> bytes:
-    """The file as it is installed."""
+    """Bytes of the installed file."""
     return (resources.files("fleetmap") / "data" / _FILE).read_bytes()
 
 
 @lru_cache(maxsize=1)
 def default_vocabulary() -> Vocabulary:
-    """It as words."""
+    """The shipped vocabulary, decoded."""
     return decode_vocabulary(default_vocabulary_bytes())
 
 
 def shipped_vocabulary(sha256: str) -> bytes | None:
-    """The bytes of the vocabulary of that hash where it is the one that ships, else None."""
+    """Bytes of the shipped vocabulary if it has this hash, else None."""
     return default_vocabulary_bytes() if sha256 == DEFAULT_VOCABULARY_SHA256 else None

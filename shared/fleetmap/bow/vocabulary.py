@@ -1,4 +1,4 @@
-"""A tree of binary words: each descriptor goes down to the nearest child until it reaches a leaf, its word."""
+"""A tree of binary words: a descriptor descends to the nearest child until it reaches a leaf, which is its word."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ WordIds = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BowVector:
-    """What a place looks like: word_ids (W,) rising, weights (W,) positive with sum 1 (both empty for no words)."""
+    """Appearance of a place: word_ids (W,) ascending, weights (W,) positive with sum 1 (both empty without words)."""
 
     word_ids: WordIds
     weights: NDArray[np.float32]
@@ -46,7 +46,7 @@ class Vocabulary:
         return core.descend(packed(descriptors), self.centres, self.first_child, self.child_count, word_of_node)
 
     def branches(self, descriptors: Descriptors) -> NDArray[np.int32]:
-        """(N, 2) the two children of the root that are nearest to each descriptor (N, 32), by their number; 0 without children."""
+        """(N, 2) numbers of the two children of the root nearest to each descriptor (N, 32); 0 without children."""
         children = self.centres[1 : 1 + int(self.child_count[0])]
         return core.two_nearest(packed(descriptors), children)
 

@@ -11,7 +11,7 @@
             32 M u8  centre of each node
             4 W f32  idf of each word
 
-Little-endian. Not compressed: centres are close to random bits. Where a node's children begin follows from the counts.
+Little-endian. Not compressed: centres are close to random bits. The index of a node's first child follows from the counts.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ _HEADER = struct.Struct("<4sHHIII")
 
 
 def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
-    """The bytes of a vocabulary: the same for the same vocabulary, on every machine."""
+    """Encode a vocabulary; equal vocabularies give equal bytes on every machine."""
     nodes = len(vocabulary.child_count)
     assert nodes <= MAX_NODES
     body = (
@@ -44,12 +44,12 @@ def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
 
 
 def vocabulary_hash(vocabulary: Vocabulary) -> str:
-    """SHA-256 of the encoded vocabulary, 64 hexadecimal digits: what maps name their words by."""
+    """SHA-256 of the encoded vocabulary, 64 hexadecimal digits; maps refer to their vocabulary by it."""
     return hashlib.sha256(encode_vocabulary(vocabulary)).hexdigest()
 
 
 def decode_vocabulary(data: bytes) -> Vocabulary:
-    """The vocabulary in `data`.
+    """Decode the vocabulary in `data`.
 
     Raises NewerFormatError for a newer format, MapFormatError for anything that is not a whole, undamaged vocabulary.
     Allocates no more than a small multiple of len(data).
@@ -66,7 +66,7 @@ def decode_vocabulary(data: bytes) -> Vocabulary:
 
 
 def _checked_header(data: bytes) -> tuple[int, int]:
-    """Numbers of nodes and words of bytes that are whole."""
+    """Check the header and the checksum; return the numbers of nodes and words."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         raise MapFormatError(
             f"vocabulary: {len(data)} bytes beginning {data[:4]!r}, not {_MAGIC!r}; another kind of file"
@@ -89,10 +89,10 @@ def _checked_header(data: bytes) -> tuple[int, int]:
 
 
 def _first_children(child_count: NDArray[np.int32], words: int) -> NDArray[np.int32]:
-    """Where each node's children begin; MapFormatError unless the counts make one tree with that many leaves."""
+    """Index of each node's first child; MapFormatError unless the counts make one tree with that many leaves."""
     nodes = len(child_count)
     begin, end = 0, 1
-    for _ in range(MAX_LEVELS):  # down, a level at a time
+    for _ in range(MAX_LEVELS):  # downwards, one level at a time
         begin, end = end, end + int(child_count[begin:end].sum())
         if begin == end or end > nodes:
             break

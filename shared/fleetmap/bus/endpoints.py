@@ -1,4 +1,4 @@
-"""Endpoints of the bus, as zenoh writes them: tcp/HOST:PORT. Files of mutual TLS, and why a handshake fails: zenoh never says."""
+"""Endpoints of the bus in zenoh's notation, tcp/HOST:PORT; files of mutual TLS; reasons for failed handshakes, which zenoh hides."""
 
 import socket
 import ssl
@@ -11,7 +11,7 @@ from fleetmap.errors import UsageError
 
 
 def check_endpoint(endpoint: str) -> str:
-    """`endpoint` itself; raises UsageError unless it reads like tcp/HOST:PORT (also tls, quic, udp)."""
+    """Return `endpoint`; raise UsageError unless it has the form tcp/HOST:PORT (also tls, quic, udp)."""
     protocol, slash, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if not slash or protocol not in {"tcp", "tls", "quic", "udp"} or not host or not port.isdecimal():
@@ -22,12 +22,12 @@ def check_endpoint(endpoint: str) -> str:
 
 
 def has_tls(endpoint: str) -> bool:
-    """Whether an endpoint's protocol has TLS in it."""
+    """True if the endpoint's protocol includes TLS."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether nobody but this machine is at an endpoint."""
+    """True if only this machine can reach the endpoint."""
     host = _host_and_port(endpoint)[0]
     try:
         return host == "localhost" or ip_address(host).is_loopback
@@ -36,7 +36,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def with_free_port(endpoint: str) -> str:
-    """`endpoint` with a port that is free at this moment in the place of 0."""
+    """Return `endpoint` with port 0 replaced by a port that is free now."""
     host, port = _host_and_port(endpoint)
     if port != "0":
         return endpoint
@@ -53,21 +53,21 @@ def _host_and_port(endpoint: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """authority: PEM certificates of who signs the other side's; own: PEM file with this side's key and certificate.
+    """authority: PEM certificates of the authority that signs the peer's certificate; own: PEM file with own key and certificate.
 
-    Key and certificate are one file, so that both change in one moment.
+    Key and certificate share one file, so that both are replaced atomically.
     """
 
     authority: Path
     own: Path
 
     def listening(self) -> dict[str, Any]:
-        """zenoh's configuration of a server."""
+        """zenoh's configuration for a server."""
         own = str(self.own)
         return self._common() | {"listen_private_key": own, "listen_certificate": own}
 
     def connecting(self) -> dict[str, Any]:
-        """zenoh's configuration of a robot."""
+        """zenoh's configuration for a robot."""
         own = str(self.own)
         return self._common() | {
             "verify_name_on_connect": True,
@@ -80,7 +80,7 @@ class TlsFiles:
         return {"root_ca_certificate": authority, "enable_mtls": True, "close_link_on_expiration": True}
 
     def fault(self) -> str:
-        """Why these files cannot be used; empty where they can. zenoh would close the listening session first."""
+        """Reason why these files cannot be used; empty if they can. Check first: zenoh closes the old session before it reads them."""
         try:
             context = ssl.create_default_context(cafile=str(self.authority))
             context.load_cert_chain(str(self.own))
@@ -103,9 +103,9 @@ _WORDS = {
 
 
 def handshake_fault(endpoint: str, files: TlsFiles, timeout_s: float = 3.0) -> str:
-    """Why no connection comes about, by a TLS handshake of the standard library; empty where the server accepts it.
+    """Reason why a connection fails, by a TLS handshake of the standard library; empty if the server accepts it.
 
-    Only of tls/HOST:PORT: QUIC's handshake is not in the standard library, and its answer is empty.
+    Only for tls/HOST:PORT; empty for QUIC, whose handshake the standard library lacks.
     """
     host, port = _host_and_port(endpoint)
     if not endpoint.startswith("tls/"):

@@ -1,4 +1,4 @@
-"""A bounded queue that serves its senders in turn, so that one who floods is dropped and the others are not late."""
+"""A bounded queue that serves senders round-robin, so that messages of a flooding sender are dropped and others are not delayed."""
 
 import logging
 import threading
@@ -7,33 +7,33 @@ from collections.abc import Callable
 
 _MAX_SENDERS = 20_000
 _MAX_BYTES = 32 << 20  # of all senders together
-_JOB_BYTES = 1000  # what a job takes beside its bytes, so that empty ones are bounded too
+_JOB_BYTES = 1000  # memory of a job besides its bytes, so that empty jobs are bounded too
 SHARED = ""
-"""The sender of what names no robot, such as a survey under way."""
+"""Sender of messages that name no robot, such as those of a running survey."""
 
-_LIMITS = {False: (64, 2 << 20), True: (4096, 8 << 20)}  # messages and bytes that wait, of a robot and of SHARED
+_LIMITS = {False: (64, 2 << 20), True: (4096, 8 << 20)}  # waiting messages and bytes, of a robot and of SHARED
 _log = logging.getLogger(__name__)
 
 
 def sender_of(key: str) -> str:
-    """Who asks or tells under a key of the bus: fleetmap/SITE/robots/ROBOT/..., else SHARED."""
+    """Sender of a message, from its key on the bus: fleetmap/SITE/robots/ROBOT/..., else SHARED."""
     chunks = key.split("/", 4)
     return f"{chunks[1]}/{chunks[3]}" if len(chunks) == 5 and chunks[2] == "robots" else SHARED
 
 
 class FairQueue:
-    """Jobs of senders, done by one thread: each sender's in their order, the senders in turn."""
+    """Jobs of several senders, run by one thread: round-robin over the senders, in order for each sender."""
 
     def __init__(self, name: str) -> None:
         self._ready = threading.Condition()
-        self._jobs: dict[str, deque[tuple[int, Callable[[], None]]]] = {}  # in the order of their turns
+        self._jobs: dict[str, deque[tuple[int, Callable[[], None]]]] = {}  # in round-robin order
         self._bytes: dict[str, int] = {}
         self._all_bytes = 0
         self._is_closed = False
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def put(self, sender: str, size: int, job: Callable[[], None]) -> bool:
-        """Queues a job of `size` bytes; False where it is dropped, because the sender has too much waiting or all have."""
+        """Queue a job of `size` bytes; return False if it is dropped because the sender's limit or the common limit is reached."""
         with self._ready:
             waiting = self._jobs.get(sender)
             if waiting is None:
@@ -53,7 +53,7 @@ class FairQueue:
             return True
 
     def close(self) -> None:
-        """Drops what waits and ends the thread after its present job."""
+        """Drop waiting jobs and end the thread after its current job."""
         with self._ready:
             self._is_closed = True
             self._jobs.clear()
@@ -78,5 +78,5 @@ class FairQueue:
             try:
                 job()
             except Exception:
-                # A fault in one job must not end the others.
+                # An error in one job must not stop the others.
                 _log.exception("a job of %r failed", sender)

@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 
 class Ros2Node:
-    """Everything that is declared shows in ROS's graph until `close`. Names resolve as in ROS: /absolute, relative, ~/private."""
+    """A node whose declarations appear in ROS's graph until `close`. Names resolve as in ROS: /absolute, relative, ~/private."""
 
     def __init__(self, bus: Bus, layout: KeyLayout, name: str, namespace: str = "") -> None:
         """namespace: empty or /like/this."""
@@ -35,10 +35,10 @@ class Ros2Node:
         return name if name.startswith("/") else f"{self.name.namespace}/{name}"
 
     def publisher(self, topic: str, type_name: str, qos: Qos = Qos()) -> Send:  # noqa: B008 - a value
-        """Sends messages. Of latched ones the last is kept; of others one that cannot be sent at once is dropped."""
+        """Declare a publisher. A latched one keeps its last message; others drop messages that cannot be sent at once."""
         endpoint = self._endpoint(PUBLISHER, topic, type_name, qos)
         key = self._layout.key(endpoint.name, type_name)
-        # Subscribers of rmw_zenoh count lost messages by name and number of their publisher: each needs its own.
+        # Subscribers of rmw_zenoh count lost messages by the publisher's name and sequence number, so each publisher needs its own.
         gid = hashlib.sha256(self._layout.token(self.name, endpoint).encode()).digest()[:_GID_BYTES]
         numbers = count(1)
         latched = self._bus.latched_publisher(key) if qos.is_transient_local else None
@@ -56,7 +56,7 @@ class Ros2Node:
         return send
 
     def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], None], qos: Qos = Qos()) -> None:  # noqa: B008 - a value
-        """Calls `listen` with every message, on a thread of the bus; one that it refuses (FleetmapError) or cannot read is logged."""
+        """Call `listen` with every message, on a thread of the bus; refused (FleetmapError) and invalid messages are logged."""
         endpoint = self._endpoint(SUBSCRIPTION, topic, type_name, qos)
 
         def take(_: str, payload: bytes) -> None:
@@ -70,7 +70,7 @@ class Ros2Node:
         self._show(endpoint)
 
     def serve(self, service: str, type_name: str, answer: Callable[[bytes], bytes]) -> None:
-        """Answers requests, on a thread of the bus. A request that cannot be read or is refused gets an error: its client logs it."""
+        """Answer requests, on a thread of the bus. A refused or undecodable request gets an error reply, which the client logs."""
         endpoint = self._endpoint(SERVICE, service, type_name, Qos())
 
         def reply(_: str, payload: bytes) -> bytes:
@@ -85,7 +85,7 @@ class Ros2Node:
         self._show(endpoint)
 
     def close(self) -> None:
-        """Takes everything back."""
+        """Undeclare everything."""
         self._declared.close()
 
     def _endpoint(self, kind: str, name: str, type_name: str, qos: Qos) -> Endpoint:

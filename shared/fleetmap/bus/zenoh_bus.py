@@ -1,4 +1,4 @@
-"""The bus between server and robots: query, answer, publish, subscribe, presence, over zenoh, which is used here alone."""
+"""The bus between server and robots: query, reply, publish, subscribe, liveliness. The only module that uses zenoh's API."""
 
 import json
 import logging
@@ -17,52 +17,52 @@ from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UsageError
 
 Answer = Callable[[str, bytes], bytes]
-"""Bytes that answer the question (key, payload); a FleetmapError that it raises travels back as the answer's error."""
+"""Returns the reply to a query (key, payload); a FleetmapError is sent back as an error reply."""
 
 Listen = Callable[[str, bytes], None]
-"""Takes (key, payload) of what was published. Runs on a thread of the bus."""
+"""Receives (key, payload) of a publication. Runs on a thread of the bus."""
 
 Attach = Callable[[bytes], bytes]
-"""The attachment of an answer, by that of its question; empty for none."""
+"""Computes the attachment of a reply from that of its query; empty for none."""
 
 MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one large message delays all others behind it
 _MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
-_HEARTBEAT_S = 0.5  # after which a subscriber notices that the last message was lost; rmw_zenoh's own
-_MAX_SESSIONS = 20_000  # zenoh's default is 1000: the next robot would find silence
+_HEARTBEAT_S = 0.5  # period after which a subscriber detects that the last message was lost; same as in rmw_zenoh
+_MAX_SESSIONS = 20_000  # zenoh's default is 1000: further robots would get no response
 _MAX_RECEIVED_BYTES = 2 * MAX_MESSAGE_BYTES
 _BUSY = b"later: too much of this sender is waiting already"
 _log = logging.getLogger(__name__)
 
 
 class Handle:
-    """Something declared on the bus; `close` takes it back, as does closing the bus."""
+    """A declaration on the bus; ends with `close` or with the bus."""
 
     def __init__(self, undo: Callable[[], None]) -> None:
         self._undo: Callable[[], None] | None = undo
 
     def closed(self) -> bool:
-        """Whether it was taken back."""
+        """True if it was undeclared."""
         return self._undo is None
 
     def close(self) -> None:
-        """Takes it back; a second call does nothing."""
+        """Undeclare it; a second call does nothing."""
         undo, self._undo = self._undo, None
         if undo is not None:
             undo()
 
 
 class LatchedPublisher(Handle):
-    """Publishes under one key, and keeps the last message for subscribers who come later and ask for it."""
+    """Publishes under one key and keeps the last message for late subscribers, which query it."""
 
     def __init__(self, put: Callable[[bytes, bytes], None], undo: Callable[[], None]) -> None:
         super().__init__(undo)
         self._put = put
 
     def put(self, payload: bytes, attachment: bytes = b"") -> None:
-        """Publishes; LinkError for more than _MAX_LATCHED_BYTES, or on a closed bus."""
+        """Publish; raises LinkError for more than _MAX_LATCHED_BYTES or on a closed bus."""
         if len(payload) > _MAX_LATCHED_BYTES:
             raise LinkError(
                 f"{len(payload)} bytes are more than the {_MAX_LATCHED_BYTES} that are kept for late subscribers"
@@ -71,7 +71,7 @@ class LatchedPublisher(Handle):
 
 
 class _Declared:
-    """Something declared: how to declare it on a session, the object that zenoh gave for it, and what ends with it."""
+    """A declaration: function that declares it on a session, zenoh's object for it, and resources that end with it."""
 
     def __init__(self, declare: Callable[[Any], Any], stop: Callable[[], None]) -> None:
         self.declare, self.stop = declare, stop
@@ -79,12 +79,12 @@ class _Declared:
 
 
 class Bus:
-    """One participant, a zenoh session with explicit endpoints only: no multicast, no gossip, nothing found by itself.
+    """One participant, a zenoh session with explicit endpoints only: no multicast, no gossip, no discovery.
 
-    Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES. Questions, answers and publications block while
-    the network is full, rather than being lost, unless they may be. What a server hears passes a `FairQueue`: one sender who floods is
-    dropped. Whoever connects hears all that he asked for. A server's session can be opened anew with other rules; what
-    was declared is declared again.
+    Must be closed, best as a context manager. Messages hold at most MAX_MESSAGE_BYTES. Queries, replies and publications block while
+    the network is congested, unless they may be dropped. A server's incoming messages pass a `FairQueue`: those of a flooding sender are
+    dropped. A robot receives everything that it subscribed to. A server's session can be reopened with other rules;
+    declarations are then repeated.
     """
 
     def __init__(
@@ -96,10 +96,10 @@ class Bus:
         access: Access | None = None,
         is_ros: bool = False,
     ) -> None:
-        """Not open yet: see `open`. tls: mutual TLS; access: who may say what, for a server with mutual TLS. is_ros: towards the router
-        of a robot's ROS 2; one on another machine must be there when the bus is opened.
+        """Create a closed bus: see `open`. tls: mutual TLS; access: rules of a server with mutual TLS. is_ros: connects to the router
+        of a robot's ROS 2; a router on another machine must be running when the bus is opened.
 
-        Raises UsageError for something that is no endpoint, and for TLS without its files.
+        Raises UsageError for an invalid endpoint and for TLS without its files.
         """
         self.endpoint = check_endpoint(endpoint)
         if has_tls(endpoint) and tls is None and is_server:
@@ -108,12 +108,12 @@ class Bus:
         self._lock = threading.RLock()
         self._session: Any = None
         self._is_closed = False
-        # What is declared lives as long as its object: without this list a token would vanish with an ignored handle.
+        # A declaration lives as long as its object: without this list a token would vanish with a discarded handle.
         self._declared: list[_Declared] = []
 
     @classmethod
     def listen(cls, endpoint: str, *, tls: TlsFiles | None = None, access: Access | None = None) -> Self:
-        """The server's side, open: a router that robots connect to. Port 0 takes a free one: see `endpoint`.
+        """Open the server's side: a router that robots connect to. Port 0 takes a free one: see `endpoint`.
 
         Errors as of `open`.
         """
@@ -123,13 +123,13 @@ class Bus:
 
     @classmethod
     def connect(cls, endpoint: str, *, tls: TlsFiles | None = None, is_ros: bool = False) -> Self:
-        """A robot's side. Returns at once; connects, and after every loss connects again, in the background."""
+        """Open a robot's side. Returns at once; connects, and reconnects after every loss, in the background."""
         bus = cls(endpoint, tls=tls, is_ros=is_ros)
         bus.open()
         return bus
 
     def open(self) -> None:
-        """Opens the session with all that was declared so far; raises LinkError where it cannot listen or connect."""
+        """Open the session with all declarations so far; raises LinkError if it cannot listen or connect."""
         wanted = self.endpoint
         with self._lock:
             for attempt in range(5):
@@ -147,10 +147,10 @@ class Bus:
                         ) from error
 
     def reopen(self, access: Access) -> None:
-        """Opens a server's session anew with these rules and the present certificate: zenoh reads both when it opens.
+        """Reopen a server's session with these rules and the current certificate: zenoh reads both only when it opens.
 
-        Robots connect again by themselves; calls on other threads wait. Raises LinkError where that is not possible: the session
-        stays as it is where a certificate cannot be used, and else is closed until another attempt succeeds.
+        Robots reconnect by themselves; calls on other threads wait. Raises LinkError if that fails: the session
+        stays as it is if a certificate cannot be used, and otherwise is closed until another attempt succeeds.
         """
         fault = "" if self._tls is None else self._tls.fault()
         if fault:
@@ -167,7 +167,7 @@ class Bus:
                     self._open()
                     return
                 except zenoh.ZError as error:
-                    # The port of QUIC is not free in the moment in which its session is closed.
+                    # The port of QUIC is not free immediately after its session is closed.
                     if time.monotonic() > give_up_s:
                         raise LinkError(f"cannot listen on {self.endpoint} again ({error}); trying on") from error
                     time.sleep(_RETRY_S)
@@ -179,10 +179,10 @@ class Bus:
         self.close()
 
     def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
-        """Answers questions for keys that match `key_expr` (`*` is one chunk, `**` any number)."""
+        """Answer queries for keys that match `key_expr` (`*` is one chunk, `**` any number)."""
 
         def reply(query: Any, key: str) -> None:
-            # Leaving the block ends the question: without it the asker would wait for its timeout.
+            # Leaving the block ends the query: without it the client would wait for its timeout.
             with query:
                 payload = b"" if query.payload is None else query.payload.to_bytes()
                 data, reason = answer_query(answer, key, payload)
@@ -194,7 +194,7 @@ class Bus:
                         beside = attach(asked) if attach is not None else b""
                         query.reply(key, data, attachment=beside or None)
                 except zenoh.ZError as error:
-                    _log.debug("the session that asked for %r is gone: %s", key[:200], error)  # the asker asks again
+                    _log.debug("the session that asked for %r is gone: %s", key[:200], error)  # the client retries
 
         def take(query: Any) -> None:
             key = str(query.key_expr)
@@ -211,9 +211,9 @@ class Bus:
         return self._declare(lambda session: session.declare_queryable(key_expr, direct, complete=True), queue.close)
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
-        """The first answer to a question; asks again until the time is over, because before a connection stands zenoh is silent.
+        """Return the first reply to a query; repeats it until the timeout, because zenoh does not reply before a connection stands.
 
-        Raises UnreachableError when nobody answers within `timeout_s`, LinkError with the reason when the other side refuses.
+        Raises UnreachableError without a reply within `timeout_s`, LinkError with the reason if the other side refuses.
         """
         check_size(payload, key)
         deadline = time.monotonic() + timeout_s
@@ -232,9 +232,9 @@ class Bus:
         raise no_answer(key, timeout_s, is_silenced=self._tls is not None and self.connected())
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
-        """Tells all subscribers; nobody there is no error. `may_drop` loses it rather than wait for a full network.
+        """Publish to all subscribers; having none is not an error. `may_drop`: drop the message instead of waiting for a congested network.
 
-        attachment: beside the payload, for what other programs want there; no subscriber of this class is shown it.
+        attachment: metadata beside the payload, for other programs; subscribers of this class do not receive it.
         """
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
         beside = {"attachment": attachment} if attachment else {}
@@ -242,9 +242,9 @@ class Bus:
         self._guarded(lambda session: session.put(key, payload, congestion_control=control, **beside))
 
     def latched_publisher(self, key: str) -> LatchedPublisher:
-        """A publisher under `key` that keeps its last message.
+        """Declare a publisher under `key` that keeps its last message.
 
-        Who is late asks with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do.
+        Late subscribers query it with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do.
         """
         declared = self._declared_now(
             lambda session: zenoh.ext.declare_advanced_publisher(
@@ -263,11 +263,11 @@ class Bus:
         return LatchedPublisher(put, partial(self._undeclare, declared))
 
     def session_id(self) -> str:
-        """Names this participant on its network."""
+        """Id of this participant on its network."""
         return str(self._guarded(lambda session: session.zid()))
 
     def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
-        """Calls `listen` for everything that is published under keys that match; is_latched: first for what latched publishers keep."""
+        """Call `listen` for every publication under matching keys; is_latched: first for the kept messages of latched publishers."""
 
         def take(sample: Any) -> None:
             key = str(sample.key_expr)
@@ -288,23 +288,23 @@ class Bus:
         return self._declare(lambda session: session.declare_subscriber(key_expr, direct), queue.close)
 
     def declare_alive(self, key: str) -> Handle:
-        """Shows this participant's presence under `key` until the handle or the bus is closed, or the process dies."""
+        """Declare a liveliness token under `key` until the handle or the bus is closed, or the process dies."""
         return self._declare(lambda session: session.liveliness().declare_token(key))
 
     def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
-        """Keys under which somebody is present, sorted."""
-        # A router answers from its own table before `get` returns: what the channel does not hold would stop it for ever.
+        """Keys of all live tokens, sorted."""
+        # A router replies from its own table before `get` returns: a full channel would block it forever.
         channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
         replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=timeout_s))
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def certificates(self) -> list[str]:
-        """Names in the certificates of who is connected to a server with mutual TLS, sorted, one for each connection."""
+        """Certificate names of the connections to a server with mutual TLS, sorted, one per connection."""
         links = self._guarded(lambda session: session.info.links())
         return sorted(link.auth_identifier for link in links if link.auth_identifier)
 
     def connected(self) -> bool:
-        """True if anybody else can be reached now."""
+        """True if any other participant can be reached now."""
         session = self._session
         if session is None or session.is_closed():
             return False
@@ -315,7 +315,7 @@ class Bus:
         return self._is_closed
 
     def close(self) -> None:
-        """Takes everything back that was declared here; a second call does nothing. Without it the process would hang at its end."""
+        """Undeclare everything; a second call does nothing. Without it the process would hang at exit."""
         with self._lock:
             declared, self._declared, self._is_closed = self._declared, [], True
             if self._session is not None and not self._session.is_closed():
@@ -324,7 +324,7 @@ class Bus:
             entry.stop()
 
     def _open(self) -> None:
-        """A new session with everything that was declared. The caller holds the lock."""
+        """Open a new session with all declarations. The caller holds the lock."""
         way = "listen" if self._is_server else "connect"
         entries: dict[str, Any] = {f"{way}/endpoints": [self.endpoint]}
         if self._tls is not None:
@@ -373,7 +373,7 @@ class Bus:
 
 
 def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None, str]:
-    """The answer, or None and the reason. A fault in the handler reaches the log and the client, which waits for an answer."""
+    """Return the reply, or None and the reason. An error in the handler is logged and sent to the client, which waits for a reply."""
     try:
         return check_size(answer(key, payload), key), ""
     except FleetmapError as error:
@@ -384,7 +384,7 @@ def answer_query(answer: Answer, key: str, payload: bytes) -> tuple[bytes | None
 
 
 def check_size(payload: bytes, key: str) -> bytes:
-    """`payload` itself; raises LinkError for one that no message holds."""
+    """Return `payload`; raise LinkError if it is too large for a message."""
     if len(payload) > MAX_MESSAGE_BYTES:
         raise LinkError(
             f"{len(payload)} bytes under {key} are more than the {MAX_MESSAGE_BYTES} of a message; use parts"
@@ -393,7 +393,7 @@ def check_size(payload: bytes, key: str) -> bytes:
 
 
 def deliver(listen: Listen, key: str, payload: bytes) -> None:
-    """Calls a subscriber. What it raises is logged and does not reach the publisher."""
+    """Call a subscriber. Its exceptions are logged and do not reach the publisher."""
     try:
         listen(key, payload)
     except Exception:
@@ -401,7 +401,7 @@ def deliver(listen: Listen, key: str, payload: bytes) -> None:
 
 
 def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> UnreachableError:
-    """The error of a query without an answer. is_silenced: a server is there, and it knows the asker's certificate."""
+    """Error of a query without a reply. is_silenced: a server is there, and it knows the client's certificate."""
     why = "is the server running and reachable?"
     if is_silenced:
         why = (
@@ -412,7 +412,7 @@ def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> Unrea
 
 
 def query_refused(key: str, reason: str) -> LinkError:
-    """The error of a query that the other side refused."""
+    """Error of a query that the other side refused."""
     return LinkError(f"{key} was refused: {reason}")
 
 
@@ -423,14 +423,14 @@ def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:
 
 
 def _size(message: Any, key: str) -> int:
-    """What a sample or question keeps in memory while it waits: what came beside its payload too."""
+    """Memory of a waiting sample or query, attachment included."""
     parts = (message.payload, message.attachment)
     return len(key) + sum(len(part) for part in parts if part is not None)
 
 
 _COMMON: dict[str, Any] = {
-    # In peer mode, without an end and without failure, `open` returns at once and connects in the background for
-    # ever; any other combination gives up, or waits.
+    # In peer mode, without timeout and without exit on failure, `open` returns at once and connects in the background
+    # forever; any other combination gives up or blocks.
     "mode": "peer",
     "listen/endpoints": [],
     "connect/endpoints": [],
@@ -443,8 +443,8 @@ _COMMON: dict[str, Any] = {
     "transport/shared_memory/enabled": False,
     "adminspace/enabled": False,
 }
-# A router of ROS 2 does not pass on what one peer says to another: its programs hear of each other by the router's gossip, and connect.
-# So does a robot's side, which itself listens nowhere. From another machine they cannot be reached: there the router serves a client.
+# A router of ROS 2 does not forward messages between peers: its programs discover each other by the router's gossip, and connect.
+# So does a robot's side, which does not listen. From another machine peers cannot be reached: there the router serves a client.
 _ROS: dict[str, Any] = {"timestamping/enabled": True}
 _ROS_HERE = _ROS | {"scouting/gossip/enabled": True, "scouting/gossip/target": {"router": [], "peer": ["router"]}}
 _ROS_AWAY = _ROS | {"mode": "client", "connect/timeout_ms": 10_000, "connect/exit_on_failure": True}

@@ -1,4 +1,4 @@
-"""Features by the extractor that the settings name. To add one: a file beside this one and a line in EXTRACTORS."""
+"""Feature extraction by the extractor named in the settings. To add one: a file beside this one and a line in EXTRACTORS."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ EXTRACTORS: dict[str, Extractor] = {"grid-orb": orb.detect_in_slices}
 
 
 def extract(image: Image, settings: OrbSettings) -> orb.Features:
-    """The features of an image by the extractor of the settings; UsageError for one that does not exist."""
+    """Extract the features of an image with the extractor of the settings; UsageError for an unknown one."""
     return finished(extract_in_slices(image, settings))
 
 

@@ -23,7 +23,7 @@ def packed(descriptors: Descriptors) -> Packed:
     assert descriptors.ndim == 2
     assert descriptors.shape[1] == 32
     assert descriptors.dtype == np.uint8
-    # Bytes of a tile may begin anywhere; words must not.
+    # Bytes of a tile may be unaligned; words must not be.
     return np.require(np.ascontiguousarray(descriptors).view(np.uint64), requirements=["C", "A"])
 
 
@@ -45,7 +45,7 @@ def match_mutual(
     """(P, 2) index pairs that are each other's nearest, by rising index in a.
 
     The distance is at most `max_distance` and below `ratio` times that of a's second nearest in b. Source: Lowe 2004.
-    nodes: of a vocabulary's tree, the two nearest to each of a (A, 2) and the nearest to each of b (B,); only what shares one is compared,
+    nodes: nearest two vocabulary nodes of each of a (A, 2) and nearest one of each of b (B,); only pairs with a common one are compared,
     which misses few matches. Source: direct index, Galvez-Lopez and Tardos 2012, section III-B.
     """
     if nodes is not None:
@@ -55,9 +55,9 @@ def match_mutual(
 
 
 class Projected(NamedTuple):
-    """Where A landmarks or features should appear in an image, and how they look.
+    """Predicted pixels and appearance of A landmarks or features in an image.
 
-    pixels (A, 2), NaN where one is not to be matched; radius_px (A,); descriptors (A, 32); octave_range (A, 2) lowest and
+    pixels (A, 2), NaN to exclude one from matching; radius_px (A,); descriptors (A, 32); octave_range (A, 2) lowest and
     highest octave, both included.
     """
 
@@ -70,10 +70,10 @@ class Projected(NamedTuple):
 def match_by_projection(
     projected: Projected, features: Features, max_distance: int, ratio: float
 ) -> tuple[Indices, Distances]:
-    """(A,) index of the feature that shows each, -1 none, and (A,) their distance, FAR none.
+    """(A,) index of the matching feature of each, -1 for none, and (A,) its distance, FAR for none.
 
     The distance is at most `max_distance` and below `ratio` times that of its nearest rival of the same octave: a corner
-    found again on the next octave is no rival. Each feature goes to the nearest that chose it, the others go without; ties
+    found again on the next octave is no rival. Each feature goes to the nearest candidate that chose it, the others stay unmatched; ties
     to the lower index.
     """
     assert len(projected.pixels) == len(projected.radius_px) == len(projected.octave_range)

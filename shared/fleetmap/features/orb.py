@@ -53,7 +53,7 @@ def detect(image: Image, settings: OrbSettings) -> Features:
 
 
 def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
-    """As `detect`, in slices of about equal work: corners, descriptors, and what the caller makes of them."""
+    """As `detect`, in slices of about equal work: corners, descriptors, and the caller's use of them."""
     image = np.ascontiguousarray(image)
     levels = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
     yield
@@ -78,7 +78,7 @@ def _described(
     keypoints = list(map(cv2.KeyPoint, *columns, repeat(1.0), octaves.tolist()))
     kept, descriptors = engine.compute(image, keypoints)
     assert len(kept) == len(keypoints), "corners keep to the border that descriptors need"
-    # OpenCV scales level pixels up from their corners; where they lie in the image is told from their centres.
+    # OpenCV scales level pixels up from their corners; positions in the image count from their centres.
     middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
     return Features(pixels.astype(np.float64) + middle[:, None], octaves, angles_deg, np.asarray(descriptors, np.uint8))
 

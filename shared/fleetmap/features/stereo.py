@@ -34,5 +34,5 @@ def disparities(
 
 
 def max_disparity_px(camera: StereoCamera, settings: StereoSettings) -> float:
-    """The largest disparity that is looked for."""
+    """Largest disparity of the search."""
     return min(camera.focal_px * camera.baseline_m / settings.min_depth_m, 0.6 * camera.width_px)

@@ -1,4 +1,4 @@
-"""Foxglove: channels of maps, robots, fixes, images and failures, the server that shows them, and MCAP files that hold them.
+"""Foxglove: channels of maps, robots, fixes, images and failures, the server that sends them to viewers, and MCAP files of them.
 
 All other modules here need the extra `foxglove`: call `require_foxglove` before they are imported.
 """
@@ -12,16 +12,16 @@ LOOPBACK = "127.0.0.1"
 
 
 class ViewerAddress(NamedTuple):
-    """Where viewers connect to; port 0 picks a free one."""
+    """Address for viewers; port 0 picks a free one."""
 
     host: str
     port: int
 
 
 def viewer_address(text: str, *, insecure: bool) -> ViewerAddress:
-    """What `--foxglove` names: PORT on loopback, or HOST:PORT.
+    """Parse the value of `--foxglove`: PORT on loopback, or HOST:PORT.
 
-    Raises UsageError for what is none, and for one that other machines reach, unless that is wanted: viewers do not sign in.
+    Raises UsageError for an invalid address, and for one that other machines can reach unless allowed: viewers do not sign in.
     """
     host, _, port = text.rpartition(":")
     host = host.strip("[]") or LOOPBACK
@@ -40,7 +40,7 @@ def viewer_address(text: str, *, insecure: bool) -> ViewerAddress:
 
 
 def require_foxglove(what: str) -> None:
-    """Raises UsageError where Foxglove's library is missing; what: what needs it."""
+    """Raise UsageError if Foxglove's library is missing; what: the feature that needs it."""
     try:
         import foxglove  # noqa: F401
     except ImportError as error:

@@ -1,6 +1,6 @@
 """Channels of maps, robots, fixes, images and failures: the same for viewers and in MCAP files.
 
-Messages are protobuf in Foxglove's own schemas; a failure's whole report is JSON, because it has none. Stamps are nanoseconds.
+Messages are protobuf in Foxglove's own schemas; a failure's full report is JSON, for lack of a schema. Stamps are nanoseconds.
 """
 
 import math
@@ -51,7 +51,7 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
 
 MAP, ODOM, BASE, CAMERA, SURVEY = "map", "odom", "base_link", "camera", "survey"
-MAX_POINTS = 1_000_000  # of a map in one message of 12 MB; of larger ones every n-th
+MAX_POINTS = 1_000_000  # points of a map in one message of 12 MB; larger maps are thinned to every n-th
 _MAX_PATH = 2000
 _QUALITY = 80
 _LAST_S = (1 << 32) - 1
@@ -101,7 +101,7 @@ class ChannelMessage(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A message that is made when somebody sees it."""
+    """A message that is encoded only if a viewer subscribes."""
 
     topic: str
     stamp_ns: int
@@ -109,12 +109,12 @@ class Shown(NamedTuple):
 
     @classmethod
     def now(cls, message: ChannelMessage) -> "Shown":
-        """One that is made already."""
+        """Wrap a finished message."""
         return cls(message.topic, message.stamp_ns, lambda: message)
 
 
 class RobotMark(NamedTuple):
-    """A robot, or a place where it may be: map_from_base (4, 4), a Status by name."""
+    """A robot, or one of its possible places: map_from_base (4, 4), a Status by name."""
 
     name: str
     map_from_base: Array
@@ -122,12 +122,12 @@ class RobotMark(NamedTuple):
 
 
 def encoding_of(schema: Schema) -> str:
-    """How the messages of a schema are encoded."""
+    """Encoding of the messages of a schema."""
     return "json" if schema.encoding == "jsonschema" else "protobuf"
 
 
 class ChannelWriter:
-    """Writes an MCAP file; the same messages make the same bytes. A channel is in it with its first message."""
+    """Writes an MCAP file; equal messages give equal bytes. A channel is added with its first message."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._writer = Writer(file, compression=CompressionType.NONE)
@@ -141,7 +141,7 @@ class ChannelWriter:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
     def write(self, message: ChannelMessage) -> None:
-        """One more message, in any order of stamps."""
+        """Add a message, in any order of stamps."""
         topic, schema = message.topic, CHANNELS[message.topic]
         if schema.name not in self._schemas:
             self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -154,7 +154,7 @@ class ChannelWriter:
 
 
 def points(stamp_ns: int, points_map: Array, topic: str = "/map", frame: str = MAP) -> ChannelMessage:
-    """Landmarks (N, 3), thinned evenly where there are too many."""
+    """Landmarks (N, 3), thinned evenly if there are too many."""
     kept = points_map[:: max(1, math.ceil(len(points_map) / MAX_POINTS))]
     kind = PackedElementFieldNumericType.Float32
     fields = [PackedElementField(name=name, offset=4 * n, type=kind) for n, name in enumerate("xyz")]
@@ -194,7 +194,7 @@ def links(stamp_ns: int, given: Iterable[tuple[str, str, Array]]) -> ChannelMess
 
 
 def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", frame: str = MAP) -> ChannelMessage:
-    """All robots as arrows with words, in the place of those that were shown before."""
+    """All robots as arrows with labels; replaces those shown before."""
     entities = []
     for mark in marks:
         colour, above = _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
@@ -216,13 +216,13 @@ def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", fr
 
 
 def place(topic: str, stamp_ns: int, map_from_base: Array) -> ChannelMessage:
-    """A place (4, 4) in `map`: a fix, or where a failure began."""
+    """A place (4, 4) in `map`: a fix, or the start of a failure."""
     found = PoseInFrame(timestamp=_stamp(stamp_ns), frame_id=MAP, pose=_located(map_from_base))
     return ChannelMessage(topic, stamp_ns, found.encode())
 
 
 def picture(stamp_ns: int, left: Image) -> ChannelMessage:
-    """An image of the left camera, rectified, as `lens` has it."""
+    """An image of the left camera, rectified to `lens`."""
     return jpeg("/camera", stamp_ns, jpeg_image(left, _QUALITY).data)
 
 
@@ -233,7 +233,7 @@ def jpeg(topic: str, stamp_ns: int, data: bytes) -> ChannelMessage:
 
 
 def lens(stamp_ns: int, camera: StereoCamera) -> ChannelMessage:
-    """The rectified left camera, by which a viewer draws the map into its images."""
+    """The rectified left camera, with which a viewer projects the map into its images."""
     matrix = camera.matrix
     calibration = CameraCalibration(
         timestamp=_stamp(stamp_ns),
@@ -250,7 +250,7 @@ def lens(stamp_ns: int, camera: StereoCamera) -> ChannelMessage:
 
 
 def matches(stamp_ns: int, pixels: Array, expected: Array | None = None) -> ChannelMessage:
-    """Pixels (N, 2) at which landmarks were found; expected (N, 2): where the map has them, joined by lines."""
+    """Observed pixels (N, 2) of landmarks; expected (N, 2): pixels predicted by the map, joined by lines."""
     colour = _colour(_GOOD)
     drawn = [_annotation(stamp_ns, pixels, PointsAnnotationType.Points, colour)]
     if expected is not None:
@@ -261,7 +261,7 @@ def matches(stamp_ns: int, pixels: Array, expected: Array | None = None) -> Chan
 
 
 def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMessage:
-    """A line that says a robot's status."""
+    """A log line with a robot's status."""
     words = f"{status}: {cause}" if cause else status
     return _log("/log", stamp_ns, words, robot, _LEVELS.get(status, LogLevel.Error))
 
@@ -269,7 +269,7 @@ def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMes
 def failure(
     stamp_ns: int, report: FailureReport, pictures: Iterable[tuple[str, bytes]], where: str | None = None
 ) -> list[ChannelMessage]:
-    """A failure: its line, place, pictures and report. pictures: kind (`frame`, `matches`) and JPEG; where: in words, else the tile."""
+    """A failure: log line, place, images and report. pictures: kind (`frame`, `matches`) and JPEG; where: place name, else the tile."""
     if where is None:
         where = "nowhere" if report.tile is None else "tile {},{}".format(*report.tile)
     words = f"{report.kind}: {report.cause}, {report.duration_s:.1f} s, version {report.version}, {where}"
@@ -288,15 +288,15 @@ def failure(
 
 
 class SurveyChannels:
-    """Surveys under way, seen from above, in a frame `survey` of their own."""
+    """Running surveys, seen from above, in a separate frame `survey`."""
 
     def __init__(self, base_from_cam: Array | None = None) -> None:
-        """base_from_cam (4, 4): where the camera is, if that is known."""
+        """base_from_cam (4, 4): mounting of the camera, if known."""
         self._base_from_cam = base_from_cam
         self._status = ("", "")
 
     def shown(self, state: LiveSurveyState) -> list[Shown]:
-        """One more state; a line of the log where its status is new."""
+        """Messages of the next state, with a log line if its status changed."""
         stamp_ns, estimate = state.stamp_ns, state.estimate
         found = [
             Shown(
@@ -371,7 +371,7 @@ def _annotation(stamp_ns: int, pixels: Array, kind: PointsAnnotationType, colour
 
 
 def _stamp(stamp_ns: int) -> Timestamp:
-    """Times before 1970 are 1970, those after 2106 are that."""
+    """Clamp a time to 1970 to 2106."""
     return Timestamp(sec=min(max(0, stamp_ns) // 10**9, _LAST_S), nsec=max(0, stamp_ns) % 10**9)
 
 

@@ -1,4 +1,4 @@
-"""Foxglove's websocket server: shows what it is given to whoever subscribes, and never waits for a viewer."""
+"""Foxglove's websocket server: sends messages to subscribed viewers and never waits for one."""
 
 import logging
 import threading
@@ -15,8 +15,8 @@ from fleetmap.foxglove import ViewerAddress
 from fleetmap.foxglove.channels import CHANNELS, Shown, encoding_of
 from fleetmap.log_lines import LogLimit
 
-_WAITING = 32  # messages of a topic that nobody has encoded yet
-_BACKLOG = 256  # encoded messages that wait for one viewer; the library drops the oldest
+_WAITING = 32  # messages of a topic that are not encoded yet
+_BACKLOG = 256  # encoded messages waiting for one viewer; the library drops the oldest
 _STOP_WITHIN_S = 1.0
 _log = logging.getLogger(__name__)
 
@@ -24,21 +24,21 @@ _log = logging.getLogger(__name__)
 class FoxgloveServer:
     """Encodes and sends in a thread of its own; methods may be called from any thread. Use it in `with`.
 
-    A new viewer gets the last message of each topic. dropped: messages that came too quickly to be encoded.
+    A new viewer gets the last message of each topic. dropped: number of messages that arrived too fast to be encoded.
     """
 
     def __init__(self, address: ViewerAddress, name: str) -> None:
-        """name: shown by viewers. Raises UsageError where nothing can listen there."""
+        """name: shown by viewers. Raises UsageError if it cannot listen there."""
         self.dropped = 0
         self._context = Context()
-        # All before anybody connects: who subscribes at once to a channel that is made later may be told that there is none.
+        # All before any viewer connects: an early subscription to a channel that is created later may be refused as unknown.
         self._channels = {
             topic: Channel(topic, schema=schema, message_encoding=encoding_of(schema), context=self._context)
             for topic, schema in CHANNELS.items()
         }
         self._waiting: dict[str, deque[Shown]] = {}
         self._last: dict[str, Shown] = {}
-        self._subscribed: deque[str] = deque()  # without a lock: the library calls while it holds its own
+        self._subscribed: deque[str] = deque()  # without a lock: the library holds its own during the call
         self._lock, self._wake, self._ended = threading.Lock(), threading.Event(), False
         self._faults = LogLimit(_log)
         try:
@@ -66,7 +66,7 @@ class FoxgloveServer:
         self._ended = True
         self._wake.set()
         self._thread.join()
-        # The library waits for each viewer to take what waits for it, and one that hangs never does.
+        # The library waits until each viewer has taken its messages, and a hanging viewer never does.
         stopping = threading.Thread(target=self._server.stop, daemon=True, name="foxglove stops")
         stopping.start()
         stopping.join(_STOP_WITHIN_S)
@@ -74,11 +74,11 @@ class FoxgloveServer:
             _log.warning("%d messages came too quickly for the viewers and were dropped", self.dropped)
 
     def wants(self, topic: str) -> bool:
-        """Whether a viewer looks at a topic: what costs much is made for nobody else."""
+        """True if a viewer subscribes to the topic; check it before making expensive messages."""
         return self._channels[topic].has_sinks()
 
     def show(self, some: Iterable[Shown]) -> None:
-        """Shows messages soon, in the order of each topic; returns at once. Of what waits for too long the oldest is dropped."""
+        """Queue messages, in order for each topic; returns at once. The oldest are dropped if too many wait."""
         with self._lock:
             for shown in some:
                 waiting = self._waiting.setdefault(shown.topic, deque(maxlen=_WAITING))
@@ -87,12 +87,12 @@ class FoxgloveServer:
         self._wake.set()
 
     def subscribed(self, topic: str) -> None:
-        """A viewer begins to look at a topic."""
+        """Handle a viewer's subscription to a topic."""
         self._subscribed.append(topic)
         self._wake.set()
 
     def _serve(self) -> None:
-        """Outside the library's callbacks, which must not publish."""
+        """Encode and publish, outside the library's callbacks, which must not publish."""
         while not self._ended:
             self._wake.wait()
             self._wake.clear()
@@ -115,14 +115,14 @@ class FoxgloveServer:
             except FleetmapError as error:
                 self._faults.warning(shown.topic, "%s cannot be shown: %s", shown.topic, error)
                 continue
-            except Exception:  # a fault in one message must not end what others see
+            except Exception:  # an error in one message must not stop the others
                 _log.exception("%s cannot be shown", shown.topic)
                 continue
             channel.log(message.data, log_time=max(0, message.stamp_ns))
 
 
 class _Listener(ServerListener):
-    """What the library calls, from threads of its own."""
+    """Callbacks of the library, called from its own threads."""
 
     def __init__(self, server: FoxgloveServer) -> None:
         self._server = server

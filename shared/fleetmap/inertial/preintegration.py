@@ -1,4 +1,4 @@
-"""Inertial samples between two moments, summed up once: relative motion, its uncertainty, how both follow the biases.
+"""IMU preintegration between two moments: relative motion, its covariance, and the derivatives of both by the biases.
 
 Convention, in a gravity-aligned frame: R_j = R_i dR, v_j = v_i + g dt + R_i dv and
 p_j = p_i + v_i dt + g dt^2 / 2 + R_i dp.
@@ -20,7 +20,7 @@ GRAVITY_MAP = np.array([0.0, 0.0, -GRAVITY_MPS2])
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """Relative motion of the body between two stamps as the IMU felt it, in body axes at `start_ns`.
+    """Relative motion of the body between two stamps as measured by the IMU, in body axes at `start_ns`.
 
     delta_rotation (3, 3), delta_velocity_mps (3,), delta_position_m (3,): without gravity and initial velocity.
     cov (15, 15): rotation, velocity, position, gyro bias, accelerometer bias; the last six are the biases' walk since
@@ -49,10 +49,10 @@ class Preintegrated:
 def preintegrate(
     imu: ImuSamples, start_ns: int, end_ns: int, gyro_bias: Array, accel_bias: Array, noise: ImuNoise
 ) -> Preintegrated:
-    """The motion from `start_ns` to `end_ns`, biases (3,) taken as constant.
+    """Integrate the motion from `start_ns` to `end_ns`, biases (3,) taken as constant.
 
-    Samples are interpolated at both ends and held beyond the data. Where more than a few sample periods are missing,
-    `max_gap_s` says so and the covariance grows by what an unseen motion can be; no data at all gives zero increments
+    Samples are interpolated at both ends and held beyond the data. If more than a few sample periods are missing,
+    `max_gap_s` shows it and the covariance grows by the largest plausible motion; no data at all gives zero increments
     with a covariance to match. Source: Forster et al. 2017, On-manifold preintegration for real-time VIO.
     """
     gyro_bias, accel_bias = np.array(gyro_bias, np.float64), np.array(accel_bias, np.float64)
@@ -87,7 +87,7 @@ def imu_intervals(imu: ImuSamples, start_ns: int, end_ns: int) -> tuple[Array, A
 
 
 def densities(noise: ImuNoise) -> tuple[float, float, float, float]:
-    """As the core takes them: gyro and accelerometer, and their biases' walks."""
+    """Noise densities in the core's order: gyro and accelerometer, and the random walks of their biases."""
     walks = noise.gyro_walk_radps2_rthz, noise.accel_walk_mps3_rthz
     return noise.gyro_noise_radps_rthz, noise.accel_noise_mps2_rthz, *walks
 

@@ -1,4 +1,4 @@
-"""The building's frame, in which people and fleet managers speak of places: where the origin of `map` stands in it."""
+"""The building's frame, used by operators and fleet managers, and the pose of `map` in it."""
 
 from math import pi
 from typing import Annotated
@@ -10,10 +10,10 @@ from fleetmap.errors import MapFormatError
 from fleetmap.geometry import Array, se3, so3_exp
 
 BUILDING_KEY = "building"
-"""In `configuration` of a manifest, where readers of before look over it: format 1 refuses keys that it does not know elsewhere."""
+"""Key in `configuration` of a manifest, where older readers ignore it: elsewhere format 1 refuses unknown keys."""
 
 ALIGNMENT, AREAS = FOR_ROBOTS = ("alignment", "areas")
-"""Kinds of what a site keeps beside its versions and robots may have, by the address that the site's signed list names."""
+"""Kinds of a site's further files, beside its versions, which robots may fetch by the addresses in the signed list."""
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e7, le=1e7)]
 Angle = Annotated[float, msgspec.Meta(ge=-pi - 1e-9, le=pi + 1e-9)]
@@ -21,9 +21,9 @@ Sigma = Annotated[float, msgspec.Meta(ge=0, le=1e7)]
 
 
 class BuildingFrame(msgspec.Struct, frozen=True, kw_only=True):
-    """The origin of `map` in the building (metres), and the direction of its x axis there (radians, counter-clockwise).
+    """The origin of `map` in building coordinates (metres), and the direction of its x axis (radians, counter-clockwise).
 
-    The floor is the same: z and the vertical are those of `map`. sigma_m: of a position in the middle of what both were aligned by.
+    Both share the floor: z and the vertical are those of `map`. sigma_m: of a position amid the points of the alignment.
     """
 
     x_m: Coordinate

@@ -1,4 +1,4 @@
-"""The envelope of every binary format here: magic, format number, size, one zstd frame.
+"""The common envelope of all binary formats: magic, format number, size, one zstd frame.
 
     offset  type   content
     0       4 s    magic, names the kind
@@ -23,10 +23,10 @@ _MAX_WINDOW_BYTES = 1 << 27
 
 
 def pack(magic: bytes, format_number: int, payload: bytes | Sequence[bytes], *, level: int = _LEVEL) -> bytes:
-    """`payload` in its envelope. The same input gives the same bytes (for one release of zstd).
+    """Wrap `payload` in its envelope. Equal input gives equal bytes (for one release of zstd).
 
-    A payload in parts is compressed in blocks of its own, each with its own statistics: columns of different kinds then
-    do not spoil each other's.
+    A payload in parts is compressed in blocks of its own, each with its own statistics: columns of different kinds
+    then compress better.
     """
     parts = [payload] if isinstance(payload, bytes) else payload
     size = sum(len(part) for part in parts)
@@ -42,9 +42,9 @@ def pack(magic: bytes, format_number: int, payload: bytes | Sequence[bytes], *, 
 
 
 def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) -> tuple[int, bytes]:
-    """Format number and payload of `data`.
+    """Return format number and payload of `data`.
 
-    Raises NewerFormatError for a format number above `newest`, MapFormatError for everything else that is not a whole
+    Raises NewerFormatError for a format number above `newest`, MapFormatError for anything else but a complete
     envelope of kind `magic` with at most `max_bytes` inside. `what` names the thing in messages.
     """
     if len(data) < _HEADER.size or data[:4] != magic:

@@ -1,4 +1,4 @@
-"""The bytes of one tile of the grid of planners: place, then four layers of cells, in `container`'s envelope."""
+"""Encoding of one tile of the occupancy grid: place, then four layers of cells, in `container`'s envelope."""
 
 import struct
 
@@ -18,15 +18,15 @@ _TILE_BYTES = _HEAD.size + _LAYERS * _LAYER_BYTES
 
 
 def encode_grid_tile(place: tuple[int, int], cells: NDArray[np.uint8]) -> bytes:
-    """The bytes of the tile at (x, y) with cells (N, N, 4)."""
+    """Encode the tile at (x, y) with cells (N, N, 4)."""
     layers = (np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS))
     return pack(_MAGIC, GRID_FORMAT, [_HEAD.pack(*place), *layers], level=_LEVEL)
 
 
 def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Place and cells (N, N, 4) of a tile's bytes.
+    """Decode place and cells (N, N, 4) of a tile.
 
-    MapFormatError or NewerFormatError for anything else; memory is bounded whatever the bytes say.
+    MapFormatError or NewerFormatError for anything else; memory is bounded for any input.
     """
     _, payload = unpack(_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
     if len(payload) != _TILE_BYTES:

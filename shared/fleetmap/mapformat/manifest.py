@@ -1,4 +1,4 @@
-"""The manifest: what a version consists of, as canonical JSON. Its SHA-256 is the version's identity."""
+"""The manifest: the content of a version as canonical JSON. Its SHA-256 is the version's identity."""
 
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ Positive = Annotated[int, msgspec.Meta(ge=1, le=(1 << 62))]
 
 
 class TileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One tile: its place in the grid, its address, its size, what is in it."""
+    """One tile: its place in the grid, address, size and content counts."""
 
     x: Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
     y: Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
@@ -30,14 +30,14 @@ class TileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class BlobEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Bytes by their address."""
+    """Address and size of a blob."""
 
     sha256: Sha256
     bytes: Positive
 
 
 class CameraEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The rectified camera that made the survey; robots compare their own with it."""
+    """Rectified camera of the survey; robots compare their own with it."""
 
     focal_px: float
     width_px: Positive
@@ -46,7 +46,7 @@ class CameraEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class RecordingEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A recording that went into the survey."""
+    """A recording used by the survey."""
 
     name: str
     sha256: Sha256
@@ -54,7 +54,7 @@ class RecordingEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a version consists of. `created` is ISO 8601 in UTC; `parent` is the version that was current then."""
+    """Content of a version. `created` is ISO 8601 in UTC; `parent` is the version that was current then."""
 
     format_version: Positive = MANIFEST_FORMAT
     site: Name
@@ -72,12 +72,12 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def landmarks(self) -> int:
-        """Landmarks in all tiles."""
+        """Number of landmarks in all tiles."""
         return sum(tile.landmarks for tile in self.tiles)
 
     @property
     def tile_bytes(self) -> int:
-        """Bytes of all tiles, as they travel."""
+        """Size of all tiles in bytes, compressed."""
         return sum(tile.bytes for tile in self.tiles)
 
 
@@ -86,7 +86,7 @@ class _FormatOnly(msgspec.Struct):
 
 
 def encode_manifest(manifest: Manifest) -> bytes:
-    """Canonical JSON: sorted keys, no spaces, so that equal manifests have equal hashes.
+    """Encode as canonical JSON: sorted keys, no spaces, so that equal manifests have equal hashes.
 
     Raises MapFormatError for values that JSON can't hold.
     """
@@ -99,7 +99,7 @@ def encode_manifest(manifest: Manifest) -> bytes:
 
 
 def decode_manifest(data: bytes) -> Manifest:
-    """The manifest of `data`.
+    """Decode the manifest in `data`.
 
     Raises NewerFormatError for a newer format, MapFormatError for anything that isn't a manifest.
     """
@@ -121,7 +121,7 @@ def decode_manifest(data: bytes) -> Manifest:
 
 
 def building_frame(manifest: Manifest) -> BuildingFrame | None:
-    """The building's frame as the site knew it when the version was made; None without. MapFormatError for one that is none."""
+    """The building's frame at the time when the version was made; None if absent. MapFormatError for an invalid one."""
     found = manifest.configuration.get(BUILDING_KEY)
     if found is None:
         return None

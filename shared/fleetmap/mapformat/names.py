@@ -1,4 +1,4 @@
-"""Names that address things: sites and robots by name, bytes by their SHA-256."""
+"""Names and addresses: sites and robots by name, blobs by SHA-256."""
 
 import hashlib
 import re
@@ -12,10 +12,10 @@ _SHA256 = re.compile(SHA256_PATTERN)
 
 
 def check_name(name: str, what: str) -> str:
-    """`name` itself, fit to be a folder, a key of the bus and part of an address.
+    """Return `name` if it is valid as a folder, a key of the bus and part of an address.
 
-    Raises UsageError (`what` says whose name it is) for anything but 1-64 of a-z 0-9 _ -, or one that
-    begins with a sign.
+    Raises UsageError (`what`: kind of the name) for anything but 1-64 of a-z 0-9 _ -, or a name that
+    begins with _ or -.
     """
     if _NAME.fullmatch(name) is None:
         raise UsageError(
@@ -25,19 +25,19 @@ def check_name(name: str, what: str) -> str:
 
 
 def check_sha256(sha256: str) -> str:
-    """`sha256` itself; raises MapFormatError unless it is 64 lower-case hexadecimal digits."""
+    """Return `sha256`; raise MapFormatError unless it is 64 lower-case hexadecimal digits."""
     if _SHA256.fullmatch(sha256) is None:
         raise MapFormatError(f"{sha256[:80]!r} is not a SHA-256 (64 lower-case hexadecimal digits)")
     return sha256
 
 
 def blob_path(sha256: str) -> str:
-    """Where a store keeps the bytes of an address, relative to its folder."""
+    """Path of a blob in a store, relative to its folder."""
     return f"blobs/{check_sha256(sha256)[:2]}/{sha256}"
 
 
 def current_path(site: str) -> str:
-    """Where a store keeps the manifest's address of the site's current version, as text, relative to its folder."""
+    """Path of the text file with the address of a site's current manifest, relative to the store's folder."""
     return f"sites/{check_name(site, 'site')}/current"
 
 
@@ -47,7 +47,7 @@ def sha256_hex(data: bytes) -> str:
 
 
 def verified(data: bytes, sha256: str) -> bytes:
-    """`data` itself; raises MapFormatError unless its SHA-256 is `sha256`."""
+    """Return `data`; raise MapFormatError unless its SHA-256 is `sha256`."""
     found = sha256_hex(data)
     if found != sha256:
         raise MapFormatError(

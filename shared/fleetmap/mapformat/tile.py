@@ -1,4 +1,4 @@
-"""A tile: the piece of a version that covers one square of the floor, as values."""
+"""A tile, decoded: the part of a version that covers one square of the floor."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ class Tile:
     """Landmarks and places in `map` over [tile_x, tile_x + 1) x [tile_y, tile_y + 1) times size_m, at every height.
 
     landmark_ids (N,) strictly increasing; points_map (N, 3) metres; descriptors (N, 32);
-    view_directions_map (N, 3) unit, from the landmark towards the cameras that saw it; view_half_angle_rad (N,) how
-    widely around that it was seen; max_distance_m (N,) where it would appear at the finest octave; sigma_m (N,)
+    view_directions_map (N, 3) unit, from the landmark towards its cameras; view_half_angle_rad (N,) half angle
+    of the cone of these directions; max_distance_m (N,) distance at which it appears at the finest octave; sigma_m (N,)
     standard deviation of its position. Places are keyframes for recognition: place_ids (K,) strictly increasing,
-    map_from_cam (K, 4, 4), and for each the ids of landmarks seen there, strictly increasing; those may lie in other
+    map_from_cam (K, 4, 4), and for each the ids of landmarks seen there, strictly increasing; they may lie in other
     tiles.
     """
 
@@ -42,7 +42,7 @@ class Tile:
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """Name for messages."""
         return f"tile ({self.tile_x}, {self.tile_y})"
 
     @property
@@ -52,7 +52,7 @@ class Tile:
 
 
 def check_tile(tile: Tile) -> Tile:
-    """`tile` itself; raises MapFormatError naming the first field that breaks what Tile's docstring promises."""
+    """Return `tile`; raise MapFormatError naming the first field that violates Tile's docstring."""
     count, places = len(tile.landmark_ids), len(tile.place_ids)
     for field, shape in (
         ("landmark_ids", (count,)),
@@ -85,7 +85,7 @@ def check_tile(tile: Tile) -> Tile:
 
 
 def check_increasing(ids: Ids, what: str) -> None:
-    """Raises MapFormatError unless the ids are uint32 and strictly increasing."""
+    """Raise MapFormatError unless the ids are uint32 and strictly increasing."""
     if ids.dtype != np.uint32 or ids.ndim != 1:
         raise MapFormatError(f"{what} are {ids.dtype} of shape {ids.shape} instead of a row of uint32")
     if (ids[1:] <= ids[:-1]).any():

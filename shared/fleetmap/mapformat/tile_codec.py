@@ -1,8 +1,8 @@
-"""Tiles as bytes, magic FMTL, in the envelope of `container`. docs/map_format.md describes every byte.
+"""Encoding of tiles, magic FMTL, in the envelope of `container`. docs/map_format.md describes every byte.
 
-Written is format 2, read are 1 and 2: they differ in the fineness of their steps alone (`_STEPS`). Columns, not rows, and
-integers wider than a byte as byte planes (all low bytes, then all next ones), because zstd then finds the high bytes alike.
-Quantising is idempotent: what was decoded is encoded to the same bytes.
+Writes format 2, reads 1 and 2, which differ only in their quantisation steps (`_STEPS`). Stored by column, with
+integers wider than a byte as byte planes (all low bytes, then all next ones), because similar high bytes compress well.
+Quantisation is idempotent: a decoded tile encodes to the same bytes.
 """
 
 import struct
@@ -45,7 +45,7 @@ def direction_code(directions: NDArray[np.float32], steps: int) -> NDArray[np.in
 
     Neighbouring codes are about 1.0 degree apart with 127 steps, 2.9 with 42.
     """
-    # Twice, because the folded edge of the octahedron has two codes for one direction: the second pass picks one.
+    # Twice, because directions on the folded edge of the octahedron have two codes: the second pass picks one.
     return _direction_code(direction_value(_direction_code(directions, steps), steps), steps)
 
 
@@ -72,7 +72,7 @@ def direction_value(codes: NDArray[np.int8], steps: int) -> NDArray[np.float32]:
 def rotation_code(rotation: Array) -> tuple[int, NDArray[np.int16]]:
     """Index of the quaternion's largest component and the other three divided by it (3,), good to about 5e-5 rad.
 
-    Of components that round to the largest one the first wins, so that what was decoded is encoded alike.
+    Among components that round to the largest one the first wins, so that decoded rotations encode to the same code.
     """
     quat = quat_wxyz_from_rotation(rotation)
     ratios = np.round(quat / np.abs(quat).max() * _RATIO)
@@ -96,17 +96,17 @@ def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Ar
 
 
 def differences(ids: Ids) -> Ids:
-    """Each id less the one before it, the first as it is."""
+    """Differences of successive ids, beginning with the first id."""
     return np.diff(ids, prepend=np.uint32(0)) if len(ids) else ids
 
 
 def planes(values: Ids, width: int) -> bytes:
-    """The low `width` bytes of each value, as byte planes: all low bytes, then all next ones."""
+    """Encode the low `width` bytes of each value as byte planes: all low bytes, then all next ones."""
     return values.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :width].T.tobytes()
 
 
 class Columns:
-    """Reads a tile's payload column by column; the caller has checked that it is long enough."""
+    """Reads a tile's payload column by column; the caller has checked its length."""
 
     def __init__(self, payload: bytes, offset: int) -> None:
         self._data = np.frombuffer(payload, np.uint8)
@@ -128,7 +128,7 @@ class Columns:
         return self._sums(self.planes(count, 4))
 
     def increasing_lists(self, counts: NDArray[np.int64]) -> tuple[Ids, ...]:
-        """The next lists of ids, of so many each; errors as of `increasing`."""
+        """The next lists of ids, with the given lengths; errors as of `increasing`."""
         values = self.planes(int(counts.sum()), 4)
         return tuple(self._sums(part) for part in np.split(values, np.cumsum(counts)[:-1])) if len(counts) else ()
 
@@ -154,7 +154,7 @@ _PLACE_STEPS_PER_M = 65536.0
 
 @dataclass(frozen=True, slots=True)
 class _Steps:
-    """How finely a format counts. A tile's side has `side` quanta; distance_m and sigma_m: smallest, codes per octave."""
+    """Quantisation of a format. A tile's side has `side` quanta; distance_m and sigma_m: smallest value, codes per octave."""
 
     side: int
     direction: int
@@ -166,8 +166,8 @@ class _Steps:
         return size_m / self.side
 
 
-# Coarser steps are bytes saved where they cost nothing: a quantum of 2 mm adds 0.6 mm to the standard deviation of
-# landmarks that are known to some millimetres at best, and robots look 75 degrees beyond the directions.
+# Coarser steps save bytes at no cost: a quantum of 2 mm adds 0.6 mm to the standard deviation of
+# landmarks that are known to a few millimetres at best, and robots tolerate 75 degrees beyond the directions.
 _STEPS = {
     1: _Steps(65536, 127, 255, (0.1, 20), (1e-4, 16)),
     2: _Steps(8192, 42, 60, (0.1, 8), (1e-4, 4)),
@@ -176,7 +176,7 @@ _NOW = _STEPS[TILE_FORMAT]
 
 
 def encode_tile(tile: Tile) -> bytes:
-    """The tile's bytes; raises MapFormatError for a tile that breaks its own rules or does not fit."""
+    """Encode a tile; raises MapFormatError for a tile that is invalid or does not fit."""
     check_tile(tile)
     z_codes = np.round(tile.points_map[:, 2] / _NOW.quantum_m(tile.size_m))
     z_base = int(z_codes.min()) if len(tile) else 0
@@ -197,10 +197,10 @@ def encode_tile(tile: Tile) -> bytes:
 
 
 def decode_tile(data: bytes) -> Tile:
-    """The tile of `encode_tile`'s bytes, and of those of older formats.
+    """Decode the bytes of `encode_tile`, or of an older format.
 
-    Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a whole tile. Time and memory are
-    bounded by MAX_TILE_PAYLOAD_BYTES and MAX_TILE_PLACES whatever the bytes say.
+    Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a complete tile. Time and memory are
+    bounded by MAX_TILE_PAYLOAD_BYTES and MAX_TILE_PLACES for any input.
     """
     number, payload = unpack(_MAGIC, TILE_FORMAT, data, "tile", MAX_TILE_PAYLOAD_BYTES)
     if len(payload) < _HEAD.size:

@@ -1,4 +1,4 @@
-"""One version as one file: what is in it, and how it is read. The server writes it, `mapserver import` and robots read it.
+"""A version exported to one file: layout and reader. The server writes it, `mapserver import` and robots read it.
 
     offset  type   content
     0       4 s    magic FMEX
@@ -6,11 +6,11 @@
     6       u16    0
     8       u32    size of the head
     12      ...    head, JSON: site, version, and of every blob its kind, SHA-256 and size
-    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, grid, surfels and archive (if they are taken along)
+    ...     ...    the blobs' bytes in that order: manifest, vocabulary, tiles, grid, surfels and archive (if included)
     end-32  32 s   SHA-256 of everything before
 
-Little-endian. The file names no paths: where bytes go follows from their SHA-256. Reading holds one map blob at a time in
-memory, whatever the file claims; the archive passes in pieces.
+Little-endian. The file contains no paths: blobs are stored by their SHA-256. Reading holds one map blob at a time in
+memory, for any file; the archive is read in pieces.
 """
 
 import hashlib
@@ -56,29 +56,29 @@ class ExportBlob(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class ExportHead(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is in the file."""
+    """Content of the file."""
 
     site: Name
     version: Annotated[int, msgspec.Meta(ge=1, le=1 << 31)]
     blobs: tuple[ExportBlob, ...]
 
     def archive(self) -> ExportBlob | None:
-        """The archive, if it was taken along."""
+        """The archive, if included."""
         return next((blob for blob in self.blobs if blob.kind == "archive"), None)
 
     def start(self) -> bytes:
-        """The bytes of the file before the first blob."""
+        """Bytes of the file before the first blob."""
         text = to_json(self, order="deterministic")
         number = max({"grid": 2, "surfel": 3}.get(blob.kind, 1) for blob in self.blobs)
         return _START.pack(EXPORT_MAGIC, number, 0, len(text)) + text
 
     def file_bytes(self) -> int:
-        """The size of the whole file."""
+        """Size of the whole file."""
         return len(self.start()) + sum(blob.bytes for blob in self.blobs) + DIGEST_BYTES
 
 
 class ExportReader:
-    """An open export file. Its content is used only after it was checked."""
+    """An open export file. Use its content only after the checks."""
 
     def __init__(self, descriptor: int, path: Path) -> None:
         self._descriptor = descriptor
@@ -88,7 +88,7 @@ class ExportReader:
         self._starts = list(accumulate((blob.bytes for blob in self.head.blobs), initial=body))
 
     def check_whole(self) -> None:
-        """Raises MapFormatError unless the file's own SHA-256 is right; reads it all once."""
+        """Raise MapFormatError unless the file's own SHA-256 is correct; reads the whole file once."""
         whole = hashlib.sha256()
         for chunk in self._span(0, self._size - DIGEST_BYTES):
             whole.update(chunk)
@@ -112,7 +112,7 @@ class ExportReader:
         return manifest
 
     def check_tiles(self, manifest: Manifest) -> None:
-        """Raises MapFormatError unless every tile can be read and is what the manifest says."""
+        """Raise MapFormatError unless every tile is valid and matches the manifest."""
         number_of = {blob.sha256: number for number, blob in enumerate(self.head.blobs)}
         for entry in manifest.tiles:
             tile = decode_tile(self.data(number_of[entry.sha256]))
@@ -120,12 +120,12 @@ class ExportReader:
                 raise self._damaged(f"tile {entry.x},{entry.y} is not the one that its manifest names")
 
     def data(self, number: int) -> bytes:
-        """The bytes of a blob; raises MapFormatError for damaged ones."""
+        """Read the bytes of a blob; raises MapFormatError if they are damaged."""
         blob = self.head.blobs[number]
         return verified(b"".join(self.chunks(number)), blob.sha256)
 
     def chunks(self, number: int) -> Iterator[bytes]:
-        """The bytes of a blob in pieces, unverified."""
+        """Read the bytes of a blob in pieces, unverified."""
         return self._span(self._starts[number], self._starts[number + 1])
 
     def _read_head(self) -> tuple[ExportHead, int]:
@@ -171,10 +171,10 @@ class ExportReader:
 
 @contextmanager
 def open_export(path: Path) -> Iterator[ExportReader]:
-    """A reader of the file at `path`.
+    """Open the export file at `path`.
 
-    Raises StoreError where it cannot be read, NewerFormatError for a newer format, MapFormatError for anything else
-    that is no whole export.
+    Raises StoreError if it cannot be read, NewerFormatError for a newer format, MapFormatError for anything
+    else but a complete export.
     """
     with disk_errors(f"{path} cannot be read", "check the path"):
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -1,6 +1,6 @@
-"""Odometry of stereo and single cameras, with and without IMU: run live by the robot and as initial trajectory by the survey.
+"""Odometry of stereo and single cameras, with and without IMU: used live by the robot and for the initial trajectory by the survey.
 
-Names are imported when they are first used: settings are read by programs that compute nothing.
+Names are imported at their first use, so that reading settings stays light.
 """
 
 from importlib import import_module
@@ -32,7 +32,7 @@ _MODULES = {name: f"fleetmap.odometry.{module}" for module, names in _NAMES.item
 
 
 def __getattr__(name: str) -> object:
-    """Imports a public name when it is first used (PEP 562)."""
+    """Import a public name at its first use (PEP 562)."""
     if name not in _MODULES:
         raise AttributeError(f"module 'fleetmap.odometry' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

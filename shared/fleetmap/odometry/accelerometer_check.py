@@ -1,8 +1,8 @@
-"""The accelerometer against the images while a robot drives: signs and order of its axes, and its unit.
+"""Check of the accelerometer against the images while a robot drives: signs and order of its axes, and its unit.
 
-Places of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the integral of
-the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, whatever the velocity was; and the same integral
-of the specific force, turned as the images say, less gravity and the accelerometer's bias.
+Positions of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the integral of
+the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, for any velocity; and equals the same integral
+of the specific force, rotated by the images' rotations, less gravity and the accelerometer's bias.
 """
 
 from itertools import pairwise
@@ -16,21 +16,21 @@ from fleetmap.sensors.samples import ImuSamples
 
 _HALF_NS, _LONGEST_NS = 200_000_000, 350_000_000  # half a window, and the longest between two frames
 _CHANGE_SIGMA_MPS, _BIAS_SIGMA_MPS2 = 0.05, 0.3
-_KEPT = 0.97  # of what was seen, with each window: turns add up errors of the images
+_KEPT = 0.97  # of earlier evidence, with each window: turns accumulate errors of the images
 _MIN_WINDOWS, _SIZE_WINDOWS, _MANY_WINDOWS = 4, 10, 20
-# What other axes must explain better than the given ones before these are ruled out: in variances of a window, and times as well
+# By how much other axes must fit better than the given ones to rule these out: in variances of a window, and as a factor
 _SURE_SQUARES, _SURE_RATIO = 60.0, 4.0
-_NAMED_SQUARES = 12.0  # less well than the best: may be as well
+_NAMED_SQUARES = 12.0  # worse than the best fit by less than this: candidates as well
 _REACH_SIGMAS = 4.0
-_GRAVITY_OFF_MPS2 = 2.0  # a bias and errors of the images make less
-_NO_GRAVITY_MPS2 = 4.0  # what motion shows of it where there is none
+_GRAVITY_OFF_MPS2 = 2.0  # biases and errors of the images cause less
+_NO_GRAVITY_MPS2 = 4.0  # gravity that motion seems to show if there is none
 _UPRIGHT = 0.7  # cosine of the angle between the base's up and the accelerometer's: ramps are far within
 
 
 class AccelerometerCheck:
     """Follows images and samples frame by frame.
 
-    fault: why the accelerometer cannot be used, in words that name its axes or unit; empty while nothing says so.
+    fault: text why the accelerometer cannot be used, naming its axes or unit; empty without evidence.
     """
 
     def __init__(self, base_from_body: Array) -> None:
@@ -42,9 +42,9 @@ class AccelerometerCheck:
         self._windows = 0.0
 
     def handle(self, stamp_ns: int, earlier_from_body: Array | None, imu: ImuSamples, *, on_wheels: bool) -> None:
-        """A frame on the IMU's clock; earlier_from_body (4, 4): by images, since the frame before, None where they do not show it.
+        """Process a frame on the IMU's clock; earlier_from_body (4, 4): by images, since the frame before, None if unknown.
 
-        on_wheels: whether the base stands upright.
+        on_wheels: True if the base stands upright.
         """
         if self.fault:
             return
@@ -63,7 +63,7 @@ class AccelerometerCheck:
         self._judge(imu, on_wheels)
 
     def _begin_run(self, stamp_ns: int) -> None:
-        """What was seen of axes and bias stays; which way is up in the axes of this frame is not known."""
+        """Start a run: evidence on axes and bias stays; the up direction in the axes of this frame is unknown."""
         self._run = [(stamp_ns, np.zeros(3), np.eye(3))]
         up, others = self._normal[12:15], np.linalg.pinv(self._normal[12:15, 12:15], hermitian=True)
         self._normal = self._normal - up.T @ others @ up
@@ -97,7 +97,7 @@ class AccelerometerCheck:
         normal = self._normal.copy()
         normal[range(9, 12), range(9, 12)] += _BIAS_SIGMA_MPS2**-2
         known = np.append(range(9), 15)
-        normal[range(12, 15), range(12, 15)] += 1e-3  # where images broke off it is not known
+        normal[range(12, 15), range(12, 15)] += 1e-3  # unknown where images were interrupted
         solved = np.linalg.solve(normal[9:15, 9:15], normal[9:15][:, known])
         left = normal[np.ix_(known, known)] - normal[9:15][:, known].T @ solved
         axes = np.array([[*each.ravel(), -1.0] for each in SIGNED_AXES])
@@ -127,14 +127,14 @@ class AccelerometerCheck:
             return
         if abs(ups_base[given, 2]) > _UPRIGHT and (is_possible & is_up).any():  # a rig that stands as its base does
             is_possible &= is_up
-        # All axes reversed is one fault, of a driver that reports gravity; it goes before others that explain as much.
+        # All axes reversed is a single fault, of a driver that reports gravity; it precedes other faults that fit equally well.
         possible = [each for k, each in enumerate(SIGNED_AXES) if is_possible[k]]
         likely = max(possible, key=lambda each: 4.0 if (each == -np.eye(3)).all() else float(np.trace(each)))
         self.fault = f"it {axes_in_words(likely)}"
 
 
 def _rotations(rotvecs_rad: Array) -> Array:
-    """(N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula: `so3_exp` of all at once, which would take a fifth of a frame."""
+    """(N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula; vectorised: a loop of `so3_exp` takes a fifth of a frame's time."""
     angles = np.linalg.norm(rotvecs_rad, axis=1)[:, None, None]
     cross = np.cross(rotvecs_rad[:, None], np.eye(3)).transpose(0, 2, 1)
     sine, half_sine = np.sinc(angles / np.pi), np.sinc(0.5 * angles / np.pi)  # sin x / x

@@ -1,4 +1,4 @@
-"""The result of odometry for one frame, and a frame in which results follow each other without a jump."""
+"""Result of odometry for one frame, and a coordinate frame in which results are continuous."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,17 +20,17 @@ class OdometryStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OdometryEstimate:
-    """The body at one frame.
+    """Estimated state of the body at one frame.
 
-    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the points seen and
-    track_pixels (N, 3), u_left v u_right, where (None of an odometry that follows none);
-    after_gap where they had to be matched by descriptors; inertial once gravity is known. new_odom_from_old_odom is
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the observed points and
+    track_pixels (N, 3), u_left v u_right (None for an odometry without tracks);
+    after_gap: they were matched by descriptors; inertial: gravity is known. new_odom_from_old_odom is
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
-    previous_from_body (4, 4) is the motion since the frame before, as known now, None where it is not known. It is not what two
-    estimates differ by: gravity that becomes better known turns all of `odom` about its origin, far from where the body is.
-    imu_minus_cam_s is the time offset as estimated so far, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
-    scale_known is False for one camera whose scale nothing has shown: lengths are then in a unit of the odometry's own. revised:
-    earlier frames that are placed anew, (frame index, odom_from_body (4, 4)). is_lifted: a robot with wheels leaves its floor.
+    previous_from_body (4, 4) is the current estimate of the motion since the frame before, None if unknown. It differs from that of two
+    successive estimates: improved knowledge of gravity rotates `odom` about its origin, far from the body.
+    imu_minus_cam_s is the estimated time offset, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
+    scale_known is False for one camera of unknown scale: lengths are then in an arbitrary unit. revised:
+    earlier frames with new poses, (frame index, odom_from_body (4, 4)). is_lifted: a wheeled robot leaves its floor.
     """
 
     stamp_ns: int
@@ -57,16 +57,16 @@ class OdometryEstimate:
 
 
 def is_away(last_ns: int, estimate: OdometryEstimate) -> bool:
-    """True if nothing ties an estimate to the one at last_ns, a pause before it: the robot may have been carried anywhere."""
+    """True if no motion links an estimate to the one at last_ns, before a pause: the robot may have been carried anywhere."""
     is_pause = estimate.stamp_ns - last_ns > PAUSE_NS
     return is_pause and not estimate.inertial and estimate.status is OdometryStatus.DEGRADED
 
 
 class ContinuousFrame:
-    """Follows estimates one after the other by the motion between them.
+    """Chains estimates by the motion between them.
 
-    The odometry's own frame turns about its origin whenever gravity becomes better known: after 17 m a third of a degree in a first
-    bend moves every pose by 10 cm. frame_from_odom (4, 4) takes that up; it may be set to begin anew.
+    The odometry's own frame rotates about its origin whenever gravity becomes better known: after 17 m a third of a degree in a first
+    bend moves every pose by 10 cm. frame_from_odom (4, 4) compensates for that; it may be set to restart.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class ContinuousFrame:
         """frame_from_body (4, 4) at the estimate's frame."""
         motion, change = estimate.previous_from_body, estimate.new_odom_from_old_odom
         if self._frame_from_last is None:
-            pass  # nothing to go on from
+            pass  # no state to continue from
         elif motion is not None:
             self.frame_from_odom = self._frame_from_last @ motion @ se3_inverse(estimate.odom_from_body)
         elif change is not None:

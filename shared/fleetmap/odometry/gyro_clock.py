@@ -1,7 +1,7 @@
-"""The gyro's clock against the images: when the gyro turned as they did.
+"""Check of the gyro's clock against the images, by correlation of their rotations.
 
-For each of many shifts of the gyro's stamps the turns of the images are fitted by the gyro's turns, times a matrix near identity (its scale
-and mounting may be off by some percent) and with a bias; the squares that are left say how well a shift fits. Source: Mair et al. 2011.
+For each of many shifts of the gyro's stamps the images' rotations are fitted by the gyro's, times a matrix near identity (its scale
+and mounting may be off by a few percent) and with a bias; the squared residuals rate the shift. Source: Mair et al. 2011.
 """
 
 from collections import deque
@@ -20,10 +20,10 @@ _REACH_NS = int(_SHIFTS_S[-1] * 1e9)
 _LONGEST_NS = 350_000_000  # between two frames
 _TURN_SIGMA_RAD = 0.001  # of the images' turn between two frames, at least
 _MATRIX_SIGMA, _BIAS_SIGMA_RADPS = 0.1, 0.05
-_KEPT = 0.975  # of what was seen, with each batch: clocks drift
+_KEPT = 0.975  # of earlier evidence, with each batch: clocks drift
 _BATCH = 5  # frames taken together
 _MOST_WAITING = 100  # frames that wait for samples
-_MIN_FRAMES = 20  # that tell anything
+_MIN_FRAMES = 20  # for a result
 _SURE_SQUARES = 25.0  # in variances, by which another shift must fit better: five sigmas
 
 _PRIOR = np.zeros((7, 7))
@@ -35,11 +35,11 @@ _PRIOR[3, 3] = (_TURN_SIGMA_RAD / _BIAS_SIGMA_RADPS) ** 2
 class GyroClock:
     """Follows turns of the images and samples of the gyro frame by frame.
 
-    off_s: by how much the gyro's stamps are late against what the calibration says; None while nothing says so for sure.
+    off_s: delay of the gyro's stamps relative to the calibration; None until it is certain.
     """
 
     def __init__(self, limit_s: float) -> None:
-        """limit_s: the largest offset that the filter finds by itself."""
+        """limit_s: largest offset that the filter estimates by itself."""
         self._limit_s = limit_s
         self.off_s: float | None = None
         self._last_ns: int | None = None
@@ -49,7 +49,7 @@ class GyroClock:
         self._frames = 0.0
 
     def handle(self, stamp_ns: int, earlier_from_body: Array | None, imu: ImuSamples) -> None:
-        """A frame on the IMU's clock, as calibrated; earlier_from_body (4, 4): by images, since the frame before, None if unknown."""
+        """Process a frame on the calibrated IMU clock; earlier_from_body (4, 4): by images, since the frame before, None if unknown."""
         if self.off_s is not None or not len(imu):
             return
         last_ns, self._last_ns = self._last_ns, stamp_ns
@@ -60,7 +60,7 @@ class GyroClock:
             return
         self._add([self._waiting.popleft() for _ in range(_BATCH)], imu)
         if self._frames >= _MIN_FRAMES:
-            # Where stamps are late, the samples of a frame's own moment have not come yet: beyond that there is a gap at each frame.
+            # If stamps are late, the samples of a frame's own time have not arrived yet: a larger delay causes a gap at each frame.
             self._judge((last_imu_ns - stamp_ns + IMU_GAP_NS) * 1e-9)
 
     def _add(self, batch: Sequence[tuple[int, int, Array]], imu: ImuSamples) -> None:
@@ -83,7 +83,7 @@ class GyroClock:
         self._frames = _KEPT * self._frames + len(batch)
 
     def squares(self) -> Array:
-        """Squares that each shift leaves, in variances."""
+        """Squared residuals of each shift, in variances."""
         grams = self._grams + _PRIOR
         known, crossed = grams[:, :4, :4], grams[:, :4, 4:]
         explained = (crossed * np.linalg.solve(known, crossed)).sum(axis=(1, 2))
@@ -92,7 +92,7 @@ class GyroClock:
 
     def _judge(self, latest_s: float) -> None:
         squares = self.squares()
-        # None is always among them: the filter of a rig with exact clocks finds no offset.
+        # Shift 0 is always included: the filter of a rig with exact clocks finds no offset.
         first_s = min(0.5 * _STEP_S - self._limit_s, 0.0)
         last_s = max(min(self._limit_s, latest_s) - 0.5 * _STEP_S, 0.0)
         may_be_found = (first_s <= _SHIFTS_S) & (last_s >= _SHIFTS_S)

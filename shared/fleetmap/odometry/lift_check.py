@@ -1,4 +1,4 @@
-"""Whether a robot with wheels has left its floor: hands, a fork or a hoist carry it. By what IMU and images make of its motion."""
+"""Detection of a wheeled robot that is lifted off its floor, by hands, fork or hoist, from the motion of IMU and images."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.sensors.samples import WheelSample
 
 _WINDOW_NS = 400_000_000
-# That a floor allows: thresholds, and slopes of 17 degrees over the way that the wheels roll.
+# Climb that a floor allows: thresholds, and slopes of 17 degrees over the rolled distance.
 _CLIMB_M, _CLIMB_SHARE = 0.05, 0.3
 _SIGMAS = 4.0
-_TILT = np.cos(np.radians(12.0))  # against the floor that it rolled on: driving onto a ramp and braking make less
-_FLOOR_KEPT = 0.95  # of which way is up, with each frame in which the wheels roll
+_TILT = np.cos(np.radians(12.0))  # against the floor on which it rolled: ramps and braking cause less
+_FLOOR_KEPT = 0.95  # share of the old up direction, with each frame in which the wheels roll
 _ROLLING_MPS = 0.05
-# Of way without a turn of the wheels; a robot that skids with locked wheels slows down.
+# Distance without rotation of the wheels; a robot that skids with locked wheels slows down.
 _CARRIED_M, _SKID_SHARE = 0.15, 0.8
 
 
@@ -29,20 +29,20 @@ class _Step(NamedTuple):
 
 
 class LiftCheck:
-    """Follows a robot frame by frame. Without wheels it says nothing: what has none may fly."""
+    """Follows a robot frame by frame. Never reports a lift without wheel odometry: such a robot may fly."""
 
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body, self._body_from_base = base_from_body, se3_inverse(base_from_body)
         self._wheel: WheelSample | None = None
         self._steps = deque[_Step]()
         self._floor_up: Array | None = None  # (3,) in the base's axes
-        self._has_rolled = False  # since it was carried: wheels that never turn say nothing
+        self._has_rolled = False  # since it was carried: wheels that never turn prove nothing
 
     def is_lifted(
         self, stamp_ns: int, wheel: Sequence[WheelSample], odom_from_body: Array, earlier_from_body: Array | None,
         climb_sigma_mps: float,
     ) -> bool:  # fmt: skip
-        """Whether it leaves the floor with this frame; stamps on the IMU's clock.
+        """True if the robot leaves the floor with this frame; stamps on the IMU's clock.
 
         wheel: the samples since the frame before. odom_from_body (4, 4): z is up. earlier_from_body (4, 4): since the frame before.
         climb_sigma_mps: of the speed upwards.
@@ -69,14 +69,14 @@ class LiftCheck:
     def _is_tilted(self, up: Array, speed_mps: float) -> bool:
         is_tilted = self._floor_up is not None and bool(self._floor_up @ up < _TILT)
         if self._floor_up is None or is_tilted:
-            self._floor_up = up  # said once: it may stand on a slope from now on, and search there
+            self._floor_up = up  # reported once: the robot may now stand on a slope, and search there
         elif speed_mps > _ROLLING_MPS:
             mixed = _FLOOR_KEPT * self._floor_up + (1.0 - _FLOOR_KEPT) * up
             self._floor_up = mixed / length(mixed)
         return is_tilted
 
     def _is_moved(self, speed_mps: float) -> bool:
-        """Whether it moves on and on without a turn of its wheels, which had turned before."""
+        """True if it keeps moving while its wheels, which turned before, stand still."""
         self._has_rolled |= speed_mps > _ROLLING_MPS
         half = len(self._steps) // 2
         if not self._has_rolled or half < 2 or any(step.is_rolling for step in self._steps):

@@ -1,4 +1,4 @@
-"""The modes of the odometry, one class each: vision alone, starting (vision that looks for gravity), and stereo-inertial."""
+"""The modes of the odometry, one class each: vision alone, starting (vision until gravity is known), and stereo-inertial."""
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -26,16 +26,16 @@ from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
 _ROTATION_SIGMA_RAD = 0.01  # of a gyro's rotation over a gap of seconds
 _FOLLOWED_SHARE = 0.5  # of the tracks
-_NEAR_REST_MPS = 0.2  # a fifth of what the first speed may be off by: the filter finds it
-_STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # how far a step by images may lie from the predicted one
-_MAX_ELSEWHERE = 2  # frames in a row whose descriptor matches contradict the IMU, before these are believed
-_EXTRAPOLATED_NS = 1_000_000_000  # for which a robot that sees nothing goes on at its last speed
+_NEAR_REST_MPS = 0.2  # a fifth of the tolerated error of the first speed: the filter corrects it
+_STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # largest step by images off the prediction
+_MAX_ELSEWHERE = 2  # consecutive frames whose descriptor matches contradict the IMU, until the matches are trusted
+_EXTRAPOLATED_NS = 1_000_000_000  # during which a robot without visual tracking continues at its last speed
 
 
 class ImuInputs:
-    """What the use of an IMU needs: its samples, its noise as it is and as it is weighed, and the checks for its faults.
+    """Inputs from an IMU: its samples, its noise, true and weighted, and the checks for its faults.
 
-    accelerometer: None for one camera, whose metres come from it.
+    accelerometer: None for one camera, which gets its scale from it.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class ImuInputs:
 
 
 class Step(NamedTuple):
-    """What a mode made of one frame: the mode from now on, what its update used (see `InvariantFilter.update`).
+    """Result of one frame: the next mode, and the result of its update (see `InvariantFilter.update`).
 
-    new_odom_from_old_odom, revised and is_lifted are as in OdometryEstimate. is_lost: nothing that was tracked is believed.
+    new_odom_from_old_odom, revised and is_lifted are as in OdometryEstimate. is_lost: no track is trusted.
     """
 
     mode: "Mode"
@@ -75,31 +75,31 @@ class Step(NamedTuple):
 
 
 class Mode(ABC):
-    """A way to follow the body. For each frame `predict`, then `process` with what was tracked by the prediction."""
+    """A way to estimate the body's motion. For each frame call `predict`, then `process` with the tracks found by the prediction."""
 
     inertial = False
-    rotation_sigma_rad: float | None = None  # of `cam_from_earlier`, None where that is only a guess
+    rotation_sigma_rad: float | None = None  # of `cam_from_earlier`, None if that is only a guess
 
     @property
     @abstractmethod
     def stamp_ns(self) -> int:
-        """Of the state, on the IMU's clock; 0 before the first frame."""
+        """Time of the state, on the IMU's clock; 0 before the first frame."""
 
     def begin(self, stamp_ns: int) -> "Mode":
-        """The mode for the first frame, which is at stamp_ns."""
+        """Return the mode for the first frame, at stamp_ns."""
         return self
 
     @abstractmethod
     def predict(self, stamp_ns: int) -> None:
-        """Moves the state to a frame."""
+        """Move the state to a frame."""
 
     @abstractmethod
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """(4, 4) predicted for the frame in work; None where the earlier one is forgotten."""
+        """(4, 4) predicted for the current frame; None if the earlier one is forgotten."""
 
     @abstractmethod
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """Takes what was tracked in the frame that was predicted."""
+        """Process the tracks of the predicted frame."""
 
     @abstractmethod
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
@@ -111,7 +111,7 @@ class Mode(ABC):
 
     @abstractmethod
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """The estimate at a frame, stamped on the camera's clock; `step` is what `process` returned."""
+        """Return the estimate at a frame, stamped on the camera's clock; `step` is the result of `process`."""
 
 
 class WindowMode(Mode):
@@ -134,10 +134,10 @@ class WindowMode(Mode):
         return frame_index not in self.window.filter.clone_ids[1:]
 
     def _show(self, imu: ImuInputs, stamp_ns: int, tracked: Tracked) -> bool:
-        """Shows a frame to the checks of the IMU; stamp_ns on its clock, as calibrated. Whether they have found a fault."""
+        """Run the checks of the IMU on a frame; stamp_ns on its calibrated clock. Return True if they found a fault."""
         seen, samples = tracked.cam_from_previous, imu.samples
         if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE:
-            seen = None  # pictures that could hardly be followed accuse no sensor
+            seen = None  # poorly tracked images are no evidence against a sensor
         moved = None if seen is None else self._rig.body_from_cam @ se3_inverse(seen) @ self._rig.cam_from_body
         imu.clock.handle(stamp_ns, moved, samples.imu)
         if imu.accelerometer is not None:
@@ -176,29 +176,29 @@ class WindowMode(Mode):
 
 
 class VisualMode(WindowMode):
-    """Vision alone: the state moves by the motion that is measured between frames, gravity is unknown."""
+    """Vision alone: the state moves by the motion measured between frames, gravity is unknown."""
 
     def __init__(self, window: SlidingWindow, cam_from_previous: Array | None = None) -> None:
-        """cam_from_previous (4, 4): the last motion where one is known."""
+        """cam_from_previous (4, 4): the last motion, if known."""
         super().__init__(window)
         self._cam_from_previous = np.eye(4) if cam_from_previous is None else cam_from_previous
-        self._seen_ns = window.stamp_ns  # of the last frame whose motion images showed
+        self._seen_ns = window.stamp_ns  # of the last frame whose motion was known from images
 
     def predict(self, stamp_ns: int) -> None:
-        """See Mode; where the state will be is known only when the frame was tracked."""
+        """See Mode; the state is known only after tracking of the frame."""
         is_dark = self.stamp_ns - self._seen_ns > _EXTRAPOLATED_NS
         if is_dark or stamp_ns - self.stamp_ns > PAUSE_NS:
             self._cam_from_previous = np.eye(
                 4
-            )  # a robot that was off, or long in the dark, did not go on at its last speed
+            )  # a robot that was off, or in the dark for long, did not continue at its last speed
         self.window.stamp_ns, self.window.rate_body_radps = stamp_ns, np.zeros(3)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """See Mode: the last motion once more."""
+        """See Mode: repeats the last motion."""
         return self._cam_from_previous if self.window.filter.clone_ids[-1:] == [frame_index] else None
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode. `odom` begins anew where the images no longer show the motion: what that may be is said about this place."""
+        """See Mode. `odom` restarts if the images no longer show the motion; the covariance describes the error relative to this place."""
         change = None
         if self.window.filter.clone_ids:
             if tracked.lost:
@@ -208,7 +208,7 @@ class VisualMode(WindowMode):
             self._predict_random_walk(tracked)
             if (
                 tracked.lost
-            ):  # no motion has verified these observations, and without an IMU nothing else contradicts wrong ones
+            ):  # these observations are not verified by a motion, and without an IMU nothing else reveals wrong ones
                 tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0])
         used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
         return Step(self, used, change)
@@ -226,14 +226,14 @@ class VisualMode(WindowMode):
         window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, self._measured_motion_cov(tracked))
 
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
-        """Of a predicted motion (4, 4), without the images."""
+        """Rotation sigma of a predicted motion (4, 4), without the images."""
         return self._rig.settings.filter.free_rotation_sigma_rad
 
     def _measured_motion_cov(self, tracked: Tracked) -> Array | None:
-        """Covariance (6, 6), in the body's axes, that holds the state near the motion from all points of the last two frames.
+        """Covariance (6, 6), in body axes, that ties the state to the motion of all points of the last two frames.
 
-        An update takes the few tracks that are due or ended. Where they cluster or slip together the state must not
-        follow them further than all the others allow; so loose, it adds no information to speak of.
+        An update uses the few tracks that are due or ended. If they cluster or slip together, the state must not
+        follow them further than all the others allow; it is so loose that it adds hardly any information.
         """
         if tracked.information is None:
             return None
@@ -247,7 +247,7 @@ class VisualMode(WindowMode):
 
 
 class GyroMode(VisualMode):
-    """Vision and the gyro, of an IMU whose accelerometer is not used: the gyro says how the body turns."""
+    """Vision and the gyro of an IMU whose accelerometer is not used: the gyro measures the rotation."""
 
     def __init__(self, window: SlidingWindow, imu: ImuInputs, cam_from_previous: Array | None = None) -> None:
         super().__init__(window, cam_from_previous)
@@ -255,7 +255,7 @@ class GyroMode(VisualMode):
         self._turned: Array | None = None
 
     def predict(self, stamp_ns: int) -> None:
-        """See Mode; the motion to expect is the last one, turned as the gyro says: in a turn that begins the last one is far off."""
+        """See Mode; predicts the last motion with the gyro's rotation, because at the start of a turn the last motion is far off."""
         is_pause = stamp_ns - self.stamp_ns > PAUSE_NS
         self._turned = (
             None if is_pause else self._imu.samples.rotation_between(self.stamp_ns, stamp_ns, self._imu.noise)
@@ -267,7 +267,7 @@ class GyroMode(VisualMode):
             self._cam_from_previous = self._rig.cam_from_body @ se3_inverse(body_from_next) @ self._rig.body_from_cam
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode; a gyro that contradicts the images is given up."""
+        """See Mode; abandons a gyro that contradicts the images."""
         predicted, seen = None if self._turned is None else self._cam_from_previous, tracked.cam_from_previous
         if self._imu.monitor.is_wrong_imu(predicted, seen):
             return VisualMode(self.window, seen).process(frame_index, tracked)
@@ -276,7 +276,7 @@ class GyroMode(VisualMode):
         return step if self._imu.clock.off_s is None else step._replace(mode=VisualMode(self.window, seen))
 
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
-        """The largest bias of a gyro that agrees: few tracks that slip together may not turn the state further."""
+        """The largest bias of a consistent gyro: few tracks that slip together may not rotate the state further."""
         settings = self._rig.settings
         free_rad = settings.filter.free_rotation_sigma_rad
         sigma_rad = max(settings.start.steady_gyro_mean_radps * duration_s, _ROTATION_SIGMA_RAD)
@@ -286,12 +286,12 @@ class GyroMode(VisualMode):
 
 
 def _without_fault(window: SlidingWindow, imu: ImuInputs, motion: Array) -> Mode:
-    """The mode for an IMU with a fault: without one whose clock is wrong, else by its gyro; motion (4, 4): cam_from_previous."""
+    """The mode for a faulty IMU: without the IMU if its clock is wrong, else by its gyro; motion (4, 4): cam_from_previous."""
     return VisualMode(window, motion) if imu.clock.off_s is not None else GyroMode(window, imu, motion)
 
 
 class StartingMode(GyroMode):
-    """Vision and the gyro until gravity is known, by rest or by motion."""
+    """Vision and the gyro until gravity is known, from rest or motion."""
 
     waits_for_gravity = True
 
@@ -308,7 +308,7 @@ class StartingMode(GyroMode):
         self._trajectory: list[tuple[int, Array]] = []
 
     def begin(self, stamp_ns: int) -> Mode:
-        """See Mode: stereo-inertial at once where the IMU rested before the first frame."""
+        """See Mode: stereo-inertial at once if the IMU rested before the first frame."""
         start = self._static_start(stamp_ns)
         return self if start is None else InertialMode.started(self.window, self._imu, start)
 
@@ -337,10 +337,10 @@ class StartingMode(GyroMode):
         return None if start is None else self._moving_evenly(start)
 
     def _moving_evenly(self, start: InitialState) -> InitialState | None:
-        """The start with the speed that wheels or pictures saw in its steady window; None where they saw the speed change.
+        """The start with the speed by wheels or images in its steady window; None if that speed changed.
 
-        An even acceleration is as steady as rest: to an IMU alone it is a tilt, of 5 degrees for 0.8 m/s^2. A speed that is far from zero
-        would be taken for outliers of everything that measures it.
+        Constant acceleration is as steady as rest: an IMU alone sees it as a tilt, of 5 degrees for 0.8 m/s^2. At a speed far from zero
+        the measurements of it would be rejected as outliers.
         """
         settings, base_from_body = self._rig.settings.start, self._rig.base_from_body
         begin_ns = start.stamp_ns - int(settings.steady_window_s * 1e9)
@@ -374,7 +374,7 @@ class StartingMode(GyroMode):
 
 
 class InertialMode(WindowMode):
-    """Stereo-inertial: the state moves by the IMU, images correct it, rest and wheels help."""
+    """Stereo-inertial: the IMU predicts the state; images, rest and wheels correct it."""
 
     inertial = True
     rotation_sigma_rad: float | None = _ROTATION_SIGMA_RAD
@@ -385,14 +385,14 @@ class InertialMode(WindowMode):
         self._zero_velocity = ZeroVelocityDetector(settings.still_window_s, settings.still_flow_px)
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
-        self._seen: Array | None = None  # the last motion that images showed
+        self._seen: Array | None = None  # the last motion by images
         self._lift = LiftCheck(self._rig.base_from_body)
-        self._elsewhere_frames = 0  # in a row, whose descriptor matches contradicted the prediction
+        self._elsewhere_frames = 0  # consecutive frames whose descriptor matches contradicted the prediction
         self._is_pause = False
 
     @classmethod
     def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
-        """The mode with an empty window in the place of another."""
+        """Replace another mode, with an empty window."""
         return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
 
     def predict(self, stamp_ns: int) -> None:
@@ -416,7 +416,7 @@ class InertialMode(WindowMode):
         return self.window.cam_from_earlier(frame_index)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode; a gyro or accelerometer that contradicts the images is given up, a filter that diverged begins again."""
+        """See Mode; abandons a gyro or accelerometer that contradicts the images, restarts a diverged filter."""
         window, monitor = self.window, self._imu.monitor
         if self._is_pause:
             return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
@@ -431,7 +431,7 @@ class InertialMode(WindowMode):
         if matched is not None:
             window.filter.inflate(matched[0], matched[1], window.seconds_since(matched[0]))
         elif window.contradicts_images and seen is not None:
-            window.filter.inflate_velocity(self._off_mps(frame_index - 1, seen))  # it is locked in a wrong speed
+            window.filter.inflate_velocity(self._off_mps(frame_index - 1, seen))  # it is stuck at a wrong speed
         self._update_zero_velocity(tracked)
         rolled = self._imu.samples.wheel_between(0, window.stamp_ns)
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
@@ -450,7 +450,7 @@ class InertialMode(WindowMode):
         return Step(self, used, is_lost=tracked.lost, is_lifted=is_lifted)
 
     def _off_mps(self, frame_index: int, seen: Array) -> float:
-        """The speed by which cam_from_earlier (4, 4), by images since a frame, differs from the state's; 0 for what its covariance admits.
+        """Difference in speed between cam_from_earlier (4, 4), by images since a frame, and the state; 0 within its covariance.
 
         Source: Bar-Shalom et al. 2001, section 5.4 (test of the innovation).
         """
@@ -463,9 +463,9 @@ class InertialMode(WindowMode):
         return off_m / max(duration_s, 1e-3) if off_m > max(_STEP_M, admitted_m) else 0.0
 
     def _without_lookalikes(self, tracked: Tracked) -> Tracked:
-        """What was tracked, without descriptor matches after a gap that lead where the IMU cannot have moved the body.
+        """Return the tracks, without descriptor matches after a gap that imply a motion impossible by the IMU.
 
-        Bays of a rack look alike, and matches may agree on the next one. They are believed once that repeats itself: the IMU is wrong then.
+        Bays of a rack look alike, and matches may agree on the next one. Repeated contradictions are trusted: the IMU is wrong then.
         """
         if not tracked.earlier:
             self._elsewhere_frames = self._elsewhere_frames if tracked.lost else 0
@@ -478,9 +478,9 @@ class InertialMode(WindowMode):
         return replace(tracked, earlier=possible, cam_from_previous=tracked.cam_from_previous if is_possible else None)
 
     def _bridge_gap(self, end_ns: int) -> None:
-        """Without samples: as all points of the last two frames moved, as uncertain as without an IMU.
+        """Move the state over a gap in the samples by the motion of all points of the last two frames, as uncertain as without an IMU.
 
-        Not as the estimates of those frames differ: what an update moved would be taken for a speed, and grow from frame to frame.
+        Not by the difference of their estimates: the shift of an update would count as a speed, and grow from frame to frame.
         """
         window, settings = self.window, self._rig.settings.filter
         held = window.filter.clone_ids[-2:]
@@ -496,7 +496,7 @@ class InertialMode(WindowMode):
         window.rate_body_radps = np.zeros(3)
 
     def _update_zero_velocity(self, tracked: Tracked) -> None:
-        """Zero velocity and turn where for a while neither images nor IMU moved."""
+        """Apply zero velocity and rotation if neither images nor IMU moved for a while."""
         now_ns, samples = self.window.stamp_ns, self._imu.samples.imu
         still = self._zero_velocity.since(now_ns, tracked.ids, tracked.pixels)
         if still is None:
@@ -509,9 +509,9 @@ class InertialMode(WindowMode):
         self.window.filter.correct_by_rest(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
-        """Without the accelerometer from where the last frame was, until gravity is known anew.
+        """Continue from the last frame without the accelerometer, until gravity is known again.
 
-        What was called `odom` goes on, but nothing of before is known as well as it was said to be.
+        The frame `odom` continues, but earlier estimates are less accurate than reported.
         """
         rig, seen = self._rig, tracked.cam_from_previous
         motion = np.eye(4) if seen is None else seen

@@ -24,11 +24,11 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 _IMU_MEMORY_S = 25.0
-_IMU_MEMORY_INERTIAL_S = 4.0  # with a state to go on from, no start is looked for in it
+_IMU_MEMORY_INERTIAL_S = 4.0  # with a state to continue from, no start is searched for in it
 
 
 class Odometry:
-    """Stereo-inertial, or stereo alone where the rig has no IMU. Frames go to the mode that is on, see `modes`."""
+    """Stereo-inertial, or stereo alone if the rig has no IMU. Frames go to the current mode, see `modes`."""
 
     def __init__(
         self,
@@ -51,18 +51,18 @@ class Odometry:
         self._frame_index = 0
 
     def handle_imu(self, samples: ImuSamples) -> None:
-        """Takes samples newer than any before; ignored by a rig without IMU noise figures."""
+        """Add samples newer than any before; ignored by a rig without IMU noise figures."""
         self._samples.add_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """Takes wheel odometry newer than any before, on the IMU's clock; of use once gravity is known."""
+        """Add wheel odometry newer than any before, on the IMU's clock; used once gravity is known."""
         if self._rig.settings.filter.use_wheels:
             self._samples.add_wheel(samples)
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        """The estimate at `frame`, which must be newer than any before.
+        """Return the estimate at `frame`, which must be newer than any before.
 
-        IMU samples up to its stamp should have come.
+        IMU samples up to its stamp should have been added.
         """
         memory_s = _IMU_MEMORY_INERTIAL_S if self._mode.inertial else _IMU_MEMORY_S
         self._samples.absorb(min(frame.stamp_ns, self._mode.stamp_ns or frame.stamp_ns), memory_s)
@@ -76,30 +76,30 @@ class Odometry:
 
     @property
     def refuses_imu(self) -> bool:
-        """True if the images contradicted the IMU's turns, so that it is used no more."""
+        """True if the images contradicted the IMU's rotation, so that it is no longer used."""
         return self._rig.imu is not None and type(self._mode) is VisualMode
 
     @property
     def imu_late_s(self) -> float | None:
-        """By how much the stamps of an IMU that is left out for that are late against the calibration; None else."""
+        """Delay of the IMU's stamps relative to the calibration if the IMU is excluded for it; None otherwise."""
         return self._clock.off_s
 
     @property
     def accelerometer_fault(self) -> str:
-        """Why the accelerometer is not used, by its axes or its unit; empty where it is, or may be."""
+        """Reason why the accelerometer is not used, its axes or unit; empty if it is, or may be."""
         return self._accelerometer.fault
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
-        None where the frame is forgotten; one that was dropped with this very frame is not yet. The covariance (6, 6) is that
-        of a left perturbation in the earlier body's axes, rotation first. Sparse images can revise where earlier frames were:
-        what two estimates differ by is then not the motion between them, this is.
+        None if the frame is forgotten, which a frame dropped just now is not yet. The covariance (6, 6) is that
+        of a left perturbation in the earlier body's axes, rotation first. Sparse images can revise earlier poses:
+        then this is the motion between two frames, not the difference of their estimates.
         """
         return self._mode.motion_since(frame_index)
 
     def will_forget(self, frame_index: int) -> bool:
-        """Whether `motion_since` may not know a frame any more after the next one: the oldest that it knows, and what was dropped."""
+        """True if `motion_since` may not know a frame after the next one: the oldest known one, and dropped ones."""
         return self._mode.will_forget(frame_index)
 
     def _first_mode(self) -> Mode:

@@ -1,4 +1,4 @@
-"""Checks of what the odometry makes: a wrong IMU, a diverged filter, standstill."""
+"""Checks of the odometry: a wrong IMU, a diverged filter, standstill."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,22 +7,22 @@ from fleetmap import core
 from fleetmap.geometry import Array, rotation_angle_rad
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
-_MAX_DISAGREEMENTS = 8  # frames that disagree beyond those that agree, before the IMU is given up
-MAX_OFFSET_SIGMAS = 3.0  # a larger time offset cannot be one
-_DIVERGED_MPS, _MAX_DIVERGED_FRAMES = 5.0, 3  # from the speed that images show, for so many frames in a row
+_MAX_DISAGREEMENTS = 8  # surplus of disagreeing over agreeing frames, at which the IMU is abandoned
+MAX_OFFSET_SIGMAS = 3.0  # a larger time offset is implausible
+_DIVERGED_MPS, _MAX_DIVERGED_FRAMES = 5.0, 3  # from the speed by images, for so many consecutive frames
 
 
 class DivergenceMonitor:
     """Counts disagreements with the images. Motions are cam_from_previous (4, 4), None where unknown."""
 
     def __init__(self, offset_sigma_s: float) -> None:
-        """offset_sigma_s: of the time between the two clocks before anything was seen."""
+        """offset_sigma_s: initial standard deviation of the offset between the two clocks."""
         self._max_offset_s = MAX_OFFSET_SIGMAS * offset_sigma_s
         self._disagreements = 0
         self._diverged_frames = 0
 
     def is_wrong_imu(self, predicted: Array | None, seen: Array | None) -> bool:
-        """Whether images and gyro have disagreed on rotation too often, this frame included.
+        """True if images and gyro have disagreed on rotation too often, this frame included.
 
         Such an IMU belongs to another recording, or its mounting differs from the calibration.
         """
@@ -33,7 +33,7 @@ class DivergenceMonitor:
         return self._disagreements >= _MAX_DISAGREEMENTS
 
     def is_wrong_start(self, offset_s: float, off_mps: float) -> bool:
-        """Whether the filter must be initialized again, this frame included; off_mps: what its speed differs by from that of the images.
+        """True if the filter must be initialized again, this frame included; off_mps: difference between its speed and that of the images.
 
         A static initialization under constant acceleration is tilted by degrees. The filter then estimates an impossible
         time offset, or its speed differs from that of the images frame after frame.
@@ -44,7 +44,7 @@ class DivergenceMonitor:
         return self._diverged_frames >= _MAX_DIVERGED_FRAMES
 
     def begin_again(self) -> None:
-        """Starts the count of diverged frames anew, for a new filter."""
+        """Restart the count of diverged frames, for a new filter."""
         self._diverged_frames = 0
 
 
@@ -52,14 +52,14 @@ _MIN_POINTS = 10
 
 
 class ZeroVelocityDetector:
-    """Compares each image with the one of a window ago."""
+    """Compares each image with the one a window earlier."""
 
     def __init__(self, window_s: float, limit_px: float) -> None:
         self._window_ns, self._limit_px = int(window_s * 1e9), limit_px
         self._images: list[tuple[int, NDArray[np.int64], Array]] = []
 
     def since(self, now_ns: int, ids: NDArray[np.int64], pixels: Array) -> tuple[int, int] | None:
-        """Stamps since when the image has not moved, at least a window ago, and of the previous one; None where it moved.
+        """Start of the standstill of the image, at least a window ago, and stamp of the previous image; None if it moved.
 
         ids (N,), pixels (N, 3) of the points seen at now_ns, later than any before.
         """
@@ -74,12 +74,12 @@ class ZeroVelocityDetector:
 def is_image_still(
     old_ids: NDArray[np.int64], old_pixels: Array, ids: NDArray[np.int64], pixels: Array, limit_px: float
 ) -> bool:
-    """Whether most of at least ten points seen in both images, pixels (N, 3), have stayed within the limit; ids ascend."""
+    """True if most of at least ten points seen in both images, pixels (N, 3), have stayed within the limit; ids ascend."""
     ways_px = core.common_ways_px(old_ids, old_pixels, ids, pixels)
     return len(ways_px) >= _MIN_POINTS and middle(ways_px) < limit_px
 
 
 def middle(values: Array) -> float:
-    """The median of some values, at a tenth of numpy's cost for so few."""
+    """Median of a few values, in a tenth of numpy's time."""
     ordered = np.sort(values)
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])

@@ -1,4 +1,4 @@
-"""IMU and wheel samples that came and may still be needed."""
+"""Buffer of IMU and wheel samples that may still be needed."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,13 @@ from fleetmap.inertial import preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, ImuSamples, Stamps, WheelSample
 
-IMU_GAP_NS = 35_000_000  # a longer time without samples is bridged as without an IMU; one of 30 Hz has none
+IMU_GAP_NS = 35_000_000  # a longer gap is bridged as without an IMU; an IMU of 30 Hz has no such gaps
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
 _FOR_EVER_NS = 1 << 62
 
 
 def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
-    """True if no motion is carried from one moment to another, both on the IMU's clock: samples that are all there carry it longer."""
+    """True if no motion is propagated between two moments, both on the IMU's clock; complete samples allow a longer time."""
     is_missing = core.longest_gap_ns(imu_stamps_ns, start_ns, end_ns) > IMU_GAP_NS
     return end_ns - start_ns > (PAUSE_NS if is_missing else INTEGRATED_NS)
 
@@ -30,17 +30,17 @@ class SensorBuffer:
         self._wheel: list[WheelSample] = []
 
     def add_imu(self, samples: ImuSamples) -> None:
-        """Takes samples newer than any before; `imu` shows them after `absorb`."""
+        """Add samples newer than any before; `imu` has them after `absorb`."""
         self._pending.append(samples)
 
     def add_wheel(self, samples: Sequence[WheelSample]) -> None:
-        """Takes samples newer than any before."""
+        """Add samples newer than any before."""
         self._wheel.extend(samples)
 
     def absorb(self, needed_from_ns: int, memory_s: float) -> None:
-        """Appends what came; drops IMU samples older than memory_s before needed_from_ns once they are many, and wheel samples as old.
+        """Append new samples; drop IMU samples older than memory_s before needed_from_ns once they are many, and wheel samples as old.
 
-        Without an IMU wheels serve no start: all go that serve no frame from needed_from_ns on.
+        Without an IMU wheels serve no start: all samples that serve no frame from needed_from_ns on are dropped.
         """
         if self._pending:
             parts = [self.imu, *self._pending]
@@ -58,22 +58,22 @@ class SensorBuffer:
             self._wheel = [s for s in self._wheel if s.stamp_ns >= serves_ns]
 
     def rotation_between(self, start_ns: int, end_ns: int, noise: ImuNoise) -> Array | None:
-        """earlier_from_later (3, 3) of the body by the gyro, its bias included; None where samples are missing."""
+        """earlier_from_later (3, 3) of the body by the gyro, its bias included; None if samples are missing."""
         if core.longest_gap_ns(self.imu.stamps_ns, start_ns, end_ns) > IMU_GAP_NS:
             return None
         return preintegrate(self.imu, start_ns, end_ns, np.zeros(3), np.zeros(3), noise).delta_rotation
 
     @property
     def on_wheels(self) -> bool:
-        """Whether wheel odometry came lately: the robot stands on a floor."""
+        """True if recent wheel odometry exists: the robot stands on a floor."""
         return bool(self._wheel)
 
     def wheel_between(self, start_ns: int, end_ns: int) -> list[WheelSample]:
-        """The wheel samples from start_ns until end_ns that are still there; none is taken."""
+        """Kept wheel samples from start_ns until end_ns; they stay in the buffer."""
         return [sample for sample in self._wheel if start_ns <= sample.stamp_ns <= end_ns]
 
     def take_wheel(self, stamp_ns: int) -> tuple[WheelSample, Array] | None:
-        """The wheel sample nearest to a moment with the mean gyro (3,) around it; None where none is near.
+        """Take the wheel sample nearest to a moment with the mean gyro (3,) around it; None if none is near.
 
         Samples up to that moment are dropped.
         """

@@ -11,7 +11,7 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 
 _WIDTH = 4.0  # of the robust weight (Geman-McClure), in sigmas
-_CONFIDENCE = 0.999  # that no camera has more votes than the one that was found
+_CONFIDENCE = 0.999  # confidence that the camera found has the most votes
 GATE_SQUARED = 11.345  # 0.99 of chi-square with 3 degrees of freedom: u, v, disparity
 ITERATIONS = 10, 5  # on all, and on the inliers
 REFINEMENT = _WIDTH, GATE_SQUARED, ITERATIONS
@@ -19,7 +19,7 @@ REFINEMENT = _WIDTH, GATE_SQUARED, ITERATIONS
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """N points_source (N, 3) and the pixels (N, 3) u_left v u_right (NaN none) where a camera sees them.
+    """N points_source (N, 3) and the pixels (N, 3) u_left v u_right (NaN none) of their observations.
 
     sigmas_px (N, 2) of u and v, of the disparity.
     """
@@ -33,7 +33,7 @@ class Correspondences:
         return len(self.points_source)
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
-        """Some of them."""
+        """Select a subset."""
         return Correspondences(self.camera, self.points_source[rows], self.pixels[rows], self.sigmas_px[rows])
 
 
@@ -52,16 +52,16 @@ class PnpResult:
 
     @cached_property
     def cov_rot_trans(self) -> Array:
-        """(6, 6) of the perturbation; not every caller needs it."""
+        """(6, 6) covariance of the perturbation, computed on demand."""
         return np.asarray(np.linalg.inv(self.information + 1e-9 * np.eye(6)))
 
 
 def refine_pnp(
     matches: Correspondences, cam_from_source: Array, prior_information: Array | None = None
 ) -> PnpResult | None:
-    """Robust least squares from a start; None where the points do not determine the camera.
+    """Robust least squares from an initial pose; None if the points do not determine the camera.
 
-    prior_information (6, 6) holds the start, rotation first, camera axes.
+    prior_information (6, 6) ties the result to the initial pose, rotation first, camera axes.
     """
     if len(matches) == 0:
         return None
@@ -72,7 +72,7 @@ def refine_pnp(
 def ransac_pnp(
     matches: Correspondences, *, threshold_px: float, min_inliers: int, seed: int, iterations: int = 800
 ) -> PnpResult | None:
-    """As `refine_pnp` without a start: three-point RANSAC first, of so many iterations at most.
+    """As `refine_pnp` without an initial pose: three-point RANSAC first, with at most the given iterations.
 
     None below min_inliers. Sources are named in the core.
     """
@@ -90,7 +90,7 @@ def pnp_with_rotation(
     min_inliers: int,
     rotation_sigma_rad: float,
 ) -> PnpResult | None:
-    """As `ransac_pnp` where the rotation is nearly known (from the IMU).
+    """As `ransac_pnp` with a nearly known rotation (from the IMU).
 
     One correspondence proposes the translation. Needs depth in both views. Finds the pose among far more wrong matches
     than three points can; none below min_inliers.

@@ -39,7 +39,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class RecordingFormat:
-    """Functions that recognise and open one format; `layout` describes it in words."""
+    """Functions that recognise and open one format; `layout` describes it as text."""
 
     layout: str
     recognises: Callable[[Path], bool]
@@ -61,7 +61,7 @@ RECORDING_FORMATS = {
     "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
     "video": RecordingFormat("an .mp4 video of one camera", video.recognises, video.open_video),
 }
-# Of what cannot be read: the command that makes it readable
+# For unreadable files: the command that makes them readable
 _ADVICE = {
     (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "`tar xf {path}` unpacks it",
     (".7z", ".rar"): "`7z x {path}` unpacks it",
@@ -75,13 +75,13 @@ FILE_SUFFIXES = (".mcap", ".db3", ".bag", *video.SUFFIXES)  # of recordings that
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:
-    """The recording at `path`, its format recognised from the files that are there.
+    """Open the recording at `path`; its format is recognised from its files.
 
     >>> with open_recording("survey.mcap") as recording:
     ...     print(recording.sensor_set, len(recording), recording.read_frame(0).left.shape)
 
-    RecordingError for what does not exist, is of no known format or contradicts itself; CalibrationError for a missing
-    or impossible calibration.
+    RecordingError for a missing or inconsistent recording or an unknown format; CalibrationError for a missing
+    or invalid calibration.
     """
     path, options = Path(path), options or OpenOptions()
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Calibration from files: EuRoC `sensor.yaml` and Kalibr camchain, and the one form in which the project writes it.
+"""Calibration files: EuRoC `sensor.yaml` and Kalibr camchain, and the format that the project writes.
 
 The form of `--calibration FILE` is Kalibr's camchain (cam0, cam1 with camera_model, intrinsics, distortion_model,
 distortion_coeffs, resolution, T_cam_imu or T_cn_cnm1, timeshift_cam_imu), with these keys beside the cameras:
@@ -10,9 +10,9 @@ distortion_coeffs, resolution, T_cam_imu or T_cn_cnm1, timeshift_cam_imu), with 
       accelerometer_random_walk: 3.0e-3    m/s^3/sqrt(Hz)
     base_from_body: [[...], [...], [...], [...]]   4x4 rows, where the IMU sits on the robot
 
-and `has_imu: false` for a rig whose cameras alone are described, and inside a camera `body_from_cam` (4x4 rows), which
-goes before T_cam_imu: it is what this project writes, because a matrix that is inverted twice is not the same to the
-last bit.
+and `has_imu: false` for a rig described by its cameras alone, and inside a camera `body_from_cam` (4x4 rows), which
+takes precedence over T_cam_imu: this project writes it, because inverting a matrix twice changes the
+last bits.
 """
 
 import io
@@ -44,7 +44,7 @@ _NOISE_KEYS = {
     "accel_walk_mps3_rthz": "accelerometer_random_walk",
 }
 _MOUNTINGS = ("body_from_cam", "T_cam_imu", "T_imu_cam")
-# What Kalibr and OpenVINS say of an IMU besides its noise, and the value that changes nothing
+# IMU parameters of Kalibr and OpenVINS besides noise, and their neutral values
 _IMU_INTRINSICS: dict[str, Any] = {
     "T_i_b": np.eye(4),
     "Tw": np.eye(3),
@@ -59,11 +59,11 @@ Values = Mapping[str, Any]
 
 
 class _RepeatedKeyError(ValueError):
-    """Its text is the key."""
+    """A repeated key, which is the message."""
 
 
 class _Loader(_SAFE_LOADER):  # type: ignore[misc]
-    """Refuses a key that a mapping has twice; YAML's own loader takes the last."""
+    """Refuses repeated keys in a mapping; YAML's own loader takes the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
@@ -75,17 +75,17 @@ class _Loader(_SAFE_LOADER):  # type: ignore[misc]
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFile:
-    """The calibration in a file, and the topics that Kalibr noted (`rostopic`) as cam0, cam1, imu0."""
+    """Calibration in a file, and the topics (`rostopic`) noted by Kalibr as cam0, cam1, imu0."""
 
     calibration: RigCalibration
     topics: Mapping[str, str]
 
 
 def load_calibration(path: Path) -> CalibrationFile:
-    """The calibration of a Kalibr camchain with this module's extra keys.
+    """Load a Kalibr camchain with this module's extra keys.
 
     Kalibr's `imu*.yaml` or OpenVINS' `kalibr_imu_chain.yaml` beside a camchain that has no noise values is read too.
-    CalibrationError for missing files, nonsense and impossible values.
+    CalibrationError for missing files and invalid values.
     """
     found = parse_calibration(_read(path), str(path))
     if found.calibration.imu is not None and not found.topics.get("noise"):
@@ -98,12 +98,12 @@ def load_calibration(path: Path) -> CalibrationFile:
 
 
 def read_calibration(path: Path) -> RigCalibration:
-    """The calibration alone, as `load_calibration`."""
+    """Load only the calibration, as `load_calibration`."""
     return load_calibration(path).calibration
 
 
 def parse_calibration(text: str, where: str) -> CalibrationFile:
-    """The calibration in the text of a camchain; `where` names it in error messages."""
+    """Parse the text of a camchain; `where` names it in error messages."""
     values = _parse_yaml(text, where)
     if "camera_matrix" in values:
         return CalibrationFile(RigCalibration((_ros_camera(values, where),), assumed=("base_from_body",)), {})
@@ -150,7 +150,7 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
 
 
 def format_calibration(calibration: RigCalibration) -> str:
-    """The YAML text from which `parse_calibration` makes the same calibration, bit for bit."""
+    """Format a calibration as YAML text, from which `parse_calibration` restores it bit for bit."""
     out = io.StringIO()
     for number, camera in enumerate(calibration.cameras):
         model = "radtan" if camera.model == "radial-tangential" else camera.model
@@ -175,7 +175,7 @@ def format_calibration(calibration: RigCalibration) -> str:
 
 
 def read_euroc_camera(path: Path) -> CameraCalibration:
-    """The camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
+    """Read the camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
     where, values = str(path), read_yaml(path)
     camera = _camera(values, "distortion_coefficients", where)
     return check_camera(
@@ -186,7 +186,7 @@ def read_euroc_camera(path: Path) -> CameraCalibration:
 def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
     """(4, 4) `T_BS` of a EuRoC IMU `sensor.yaml` (EuRoC's body from the IMU) and its noise.
 
-    Defaults where it says nothing.
+    Defaults for missing values.
     """
     where, values = str(path), read_yaml(path)
     body_from_imu = matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")
@@ -194,7 +194,7 @@ def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
 
 
 def read_yaml(path: Path) -> Values:
-    """The mapping in a YAML file, with or without OpenCV's `%YAML:1.0` first line.
+    """Read the mapping in a YAML file, with or without OpenCV's `%YAML:1.0` first line.
 
     CalibrationError for anything else.
     """
@@ -223,7 +223,7 @@ def matrix_4x4(value: object, where: str) -> Array:
 
 
 def _fault_of(matrix: Array) -> str:
-    """Why (4, 4) is no rigid transform; empty if it is one."""
+    """Reason why (4, 4) is not a rigid transform; empty if it is one."""
     if not np.isfinite(matrix).all():
         return "not all of it is finite"
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
@@ -248,7 +248,7 @@ def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: st
 
 
 def _ros_camera(values: Values, where: str) -> CameraCalibration:
-    """The camera of a file that ROS's camera_calibration wrote: its raw images, not the rectified ones."""
+    """The camera in a file of ROS's camera_calibration: for its raw images, not the rectified ones."""
     fx, _, cx, _, fy, cy, *_ = _numbers(_need(values, "camera_matrix", where), 9, f"{where}: camera_matrix")
     translated = {
         "camera_model": "pinhole",
@@ -376,7 +376,7 @@ def _section(values: Values, name: str, where: str) -> Values:
 
 
 def _brief(value: object) -> str:
-    """What a file said, in at most 80 signs."""
+    """A value of a file, in at most 80 characters."""
     return _WORDS.repr(value)[:80]
 
 
@@ -410,7 +410,7 @@ def _parse_yaml(text: str, where: str) -> Values:
 
 
 def _check_events(text: str, where: str) -> None:
-    """CalibrationError for what no calibration has and what is dear to load: aliases, tags, deep nesting, long words."""
+    """CalibrationError for YAML that no calibration contains and that is expensive to load: aliases, tags, deep nesting, long scalars."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=_SAFE_LOADER)):
         if count > _MAX_EVENTS:

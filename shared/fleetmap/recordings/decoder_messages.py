@@ -1,4 +1,4 @@
-"""What C libraries behind OpenCV print about an image while they decode it: libpng and libjpeg return no errors, they write to stderr."""
+"""Capture of decoder messages of the C libraries behind OpenCV: libpng and libjpeg report errors only on stderr."""
 
 import ctypes
 import os
@@ -22,14 +22,14 @@ except (
     ValueError,
     AttributeError,
     TypeError,
-):  # a system whose C library names it otherwise: nothing is caught
+):  # a C library with another symbol name: nothing is captured
     _CAUGHT = None
 
 
 def with_messages(decode: Callable[[], T]) -> tuple[T, str]:
-    """The result of `decode`, and what C libraries printed meanwhile. Python's own stderr and child processes are left as they are.
+    """Return the result of `decode` and the output of C libraries during it. Python's own stderr and child processes are not affected.
 
-    Several threads may decode at once. When one of them has printed nobody knows which: all of them then decode again, one by one.
+    Several threads may decode at once. If one of them has printed, it is unknown which: all of them then decode again, one by one.
     """
     if not _CAUGHT:
         return decode(), ""
@@ -50,18 +50,18 @@ def _written() -> int:
 
 
 class _Stream:
-    """The stderr of C libraries, which the whole process has in common."""
+    """The stderr of C libraries, shared by the whole process."""
 
     def __init__(self) -> None:
         self._turn = threading.Condition()
-        self._inside = self._waiting = 0  # who catches it, and who waits to do so alone
+        self._inside = self._waiting = 0  # threads that capture it, and threads that wait for exclusive use
         self._is_alone = False
         if _CAUGHT:
             _STDERR.value = _USUAL
 
     @contextmanager
     def caught(self, *, alone: bool) -> Iterator[None]:
-        """It goes to memory; alone: for nobody else meanwhile."""
+        """Redirect it to memory; alone: exclusively for this thread."""
         with self._turn:
             self._waiting += alone
             self._turn.wait_for(lambda: not (self._is_alone or (self._inside if alone else self._waiting)))
@@ -80,4 +80,4 @@ class _Stream:
 
 
 _stream = _Stream()
-os.register_at_fork(after_in_child=_stream.__init__)  # type: ignore[misc]  # threads that were inside are not in the child
+os.register_at_fork(after_in_child=_stream.__init__)  # type: ignore[misc]  # threads inside the block do not exist in the child

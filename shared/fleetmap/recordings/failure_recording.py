@@ -1,7 +1,7 @@
-"""A failure's recording: an MCAP file of the seconds around a failure, as robots keep them and servers take them.
+"""A failure's recording: an MCAP file of the seconds around a failure, kept by robots and sent to servers.
 
-It is a recording like any other, with reduced images, and has two attachments more: a summary, which everybody reads, and the localizer's
-pose at the beginning with what it perceived since, which only a client of the robot reads (locclient.delivery.failure_file).
+It is an ordinary recording with reduced images and two additional attachments: a summary, which every program reads, and the localizer's
+initial pose with its perceptions since, which only a robot's client reads (locclient.delivery.failure_file).
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ SUMMARY, LOCALIZER = "failure.msgpack", "localizer.msgpack.zst"
 
 
 def is_failure_recording(path: Path) -> bool:
-    """True for a file with the attachments of a failure's recording, or with one of them."""
+    """True for a file with one or both attachments of a failure's recording."""
     if path.suffix.lower() != ".mcap" or not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
         return False
     try:
@@ -24,7 +24,7 @@ def is_failure_recording(path: Path) -> bool:
 
 
 def attachments_of(path: Path) -> dict[str, bytes]:
-    """Both attachments of a failure's recording; RecordingError for a file without one of them, or that is damaged."""
+    """Both attachments of a failure's recording; RecordingError if one is missing or the file is damaged."""
     size = path.stat().st_size
     if size > MAX_FILE_BYTES:
         raise RecordingError(f"{path} has {size} bytes; a failure's recording has at most {MAX_FILE_BYTES}")

@@ -1,4 +1,4 @@
-"""Reading files that may be missing, too large or something else: pointers of Git LFS, pages of a web server, zip files."""
+"""Reading of files that may be missing, too large or of another kind: Git LFS pointers, HTML pages, zip files."""
 
 import hashlib
 import re
@@ -12,7 +12,7 @@ _BLOCK_BYTES = 1 << 20
 
 
 def what_instead(head: bytes) -> str:
-    """What the first bytes of a file are in place of its content, with what to do; empty where they may be the content."""
+    """Name the unexpected kind of a file by its first bytes, with advice; empty if they may be the expected content."""
     if head.startswith(b"version https://git-lfs.github.com/spec/"):
         return "a Git LFS pointer in place of the file; `git lfs pull` fetches it"
     if head.startswith(b"PK\x03\x04"):
@@ -24,7 +24,7 @@ def what_instead(head: bytes) -> str:
 
 
 def file_head(path: Path, size: int) -> bytes:
-    """The first bytes of a file; none of what is no regular file or cannot be read."""
+    """The first bytes of a file; empty unless it is a readable regular file."""
     try:
         if not path.is_file():
             return b""
@@ -35,7 +35,7 @@ def file_head(path: Path, size: int) -> bytes:
 
 
 def what_file_instead(path: Path) -> str:
-    """As `what_instead`, of the file at `path`."""
+    """As `what_instead`, for the file at `path`."""
     return what_instead(file_head(path, 512))
 
 
@@ -47,9 +47,9 @@ def read_text(
     errors: str = "strict",
     error_type: type[FleetmapError] = RecordingError,
 ) -> str:
-    """The text of a file without a byte order mark; an `error_type` for what cannot be read, is no text, too large or something else.
+    """Read a text file without its byte order mark; raises `error_type` if it is unreadable, not text, too large or of another kind.
 
-    expected: words on what the file should hold. errors: `replace` for tables, where damage costs lines and not the file.
+    expected: description of the expected content. errors: `replace` for tables, so that damage costs lines and not the file.
     """
     if fault := what_file_instead(path):
         raise error_type(f"{path} is {fault}")
@@ -67,7 +67,7 @@ def read_text(
 
 
 def hash_file(path: Path, digest: "hashlib._Hash") -> None:
-    """Feeds the bytes of a file to `digest`, a block at a time."""
+    """Feed the bytes of a file to `digest`, a block at a time."""
     try:
         with path.open("rb") as file:
             while block := file.read(_BLOCK_BYTES):
@@ -77,5 +77,5 @@ def hash_file(path: Path, digest: "hashlib._Hash") -> None:
 
 
 def natural_key(name: str) -> tuple[object, ...]:
-    """Sorts file names by the numbers in them."""
+    """Sort key of file names by the numbers in them."""
     return tuple(int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name))

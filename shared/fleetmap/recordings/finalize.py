@@ -1,4 +1,4 @@
-"""The last steps that all formats share: which sensors take part, and the checks before a recording is handed out."""
+"""Final steps of all formats: selection of sensors, and checks of the recording."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ _WINDOW_S, _SMOOTH_S = 0.5, 0.1
 
 @dataclass(frozen=True)
 class RecordingParts:
-    """The parts that a format has read; `finalize` makes a Recording of them. The name is the path's unless given."""
+    """Parts read by a format, input of `finalize`. The name is the path's unless given."""
 
     path: Path
     format: str
@@ -41,7 +41,7 @@ class RecordingParts:
 
 
 def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
-    """The calibration that the caller asked for, None where the recording's own shall be used."""
+    """The calibration chosen by the caller, None to use the recording's own."""
     if options.calibration_file is None:
         return None
     log.files.append(options.calibration_file)
@@ -49,9 +49,9 @@ def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFil
 
 
 def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
-    """The Recording of `parts`, with the issues of `log`.
+    """Build the Recording of `parts`, with the issues of `log`.
 
-    RecordingError for no frame, for units that cannot be right and for a first image that contradicts the calibration;
+    RecordingError for no frame, for wrong units and for a first image that contradicts the calibration;
     CalibrationError for too few cameras in the calibration.
     """
     if len(parts.frame_stamps_ns) == 0:
@@ -115,7 +115,7 @@ def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:
 
 
 def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
-    """(D,) one stamp for each moment of which an image is damaged and that is no frame: of a pair both may be."""
+    """(D,) stamps of moments without a frame because of a damaged image, each once even if both images of a pair are damaged."""
     moments: list[int] = []
     for stamp_ns in np.setdiff1d(np.array(damaged_ns, np.int64), frame_stamps_ns).tolist():
         if not moments or stamp_ns - moments[-1] > PAIR_TOLERANCE_NS:
@@ -124,7 +124,7 @@ def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
 
 
 def _first_frame(recording: Recording) -> CameraFrame:
-    """The first frame that can be decoded, of a few; RecordingError of the first where none can."""
+    """The first of a few frames that can be decoded; RecordingError of the first one if none can."""
     fault: RecordingError | None = None
     for index in range(min(_TRIED_FRAMES, len(recording))):
         try:
@@ -136,13 +136,13 @@ def _first_frame(recording: Recording) -> CameraFrame:
 
 
 def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]
-    """How many bits of left images of 16 the sensor uses, by a few of them: drivers put 10 and 12 bits into the lower ones."""
+    """Number of bits used in 16-bit left images, from a few of them: drivers store 10 and 12 bits in the lower ones."""
     peak = 0
     for index in sorted({round(share * (len(frames.left) - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
         try:
             image = frames.reader.read(frames.left.sources[index], int(frames.left.stamps_ns[index]))
             if index == 0 and not is_wide(image):
-                return 16  # as nearly all are: nothing more is read
+                return 16  # the usual case: nothing more is read
             peak = max(peak, grey_peak(image))
         except RecordingError:
             continue
@@ -153,11 +153,11 @@ def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]
 
 
 def check_imu_units(imu: ImuSamples, where: str) -> None:
-    """Raises RecordingError for an accelerometer in g and for a gyro in degrees per second.
+    """Raise RecordingError for an accelerometer in g and for a gyro in degrees per second.
 
-    The accelerometer at rest or in any gentle motion measures about 9.81. The gyro is judged by what the accelerometer
-    sees of its rotation: over half a second the direction of the specific force, turned by the integrated rate, must
-    come out where it is found (in slow motion to a few degrees). It is in degrees where that fails badly and a rate 57
+    The accelerometer at rest or in any gentle motion measures about 9.81. The gyro is compared with the rotation of gravity in the
+    accelerometer: over half a second the direction of the specific force, rotated by the integrated rate, must
+    match the measured one (in slow motion to a few degrees). It is in degrees if that fails clearly and a rate 57
     times smaller explains it.
     """
     if len(imu) < _MIN_SAMPLES:
@@ -185,10 +185,10 @@ def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
 
 
 def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
-    """(K,) angle between the specific force that the gyro times `gyro_scale` predicts and the measured one.
+    """(K,) angle between the measured specific force and the one predicted by the gyro times `gyro_scale`.
 
-    Over windows of half a second, and only where both ends measure within 1 m/s^2 of gravity: elsewhere the direction
-    is that of an acceleration.
+    Over windows of half a second, and only if both ends measure within 1 m/s^2 of gravity: otherwise the direction
+    is affected by acceleration.
     """
     period_s = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     smooth = max(1, round(_SMOOTH_S / period_s))
@@ -210,7 +210,7 @@ def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
 
 
 def _turned(vectors: Array, rotvecs_rad: Array) -> Array:
-    """Vectors (K, 3), each turned by its rotation vector (K, 3). Source: Rodrigues' formula."""
+    """Vectors (K, 3), each rotated by its rotation vector (K, 3). Source: Rodrigues' formula."""
     angles = np.linalg.norm(rotvecs_rad, axis=1, keepdims=True)
     axes = rotvecs_rad / np.maximum(angles, 1e-300)
     along = axes * (axes * vectors).sum(axis=1, keepdims=True)

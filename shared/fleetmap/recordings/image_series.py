@@ -1,4 +1,4 @@
-"""Images of each camera by their stamps, paired to frames and read one frame at a time."""
+"""Images of each camera by stamp, paired to frames and read one frame at a time."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ _DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class ImageSeries(Generic[T]):
-    """One camera's images: stamps (N,), and where each one is stored."""
+    """One camera's images: stamps (N,), and the storage location of each."""
 
     stamps_ns: Stamps
     sources: tuple[T, ...]
@@ -27,11 +27,11 @@ class ImageSeries(Generic[T]):
         return len(self.sources)
 
     def take(self, indices: NDArray[np.int64]) -> "ImageSeries[T]":
-        """Those at `indices` (K,)."""
+        """Images at `indices` (K,)."""
         return ImageSeries(self.stamps_ns[indices], tuple(self.sources[int(i)] for i in indices))
 
     def forward(self, what: str, log: ReadLog) -> "ImageSeries[T]":
-        """Those whose stamps increase, as `forward_only`; where days lie between them, those of the largest part."""
+        """Images with increasing stamps, as `forward_only`; if days lie between them, those of the largest part."""
         kept = np.flatnonzero(forward_only(self.stamps_ns, what, log))
         parts = np.split(kept, np.flatnonzero(np.diff(self.stamps_ns[kept]) > _DAY_NS) + 1)
         largest = max(parts, key=len)
@@ -44,7 +44,7 @@ class ImageSeries(Generic[T]):
 def pair_images(
     first: ImageSeries[T], second: ImageSeries[T], log: ReadLog, tolerance_ns: int = PAIR_TOLERANCE_NS
 ) -> tuple[ImageSeries[T], ImageSeries[T]]:
-    """Images of two cameras taken at the same moments; those without a partner are noted in `log`."""
+    """Pair the images of two cameras by time; those without a partner are noted in `log`."""
     firsts, seconds = pair_stamps(first.stamps_ns, second.stamps_ns, tolerance_ns)
     alone = len(first) + len(second) - 2 * len(firsts)
     if alone:
@@ -62,23 +62,23 @@ def pair_images(
 
 
 class ImageReader(Protocol[T]):
-    """Reads the images of a recording where they are stored."""
+    """Reads the images of a recording from their storage."""
 
     def read(self, source: T, stamp_ns: int) -> StoredImage:
-        """One image, still encoded; RecordingError where its bytes are gone."""
+        """Read one image, still encoded; RecordingError if its bytes are gone."""
 
     def apart(self) -> "ImageReader[T]":
-        """Another reader of the same images, to be used and closed apart from this one, in other threads and processes too."""
+        """Create another reader of the same images, used and closed independently, also in other threads and processes."""
 
     def hash_into(self, digest: "hashlib._Hash", images: list[T]) -> None:
-        """Feeds all that was read of the recording, the images included, to `digest`."""
+        """Feed the recording's content, including images, to `digest`."""
 
     def close(self) -> None:
-        """Closes open files."""
+        """Close open files."""
 
 
 class DepthRegistration(Protocol):
-    """Brings depth images into the pixels of the left image."""
+    """Reprojects depth images into the pixels of the left image."""
 
     def registered(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
         """(H, W) metres, 0 where unknown."""
@@ -88,7 +88,7 @@ class DepthRegistration(Protocol):
 class SeriesFrames(Generic[T]):
     """A FrameSource over paired series of equal length.
 
-    grey_bits: of left and right images of 16 bits, how many are used. registration: for depth that is not registered as it is stored.
+    grey_bits: used bits of left and right 16-bit images. registration: for depth that is stored unregistered.
     """
 
     reader: ImageReader[T]
@@ -99,7 +99,7 @@ class SeriesFrames(Generic[T]):
     grey_bits: int = 16
 
     def stored(self, index: int) -> StoredFrame:
-        """Frame `index` with its images as they are stored; registered depth as PNG in whole mm."""
+        """Frame `index` with its images as stored; registered depth as PNG in whole mm."""
         stored = self._stored(index)
         if stored.depth is None or self.registration is None:
             return stored
@@ -108,7 +108,7 @@ class SeriesFrames(Generic[T]):
         return replace(stored, depth=StoredImage("file", png.tobytes(), stored.depth.where))
 
     def frame(self, index: int) -> CameraFrame:
-        """Frame `index`, decoded; registered depth to one mm, as it is stored."""
+        """Frame `index`, decoded; registered depth to one mm, as stored."""
         stored = self._stored(index)
         frame = decode_frame(stored)
         if stored.depth is None or frame.depth_m is None or self.registration is None:

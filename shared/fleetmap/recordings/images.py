@@ -1,4 +1,4 @@
-"""Images as recordings store them, and their decoding to grey or metres."""
+"""Stored images of recordings, and their decoding to grey or metres."""
 
 import os
 import re
@@ -25,13 +25,13 @@ _JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
-_THREADS = max(os.cpu_count() or 1, 2)  # a survey reads its parts at once
+_THREADS = max(os.cpu_count() or 1, 2)  # a survey reads its parts in parallel
 _BESIDE = ThreadPoolExecutor(_THREADS, "decoder")  # decodes left images while their partners are decoded
 os.register_at_fork(after_in_child=partial(_BESIDE.__init__, _THREADS, "decoder"))  # type: ignore[misc]  # a child has no thread of its parent's
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels that the file's header states; None for other formats and for headers that are not whole."""
+    """Width and height in pixels from the file's header; None for other formats and for incomplete headers."""
     try:
         if data.startswith(b"\xff\xd8"):
             return _jpeg_size(data)
@@ -68,7 +68,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Of the first picture; OpenCV reads no other."""
+    """Size of the first image; OpenCV reads only that."""
     order = "<" if data[0] == ord("I") else ">"
     (at,) = struct.unpack_from(order + "I", data, 4)
     (count,) = struct.unpack_from(order + "H", data, at)
@@ -91,7 +91,7 @@ def _bmp_size(data: bytes) -> tuple[int, int]:
 
 
 _BAYER_ORDERS = ("rggb", "bggr", "gbrg", "grbg")
-# Type and channels of the pixels of images in rows, by ROS's names
+# Pixel type and channels of raw images, by ROS's names
 RAW_ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     **dict.fromkeys(("mono8", "8UC1", *(f"bayer_{order}8" for order in _BAYER_ORDERS)), (np.uint8, 1)),
     **dict.fromkeys(("mono16", "16UC1", *(f"bayer_{order}16" for order in _BAYER_ORDERS)), (np.uint16, 1)),
@@ -100,12 +100,12 @@ RAW_ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     **dict.fromkeys(("rgba8", "bgra8", "8UC4"), (np.uint8, 4)),
     **dict.fromkeys(("rgb16", "bgr16"), (np.uint16, 3)),
     **dict.fromkeys(("rgba16", "bgra16"), (np.uint16, 4)),
-    # Two bytes a pixel, of which one is luma; ROS's older names and newer ones
+    # Two bytes a pixel, one of them luma; ROS's older and newer names
     **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), (np.uint8, 2)),
-    # A plane of luma, and colour behind it
+    # A plane of luma, followed by colour
     **dict.fromkeys(("nv12", "nv21", "nv24"), (np.uint8, 1)),
 }
-_COLOUR_ROWS = {"nv12": (1, 2), "nv21": (1, 2), "nv24": (2, 1)}  # of colour for each row of luma
+_COLOUR_ROWS = {"nv12": (1, 2), "nv21": (1, 2), "nv24": (2, 1)}  # rows of colour per row of luma
 _LUMA_AT = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 # OpenCV names a mosaic by the second row, its newer names by the first as ROS does
 _GREY_FROM_MOSAIC = {order: getattr(cv2, f"COLOR_Bayer{order.upper()}2GRAY") for order in _BAYER_ORDERS}
@@ -113,9 +113,9 @@ _GREY_FROM = {  # others are BGR
     **dict.fromkeys(("rgb8", "rgb16"), cv2.COLOR_RGB2GRAY),
     **dict.fromkeys(("rgba8", "rgba16"), cv2.COLOR_RGBA2GRAY),
 }
-INVERSE_DEPTH = "32FC1; compressedDepth"  # what ROS calls its quantized inverse depths
+INVERSE_DEPTH = "32FC1; compressedDepth"  # ROS's name for its quantized inverse depths
 _DEPTH_HEAD = struct.Struct("<iff")
-# Words in the `format` of a message, and the first bytes, of what holds images and is not read
+# Words in the `format` of a message, and the first bytes, of unsupported image formats
 _VIDEO = "; one picture of a video cannot be read alone: record JPEG (`ros2 run image_transport republish ffmpeg compressed`) or raw images"
 _OTHER_IMAGE = "; record JPEG, PNG or raw images"
 _UNREAD_FORMS = {
@@ -133,22 +133,22 @@ _UNREAD_STARTS = (
     (re.compile(rb"GIF8"), "a GIF image" + _OTHER_IMAGE),
 )
 _MOSAIC_SHARE, _LEAST_MOSAIC_PX, _LEAST_MOSAIC_GREY = 0.04, 100, 20.0
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what it says of an image is an error of ours
-# What libjpeg and libpng say of pixels that are lost; colour profiles and comments may be damaged
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # its exceptions for an image become our errors
+# Messages of libjpeg and libpng about lost pixels; damage to colour profiles and comments is accepted
 _DAMAGED = re.compile("Corrupt JPEG data|Premature end|libpng error|IDAT")
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-# Images with sensor noise have no repetitions worth a search: run-length coding is faster and, measured, smaller.
+# Images with sensor noise have hardly any repetitions: run-length coding is faster and, by measurement, smaller.
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
 @dataclass(frozen=True, slots=True)
 class StoredImage:
-    """An image as it lies in the recording; `where` names it in error messages.
+    """An image as stored in the recording; `where` names it in error messages.
 
     encoding: "file" for the bytes of an image file (JPEG, PNG, ...), INVERSE_DEPTH for those of a PNG behind the head of
     compressed_depth_image_transport, else a key of RAW_ENCODINGS with rows of step_bytes. form: the `format` of a CompressedImage.
-    bits: of grey images of 16, how many are used, the lower ones.
+    bits: used lower bits of 16-bit grey images.
     """
 
     encoding: str
@@ -164,7 +164,7 @@ class StoredImage:
 
 @dataclass(frozen=True, slots=True)
 class StoredFrame:
-    """One moment of the rig with its images as they were stored.
+    """One moment of the rig with its images as stored.
 
     Depth is registered to left, in mm if whole numbers, else m.
     """
@@ -176,7 +176,7 @@ class StoredFrame:
 
 
 def decode_frame(stored: StoredFrame) -> CameraFrame:
-    """The frame with its images decoded, of files two at a time; RecordingError naming the image that cannot be."""
+    """Decode the images of a frame, files two at a time; RecordingError naming an image that cannot be decoded."""
     is_slow = stored.left.encoding == "file" and (stored.right or stored.depth) is not None
     left = _BESIDE.submit(decode_grey, stored.left) if is_slow else None
     right = None if stored.right is None else decode_grey(stored.right)
@@ -185,9 +185,9 @@ def decode_frame(stored: StoredFrame) -> CameraFrame:
 
 
 def decode_grey(stored: StoredImage) -> Image:
-    """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights; of YUV luma is taken as it is."""
+    """(H, W) uint8. 16-bit images keep their upper byte, colour becomes grey by the usual luma weights; YUV keeps its luma."""
     pixels = _decode(stored)
-    # image_transport packs a mosaic as it is, and names it in front of its format
+    # image_transport compresses a mosaic unchanged, and names it in front of its format
     mosaic = stored.form if stored.encoding == "file" and pixels.ndim == 2 else stored.encoding
     if mosaic.startswith("bayer_") and mosaic[6:10] in _GREY_FROM_MOSAIC:
         pixels = cv2.cvtColor(pixels, _GREY_FROM_MOSAIC[mosaic[6:10]])
@@ -204,27 +204,27 @@ def decode_grey(stored: StoredImage) -> Image:
 
 
 def is_wide(stored: StoredImage) -> bool:
-    """True for an image of 16 bits, by its encoding or the head of a PNG file."""
+    """True for a 16-bit image, by its encoding or the header of a PNG file."""
     dtype, _ = RAW_ENCODINGS.get(stored.encoding, (None, 0))
     is_wide_png = stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
     return dtype == np.uint16 if dtype is not None else is_wide_png
 
 
 def grey_peak(stored: StoredImage) -> int:
-    """The largest value of an image of 16 bits; 0 for others, which are not decoded; RecordingError where it cannot be decoded."""
+    """Largest value of a 16-bit image; 0 for others, which are not decoded; RecordingError if it cannot be decoded."""
     return int(_decode(stored).max()) if is_wide(stored) else 0
 
 
 def grey_bits(peak: int) -> int:
-    """10 or 12 where the largest value of images of 16 bits says that their sensor has no more; else 16."""
+    """10 or 12 if the largest value of 16-bit images fits into so many bits; else 16."""
     return next((bits for bits in (10, 12) if 0 < peak < 1 << bits), 16)
 
 
 def is_mosaic(image: Image) -> bool:
-    """Whether an image (H, W) holds the pattern of a Bayer mosaic: taken for grey, or its green for another colour.
+    """True if an image (H, W) shows the pattern of a Bayer mosaic: decoded as grey, or with green taken for another colour.
 
-    The four pixels of 2x2 blocks then differ in the mean over the image, by 12 % in a mosaic of a coloured room, by at most 0.5 % in
-    images of five real cameras. Red and blue exchanged leave no pattern; grey then is a little off in coloured places.
+    Then the mean values of the four pixels of 2x2 blocks differ, by 12 % in a mosaic of a coloured room, by at most 0.5 % in
+    images of five real cameras. Exchanged red and blue leave no pattern; grey is then slightly wrong in coloured places.
     """
     if min(image.shape) < _LEAST_MOSAIC_PX:
         return False
@@ -245,25 +245,25 @@ def decode_depth(stored: StoredImage) -> NDArray[np.float32]:
 
 
 def grey_image(image: Image, where: str = "") -> StoredImage:
-    """A grey (H, W) uint8 image, stored row by row."""
+    """Store a grey (H, W) uint8 image row by row."""
     height, width = image.shape
     return StoredImage("mono8", np.ascontiguousarray(image).tobytes(), where, width, height, width)
 
 
 def png_image(image: Image, where: str = "") -> StoredImage:
-    """A grey (H, W) uint8 image as PNG: without loss, and as fast as that goes."""
+    """Store a grey (H, W) uint8 image as PNG: lossless, at the fastest setting."""
     _, data = cv2.imencode(".png", image, _FAST_PNG)
     return StoredImage("file", data.tobytes(), where)
 
 
 def jpeg_image(image: Image, quality: int = 95, where: str = "") -> StoredImage:
-    """A grey (H, W) uint8 image as JPEG: small, with loss."""
+    """Store a grey (H, W) uint8 image as JPEG: small, lossy."""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return StoredImage("file", data.tobytes(), where)
 
 
 def depth_image(depth_m: NDArray[np.float32], where: str = "") -> StoredImage:
-    """Depth in metres (H, W), stored as 32FC1 row by row, bit for bit."""
+    """Store depth in metres (H, W) as 32FC1 row by row, bit for bit."""
     height, width = depth_m.shape
     return StoredImage("32FC1", np.ascontiguousarray(depth_m, "<f4").tobytes(), where, width, height, 4 * width)
 
@@ -276,13 +276,13 @@ def file_kind(data: bytes) -> str:
 
 
 def is_cut(head: bytes, tail: bytes) -> bool:
-    """Whether a JPEG or PNG file, by its first and last bytes, lacks its end. OpenCV fills what is missing with grey and says nothing."""
+    """True if a JPEG or PNG file, by its first and last bytes, is truncated. OpenCV silently fills the missing part with grey."""
     end = {"jpeg": _JPEG_END, "png": _PNG_END}.get(file_kind(head))
     return end is not None and end not in tail.rstrip(b"\0")[-64:]
 
 
 def is_damaged_png(data: bytes) -> bool:
-    """Whether the checksum of a part of a PNG file says that its bytes are not those that were written; False for other files.
+    """True if a checksum in a PNG file fails; False for other files.
 
     A JPEG file has no checksums.
     """
@@ -299,14 +299,14 @@ def is_damaged_png(data: bytes) -> bool:
 
 
 def store_frame(frame: CameraFrame) -> StoredFrame:
-    """A decoded frame as rows of pixels."""
+    """Store a decoded frame as rows of pixels."""
     right = None if frame.right is None else grey_image(frame.right)
     depth = None if frame.depth_m is None else depth_image(frame.depth_m)
     return StoredFrame(frame.stamp_ns, grey_image(frame.left), right, depth)
 
 
 def check_image(stored: StoredImage) -> tuple[int, int]:
-    """Width and height in pixels; RecordingError where the bytes cannot be a whole image. Nothing is decoded for it."""
+    """Check an image without decoding it and return width and height in pixels; RecordingError if it is incomplete."""
     if stored.encoding == INVERSE_DEPTH:
         _inverse_depth_scale(stored)
         return _check_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))
@@ -327,13 +327,13 @@ def _decode(stored: StoredImage) -> AnyArray:
     row_bytes = stored.width_px * channels * wire_type.itemsize
     padded = stored.data[: step * stored.height_px].ljust(step * stored.height_px, b"\0")
     rows = np.frombuffer(padded, np.uint8).reshape(stored.height_px, step)[:, :row_bytes]
-    # writable, as all images
+    # writable, like all images
     pixels: AnyArray = rows.copy().view(wire_type).astype(dtype, copy=False)
     return pixels if channels == 1 else pixels.reshape(stored.height_px, stored.width_px, channels)
 
 
 def _check_rows(stored: StoredImage) -> int:
-    """The bytes from a row to the next; RecordingError where the data is no image of the encoding and size."""
+    """Bytes from one row to the next; RecordingError if the data does not fit encoding and size."""
     if stored.encoding not in RAW_ENCODINGS:
         raise RecordingError(
             f"{stored.where}: image encoding {stored.encoding!r}; known are {', '.join(RAW_ENCODINGS)}, jpeg, png"
@@ -349,7 +349,7 @@ def _check_rows(stored: StoredImage) -> int:
             f"rows of {step} bytes; the message is damaged, or its encoding is another"
         )
     _check_size(stored.width_px, stored.height_px, stored.where)
-    return step if stored.height_px > 1 else row_bytes  # nothing says how long the only row is
+    return step if stored.height_px > 1 else row_bytes  # the length of a single row is not defined
 
 
 def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
@@ -367,7 +367,7 @@ def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
 
 
 def _inverse_depth_scale(stored: StoredImage) -> tuple[float, float]:
-    """a and b of `_decode_inverse_depth`; RecordingError where the head does not hold them."""
+    """a and b of `_decode_inverse_depth`; RecordingError if the header lacks them."""
     if len(stored.data) < _DEPTH_HEAD.size:
         raise RecordingError(f"{stored.where}: a depth image of {len(stored.data)} bytes; remove it from the recording")
     _, a, b = _DEPTH_HEAD.unpack_from(stored.data)
@@ -397,7 +397,7 @@ def _decode_file(stored: StoredImage) -> AnyArray:
 
 
 def _check_file(stored: StoredImage) -> tuple[int, int]:
-    """Width and height in pixels that the file's header states; RecordingError where it is cut or no image that is read."""
+    """Width and height in pixels from the file's header; RecordingError if it is truncated or not a supported image."""
     data = stored.data
     if not data:
         raise RecordingError(f"{stored.where}: the image has no bytes; remove it from the recording")
@@ -426,7 +426,7 @@ def _not_an_image(stored: StoredImage) -> RecordingError:
 
 
 def _unread(data: bytes, form: str) -> str:
-    """What the bytes are and what to do, where they are known to be no image that is read; else nothing."""
+    """Name and advice if the bytes are of a known unsupported format; else empty."""
     if file_kind(data) != "other":
         return ""
     said = next((what for word, what in _UNREAD_FORMS.items() if word in form.lower()), "")

@@ -1,4 +1,4 @@
-"""What a file from a stranger may cost in memory: every limit on sizes, and the functions that unpack within them."""
+"""Memory limits for untrusted files: all limits on sizes, and the functions that unpack within them."""
 
 import bz2
 from pathlib import Path
@@ -10,25 +10,25 @@ from fleetmap.errors import RecordingError
 MAX_MESSAGE_BYTES = (
     64 << 20
 )  # of a message, a chunk, an attachment: one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
-MAX_PIXELS = 64_000_000  # the largest sensors of machine vision have 150, those of robots 5
+MAX_PIXELS = 64_000_000  # the largest machine-vision sensors have 150, those of robots 5
 MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 MAX_TABLE_BYTES = 1 << 30  # 13 hours of an IMU at 200 Hz
 MAX_CALIBRATION_BYTES = 1 << 20  # a camchain of two cameras has 2 kB
 MAX_VIDEO_TABLE_BYTES = 256 << 20
-# What is kept of a file beside its images (schemas, metadata, IMU and the rest), by the size of the file. Messages of zeros are
-# the limit: zstd makes 1 of 8 bytes of recorded odometry, which is mostly empty covariances, and 1 of 30,000 zeros.
+# Limit on data kept beside the images (schemas, metadata, IMU and so on), by the size of the file. Messages of zeros are
+# the extreme: zstd compresses recorded odometry, mostly empty covariances, 8 to 1, and zeros 30,000 to 1.
 _KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
-_KEPT_RECORD_BYTES = 256  # of a record's place, stamp and object in memory
+_KEPT_RECORD_BYTES = 256  # memory of a record's place, stamp and object
 
 
 class KeptBytes:
-    """Counts what stays in memory of files of `size` bytes."""
+    """Counts the memory kept for files of `size` bytes."""
 
     def __init__(self, path: Path, size: int) -> None:
         self.path, self.size, self._kept = path, size, 0
 
     def keep(self, size: int) -> None:
-        """Counts a record of `size` bytes that stays in memory; RecordingError where the file unpacks to more than a recording can."""
+        """Count a record of `size` bytes kept in memory; RecordingError if the file unpacks to more than a real recording can."""
         self._kept += size + _KEPT_RECORD_BYTES
         limit = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
         if self._kept > limit:
@@ -39,9 +39,9 @@ class KeptBytes:
 
 
 def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
-    """The unpacked bytes; ValueError for what cannot be unpacked, or to more than `most_bytes`.
+    """Unpack bytes; ValueError if they are damaged or unpack to more than `most_bytes`.
 
-    No more memory is taken, whatever the packed bytes say of themselves. compression: zstd, lz4, bz2, or empty for none.
+    Never allocates more, whatever size the packed bytes declare. compression: zstd, lz4, bz2, or empty for none.
     """
     try:
         if compression == "":

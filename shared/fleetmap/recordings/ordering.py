@@ -1,4 +1,4 @@
-"""Stamps put in order and paired, samples checked; everything that is left out is noted, never hidden."""
+"""Ordering and pairing of stamps, checks of samples; all omissions are noted as issues."""
 
 import bisect
 from collections import Counter
@@ -14,28 +14,28 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Trajectory
 
-PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken at one moment
+PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken simultaneously
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
-# Of recordings whose stamps nobody took when the images were exposed
+# For recordings whose stamps were not taken at the exposure of the images
 UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's, which no exposure set and no other sensor shares")
 UNITS = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}  # by the nanoseconds in each
 _FINER = {1_000: "milliseconds", 1_000_000: "microseconds", 1_000_000_000: "nanoseconds"}  # by how many are in a second
-_MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits do
+_MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits may give it
 # Between values in the median: no inertial sensor has more than 10 kHz; no camera or odometry more than 2 kHz or less than 0.05 Hz
 _SHORTEST_IMU_NS, _SHORTEST_NS, _LONGEST_NS = 100_000, 500_000, 20_000_000_000
 _EPOCH_NS = (9e17, 5e18)  # 1998 to 2128
 _FEWEST = 10  # values whose steps tell a unit
-# Of a part of a stream with a pause on either side: what is shorter than the second in which an odometry begins serves nothing, so
-# that a recording that was interrupted loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
+# Of a part of a stream with a pause on either side: a part shorter than the second that an odometry needs to start is useless, so
+# an interrupted recording loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
 _SHORTEST_PART_NS, _PAUSE_STEPS, _STRAY_SHARE = 1_000_000_000, 10, 0.05
 V = TypeVar("V")
 
 
 @dataclass(slots=True)
 class ReadLog:
-    """Notes taken while a recording is read: what is missing or damaged, and the files read beside the images.
+    """Log of reading a recording: missing and damaged data, and the files read beside the images.
 
-    damaged_ns: stamps of images that were left out because they cannot be decoded.
+    damaged_ns: stamps of images left out because they cannot be decoded.
     """
 
     issues: list[DataIssue] = field(default_factory=list)
@@ -43,12 +43,12 @@ class ReadLog:
     damaged_ns: list[int] = field(default_factory=list)
 
     def note(self, what: str, detail: str) -> None:
-        """Adds an issue."""
+        """Add an issue."""
         self.issues.append(DataIssue(what, detail))
 
 
 def with_log_times(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) -> Stamps:
-    """The stamps (N,), those that nobody set (0) by their log times (N,), less what the others take to be logged; noted in `log`."""
+    """Replace unset stamps (0) among (N,) by log times (N,) minus the logging delay of the others; noted in `log`."""
     unset = (stamps_ns == 0) & (log_times_ns != 0)
     if not unset.any():
         return stamps_ns
@@ -58,7 +58,7 @@ def with_log_times(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: Read
 
 
 def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of the images with the size (width, height) of most, or of an unknown one; the others are noted in `log`."""
+    """(N,) mask of the images with the most frequent size (width, height) or an unknown one; the others are noted in `log`."""
     counts = Counter(size for size in sizes_px if size is not None)
     if len(counts) <= 1:
         return np.ones(len(sizes_px), np.bool_)
@@ -69,16 +69,16 @@ def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadL
 
 
 def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of a longest strictly increasing subsequence without single stamps far from all others; what it lacks is noted in `log`.
+    """(N,) mask of a longest strictly increasing subsequence without isolated stamps far from all others; omissions are noted in `log`.
 
-    Stamps are never sorted: values that arrive out of order carry stamps that cannot be trusted. One stamp far in the
-    future costs itself, not all that follow. RecordingError where more than half would be left out, and for stamps of
+    Stamps are never sorted: stamps of values that arrive out of order cannot be trusted. One stamp far in the
+    future is dropped alone, not all that follow. RecordingError if more than half would be left out, and for stamps in
     another unit.
     """
     _check_steps(stamps_ns, what)
     kept = _longest_increasing(stamps_ns)
     _note_dropped(stamps_ns, kept, what, log)
-    if what not in ("position priors", "ground truth"):  # which come as they like
+    if what not in ("position priors", "ground truth"):  # which arrive irregularly
         rows = np.flatnonzero(kept)
         kept[rows[_strays(stamps_ns[rows], what, log)]] = False
     return kept
@@ -111,7 +111,7 @@ def _note_dropped(stamps_ns: Stamps, kept: NDArray[np.bool_], what: str, log: Re
 
 
 def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of the few increasing stamps that stand alone, a pause away from all others; noted in `log`."""
+    """(N,) mask of the few isolated increasing stamps, a pause away from all others; noted in `log`."""
     strays = np.zeros(len(stamps_ns), np.bool_)
     steps = np.diff(stamps_ns)
     if len(steps) == 0:
@@ -156,7 +156,7 @@ def _longest_increasing(stamps_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def _check_steps(stamps_ns: Stamps, what: str) -> None:
-    """RecordingError for stamps whose median step no such sensor has, with the unit that they look like."""
+    """RecordingError for stamps with an implausible median step for the sensor, naming their likely unit."""
     if len(stamps_ns) < _FEWEST:
         return
     steps, shortest = np.diff(stamps_ns), _SHORTEST_IMU_NS if what == "imu" else _SHORTEST_NS
@@ -174,7 +174,7 @@ def _check_steps(stamps_ns: Stamps, what: str) -> None:
 
 
 def check_seconds(value: float, where: str) -> None:
-    """RecordingError for what is too large for seconds since 1970, with the unit that it looks like."""
+    """RecordingError for a value too large for seconds since 1970, naming its likely unit."""
     if abs(value) > 9_223_372_036:  # what 64 bits of nanoseconds hold
         factor = next((factor for factor in _FINER if abs(value) < 1e11 * factor), 1_000_000_000)
         why = f"{value:.0f} is no time in seconds"
@@ -182,7 +182,7 @@ def check_seconds(value: float, where: str) -> None:
 
 
 def check_together(stamps_ns: Stamps, what: str, frame_stamps_ns: Stamps) -> None:
-    """RecordingError where the stamps cover other times than the frames, and the same in another unit."""
+    """RecordingError if the stamps cover other times than the frames, but the same times in another unit."""
     if not len(stamps_ns) or not len(frame_stamps_ns) or _overlap(stamps_ns, 1, frame_stamps_ns):
         return
     for ns, unit in UNITS.items():
@@ -195,7 +195,7 @@ def check_together(stamps_ns: Stamps, what: str, frame_stamps_ns: Stamps) -> Non
 
 
 def wrong_unit(what: str, unit: str, why: str, remedy: str) -> RecordingError:
-    """The error of stamps that are in another unit than they should be."""
+    """Error for stamps in a wrong unit."""
     name = what.replace("imu", "IMU")
     return RecordingError(
         f"{name} stamps look like {unit}: {why}; {remedy} where they are written, or leave this sensor out"
@@ -203,20 +203,20 @@ def wrong_unit(what: str, unit: str, why: str, remedy: str) -> RecordingError:
 
 
 def _overlap(stamps_ns: Stamps, factor: int, others_ns: Stamps) -> bool:
-    """True if at least half of the shorter time is in the other, the stamps multiplied by `factor`."""
+    """True if at least half of the shorter interval overlaps the other, the stamps multiplied by `factor`."""
     first, last = int(stamps_ns[0]) * factor, int(stamps_ns[-1]) * factor
     begin, end = int(others_ns[0]), int(others_ns[-1])
     return 2 * (min(last, end) - max(first, begin)) >= min(last - first, end - begin)
 
 
 def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:
-    """The values whose stamps increase, as `forward_only`."""
+    """Values with increasing stamps, as `forward_only`."""
     kept = forward_only(np.array(stamps_ns, np.int64), what, log)
     return tuple(value for value, keep in zip(values, kept, strict=True) if keep)
 
 
 def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: ReadLog) -> ImuSamples:
-    """The samples with possible values and increasing stamps; the others are noted in `log`."""
+    """Samples with plausible values and increasing stamps; the others are noted in `log`."""
     possible = np.asarray((np.abs(np.hstack([gyro_radps, accel_mps2])) < _MAX_IMU_VALUE).all(axis=1))
     if not possible.all():
         log.note("imu: impossible values", f"{int((~possible).sum())} of {len(possible)} samples left out")
@@ -226,7 +226,7 @@ def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: Read
 
 
 def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLog) -> Trajectory | None:
-    """The ground truth of rows x y z qw qx qy qz (N, 7), None where no row is usable; those without a unit quaternion are noted."""
+    """Ground truth from rows x y z qw qx qy qz (N, 7), None if no row is usable; rows without a unit quaternion are noted."""
     norms = np.linalg.norm(position_quat_wxyz[:, 3:7], axis=1)
     good = np.isfinite(position_quat_wxyz).all(axis=1) & (np.abs(norms - 1) < 0.01)
     if not good.all():

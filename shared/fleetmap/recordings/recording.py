@@ -1,4 +1,4 @@
-"""A recording in memory, whatever format it came in, and a selection of its frames."""
+"""A recording in memory, independent of its format, and a selection of its frames."""
 
 import hashlib
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from fleetmap.sensors.source_settings import Topics
 
 
 def named_topics(words: Sequence[str] | None, others: Topics | None = None) -> Topics:
-    """Topics by words such as `left=/camera/left`, or `imu=` for none; the rest is as in `others`. UsageError for other words."""
+    """Parse topics given as `left=/camera/left`, or `imu=` for none; the rest is as in `others`. UsageError for other text."""
     roles, found = Topics.__struct_fields__, {}
     for word in words or ():
         role, sign, name = word.partition("=")
@@ -51,16 +51,16 @@ class FrameSource(Protocol):
     """Access to the images of a recording: F frames, in any order."""
 
     def stored(self, index: int) -> StoredFrame:
-        """Frame `index` as it was stored, images still encoded; RecordingError where the bytes are gone."""
+        """Frame `index` as stored, images still encoded; RecordingError if the bytes are gone."""
 
     def frame(self, index: int) -> CameraFrame:
-        """Frame `index`, decoded; RecordingError naming the image that cannot be."""
+        """Frame `index`, decoded; RecordingError naming an image that cannot be decoded."""
 
     def part(self, indices: NDArray[np.int64]) -> "FrameSource":
-        """The frames at indices (K,), numbered anew, to be read and closed apart from this source: in other threads and processes too."""
+        """The frames at indices (K,), renumbered, read and closed independently of this source, also in other threads and processes."""
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
-        """Feeds all that was read of the recording, images included, to `digest`, in an order that never changes."""
+        """Feed the recording's content, including images, to `digest`, in a fixed order."""
 
     def close(self) -> None:
         """Closes open files."""
@@ -68,7 +68,7 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True)
 class _SomeFrames:
-    """The frames of a source at indices (K,), numbered anew, which are closed with it."""
+    """The frames of a source at indices (K,), renumbered, closed together with it."""
 
     source: FrameSource
     indices: NDArray[np.int64]
@@ -91,13 +91,13 @@ class _SomeFrames:
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording, opened: everything but the images in memory, the images read on demand.
+    """An open recording: everything but the images in memory, images read on demand.
 
     frame_stamps_ns (F,), strictly increasing: left frames that have their partner (right image or depth). imu: all
-    samples, also those before the first frame; empty where the calibration does not say how the IMU is mounted (stated
+    samples, also those before the first frame; empty if the calibration lacks the mounting of the IMU (stated
     in issues). ground_truth: frame_from_body of the body (the IMU, or the frame that the calibration's body_from_cam
-    refers to without one). issues: what could not be read. damaged_ns (D,): frames that
-    opening, or `readable`, left out because an image of them cannot be decoded.
+    refers to without one). issues: unreadable data. damaged_ns (D,): frames that
+    opening, or `readable`, left out because one of their images cannot be decoded.
     """
 
     path: Path
@@ -141,10 +141,10 @@ class Recording:
         return frame
 
     def readable(self, indices: NDArray[np.int64]) -> tuple["Recording", NDArray[np.int64]]:
-        """The recording without those of its frames at indices (K,) whose images are damaged, and the others' indices in it.
+        """Return the recording without those frames at indices (K,) whose images are damaged, and the new indices of the others.
 
-        They are noted in its issues. JPEG images alone are decoded for it: the checksums of PNG files were looked at when the recording
-        was opened. RecordingError where most are damaged.
+        They are noted in its issues. Only JPEG images are decoded for it: the checksums of PNG files were checked when the recording
+        was opened. RecordingError if most are damaged.
         """
         faults: dict[int, str] = {}
         has_jpeg = False
@@ -175,22 +175,22 @@ class Recording:
         return sound, np.searchsorted(kept, np.setdiff1d(indices, list(faults)))
 
     def stored_frame(self, index: int) -> StoredFrame:
-        """Frame `index` with its images as they were stored, for copying without loss."""
+        """Frame `index` with its images as stored, for lossless copying."""
         self._check_index(index)
         return self.frames.stored(index)
 
     def part(self, indices: NDArray[np.int64]) -> "Recording":
-        """The frames at indices (K,), numbered anew, with everything else whole; see `FrameSource.part`."""
+        """The recording with only the frames at indices (K,), renumbered; see `FrameSource.part`."""
         return replace(self, frame_stamps_ns=self.frame_stamps_ns[indices], frames=self.frames.part(indices))
 
     def content_hash(self) -> str:
-        """SHA-256 (hex) over the content that was read, the images included; the same on every machine."""
+        """SHA-256 (hex) of the content, including images; the same on every machine."""
         digest = hashlib.sha256()
         self.frames.hash_into(digest)
         return digest.hexdigest()
 
     def close(self) -> None:
-        """Closes open files; the recording's arrays stay usable."""
+        """Close open files; the recording's arrays stay usable."""
         self.frames.close()
 
     def __enter__(self) -> "Recording":
@@ -216,7 +216,7 @@ class FrameSelection:
 
     @classmethod
     def parse(cls, text: str) -> "FrameSelection":
-        """The selection written `A:B:C`, each part may be left out.
+        """Parse a selection written `A:B:C`; each part may be omitted.
 
         UsageError for anything else and for steps below 1.
         """
@@ -234,7 +234,7 @@ class FrameSelection:
         return cls(start, stop, step or 1)
 
     def apply(self, recording: Recording) -> NDArray[np.int64]:
-        """The selected frame indices (K,), increasing; UsageError where none is left."""
+        """The selected frame indices (K,), increasing; UsageError if none is left."""
         indices = np.arange(len(recording), dtype=np.int64)[self.start : self.stop : self.step]
         if len(indices) == 0:
             raise UsageError(f"--frames {self} selects none of the {len(recording)} frames of {recording.path}")

@@ -22,7 +22,7 @@ _ROWS, _COLUMNS = np.triu_indices(6)
 
 
 def format_tum(trajectory: Trajectory) -> str:
-    """The lines of a trajectory, with a comment line that names the columns first."""
+    """The lines of a trajectory, after a comment line that names the columns."""
     lines = ["# timestamp_s tx ty tz qx qy qz qw"]
     for stamp, frame_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
         w, x, y, z = quat_wxyz_from_rotation(frame_from_body[:3, :3])
@@ -32,7 +32,7 @@ def format_tum(trajectory: Trajectory) -> str:
 
 
 def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
-    """The trajectory in `text`; empty lines and those that begin with # are skipped.
+    """Parse the trajectory in `text`; empty lines and those that begin with # are skipped.
 
     Raises RecordingError, naming `what` and the line, for anything but eight finite numbers, a quaternion that is not
     of unit length within 1 %, or stamps that do not rise.
@@ -53,7 +53,7 @@ def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Writes `trajectory` as TUM text; RecordingError where the file cannot be written."""
+    """Write `trajectory` as TUM text; RecordingError if the file cannot be written."""
     try:
         path.write_text(format_tum(trajectory), encoding="ascii")
     except OSError as error:
@@ -61,12 +61,12 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """The trajectory in the file at `path`; RecordingError as `parse_tum`, and where it cannot be read."""
+    """Read the trajectory in the file at `path`; RecordingError as `parse_tum`, and if it cannot be read."""
     return parse_tum(read_text(path, "a TUM trajectory is expected"), str(path))
 
 
 class StampedLine(NamedTuple):
-    """A line of numbers: where it is, its first 80 characters, its stamp and the values after it."""
+    """A line of numbers: its location, its first 80 characters, its stamp and the values after it."""
 
     where: str
     text: str
@@ -117,7 +117,7 @@ def format_stamp(stamp_ns: int) -> str:
 
 
 def parse_stamp_ns(field: str) -> int:
-    """Nanoseconds of a decimal number of seconds; what is finer is cut off. ValueError for anything else."""
+    """Convert decimal seconds to nanoseconds, truncating finer digits. ValueError for anything else."""
     try:
         seconds = Decimal(field)
     except InvalidOperation as error:
@@ -139,7 +139,7 @@ class StampedCovariances:
 
 
 def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """Covariances of a trajectory, as lines of a stamp and the 21 numbers of the upper triangle, rotation first.
+    """Parse the covariances of a trajectory: lines of a stamp and the 21 numbers of the upper triangle, rotation first.
 
     Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
     stamps that do not rise.
@@ -158,5 +158,5 @@ def parse_covariances(text: str, what: str = "covariances") -> StampedCovariance
 
 
 def read_covariances(path: Path) -> StampedCovariances:
-    """The covariances in the file at `path`; RecordingError as `parse_covariances`, and where it cannot be read."""
+    """Read the covariances in the file at `path`; RecordingError as `parse_covariances`, and if it cannot be read."""
     return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))

@@ -1,8 +1,8 @@
-"""Opens a video of one camera, .mp4 or .mov, with a calibration file. Its stamps are the container's, and said to be uncertain.
+"""Opens a video of one camera, .mp4 or .mov, with a calibration file. Its stamps are the container's, and marked as uncertain.
 
-PyAV (FFmpeg) decodes it. Luma is taken as the decoder gives it, so that a frame is the same on every machine. Files may be hostile:
-no other demuxer than MP4's is asked, nothing but the file itself is read, tables have no more samples than the file has bytes, and
-pictures have the size that all images may have.
+PyAV (FFmpeg) decodes it. Luma is taken from the decoder unchanged, so that a frame is the same on every machine. Files may be hostile:
+only MP4's demuxer is used, only the file itself is read, tables have no more samples than the file has bytes, and
+image sizes have the general limit.
 """
 
 import bisect
@@ -32,17 +32,17 @@ SUFFIXES = (".mp4", ".m4v", ".mov")
 _PLANES = ("yuv4", "yuvj4", "nv12", "nv21", "gray")  # pixel formats whose first plane is luma
 _BOX = struct.Struct(">I4s")
 _NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
-_COUNTS = re.compile(rb"(?:stsz|stz2).{8}(.{4})|trun.{4}(.{4})", re.DOTALL)  # how many samples
+_COUNTS = re.compile(rb"(?:stsz|stz2).{8}(.{4})|trun.{4}(.{4})", re.DOTALL)  # number of samples
 _UNEVEN = 1.5  # longest step over the median of a constant rate
 
 
 def recognises(path: Path) -> bool:
-    """Whether `path` is a file that is named, or begins, as an MP4 video."""
+    """True for a file with the name or the first bytes of an MP4 video."""
     return path.is_file() and (path.suffix.lower() in SUFFIXES or file_head(path, 12)[4:8] == b"ftyp")
 
 
 def open_video(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a video: one camera, no IMU."""
+    """Open the recording in a video: one camera, no IMU."""
     log = ReadLog(files=[path])
     given = calibration_of_options(options, log)
     if given is None:
@@ -68,9 +68,9 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
 
 
 class VideoReader:
-    """An ImageReader that decodes forward, from the last key frame before where it is asked to go elsewhere.
+    """An ImageReader that decodes forward, and seeks to the last key frame before any other requested frame.
 
-    Frames are told by their presentation time in the video's own unit. read_files: the video first; keys: those of all key frames.
+    Frames are identified by their presentation time in the video's own unit. read_files: the video first; keys: times of all key frames.
     """
 
     def __init__(self, read_files: Sequence[Path], keys: Sequence[int]) -> None:
@@ -81,18 +81,18 @@ class VideoReader:
         self._last: Any = None
 
     def rotation(self, source: int, stamp_ns: int) -> int:
-        """Degrees by which players turn the pictures."""
+        """Degrees by which players rotate the images."""
         return int(self._at(source, stamp_ns).rotation)
 
     def read(self, source: int, stamp_ns: int) -> StoredImage:
-        """A frame, decoded: nothing else of it can be copied without the frames around it."""
+        """Read a frame, decoded: its encoded form depends on other frames."""
         return grey_image(_luma(self._at(source, stamp_ns)), f"{self._read_files[0]} at {stamp_ns}")
 
     def apart(self) -> "VideoReader":
         return VideoReader(self._read_files, self._keys)
 
     def hash_into(self, digest: "hashlib._Hash", images: list[int]) -> None:
-        """The bytes of the video, then those of the calibration file."""
+        """Hash the bytes of the video, then those of the calibration file."""
         for path in self._read_files:
             hash_file(path, digest)
 
@@ -118,7 +118,7 @@ class VideoReader:
         return self._last
 
     def _decode(self, wanted: int) -> Any:
-        """The frame of that time; None where there is none."""
+        """Decode the frame of that time; None if absent."""
         if self._video is None:
             self._video = _opened(self._read_files[0])
         container, stream, _ = self._video
@@ -133,20 +133,20 @@ class VideoReader:
 
 
 class _Video(NamedTuple):
-    """An open video and the file that it is read from."""
+    """An open video and its file."""
 
     container: "av.container.InputContainer"
     stream: "av.VideoStream"
     file: BinaryIO
 
     def close(self) -> None:
-        """Closes both."""
+        """Close both."""
         self.container.close()
         self.file.close()
 
 
 def _opened(path: Path) -> _Video:
-    """The file by MP4's demuxer alone, which is given bytes and no name that it could follow."""
+    """Open the file with MP4's demuxer, which gets bytes and no path that it could follow."""
     try:
         import av
     except ImportError as error:
@@ -177,9 +177,9 @@ def _opened(path: Path) -> _Video:
 
 
 def _check_tables(path: Path, file: BinaryIO) -> None:
-    """RecordingError where tables tell of more samples than there are bytes: FFmpeg fills some 60 bytes of memory for each.
+    """RecordingError if tables declare more samples than the file has bytes: FFmpeg allocates about 60 bytes of memory for each.
 
-    Tables are looked for by their names in all but the pictures, because FFmpeg takes them wherever they stand.
+    Tables are searched by name in everything but the image data, because FFmpeg accepts them anywhere.
     """
     size, at, told = path.stat().st_size, 0, 0
     while at + _BOX.size <= size:
@@ -195,7 +195,7 @@ def _check_tables(path: Path, file: BinaryIO) -> None:
                 )
             content = file.read(length)
             told += sum(int.from_bytes(found[1] or found[2], "big") for found in _COUNTS.finditer(content))
-            told += size * (b"cmov" in content)  # tables that are packed themselves
+            told += size * (b"cmov" in content)  # compressed tables
         at += length
     file.seek(0)
     if told > size:
@@ -209,14 +209,14 @@ def _conversion(path: Path) -> str:
 
 
 def _errors() -> tuple[type[Exception], ...]:
-    """What PyAV raises of damaged files: FFmpeg's errors, and Python's where it is led to impossible places of the file."""
+    """Errors of PyAV for damaged files: FFmpeg's, and Python's for impossible positions in the file."""
     import av
 
     return (av.error.FFmpegError, OSError, ValueError)
 
 
 def _index(path: Path, log: ReadLog) -> tuple[ImageSeries[int], list[int]]:
-    """The frames by what the container says of its packets, and the times of its key frames; RecordingError where there is none."""
+    """Index the frames by the container's packets, and the times of its key frames; RecordingError if there are none."""
     video = _opened(path)
     try:
         container, stream, _ = video

@@ -1,1 +1,1 @@
-"""One frame placed in a map: visible landmarks, bag-of-words candidates, PnP, guided matching, look-alike places."""
+"""Relocalization of one frame in a map: visible landmarks, bag-of-words candidates, PnP, guided matching, look-alike places."""

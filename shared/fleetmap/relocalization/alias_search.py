@@ -1,9 +1,9 @@
-"""Search for aliases: places of a map that look the same as one that was found. Pure.
+"""Search for aliases: places of a map that look the same as a recognized place. Pure.
 
-Bags of words do not find them: a map within a budget holds other landmarks of every aisle, and what stands in one aisle stands in
-part in all others. The same things in the same order do. Every landmark of the map that looks like one that was recognized votes for
-a camera that would see it so. Halls are assumed to be built at right angles; an alias that is turned by any other angle is found by
-its words or not at all.
+Bags of words do not find them: a map within a budget holds different landmarks of every aisle, and single objects recur in
+all aisles. The arrangement of objects does. Every landmark of the map that looks like a recognized one votes for
+a camera that would see it so. Halls are assumed to be built at right angles; an alias rotated by any other angle is found by
+its bag of words or not at all.
 
 Source: the generalised Hough transform, Ballard 1981.
 """
@@ -22,11 +22,11 @@ from fleetmap.geometry import Array
 _MAX_FEATURES, _MAX_PAIRS = 96, 400_000
 _CELL_M = 0.5
 _OWN_M = 1.2  # around the place itself
-_OWN_LANDMARK_M = 0.5  # around what was recognized: it, and what of it was mapped twice
-_COMPARISONS_PER_SLICE = 3_000_000  # some ten milliseconds
+_OWN_LANDMARK_M = 0.5  # around recognized landmarks: themselves, and duplicates in the map
+_COMPARISONS_PER_SLICE = 3_000_000  # about ten milliseconds
 _MIN_VOTES = 6
 _BORDER_M = 12.0  # around the map's landmarks, where cameras may stand
-_REACH_M = 500.0  # within which look-alikes are looked for: memory must not go with how far away one landmark is
+_REACH_M = 500.0  # limit of the search: memory must not grow with the distance of a single landmark
 _QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))]
 
 
@@ -39,9 +39,9 @@ class LandmarkSet(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AliasCandidate:
-    """A camera that would see the same: map_from_cam (4, 4), about a cell exact.
+    """A camera pose with the same view: map_from_cam (4, 4), accurate to about a cell.
 
-    alias_ratio: its votes as a share of those for the place that was found. features (P,) with landmarks (P,), rows of the map: what
+    alias_ratio: its votes as a share of those for the recognized place. features (P,) with landmarks (P,), rows of the map: pairs that
     voted for it.
     """
 
@@ -54,9 +54,9 @@ class AliasCandidate:
 def find_aliases(
     seen: LandmarkSet, landmarks: LandmarkSet, map_from_cam: Array, min_ratio: float, max_count: int
 ) -> Generator[None, None, list[AliasCandidate]]:
-    """Aliases of a camera's place in the map of `landmarks`, best first, with at least a share of its own votes; in slices.
+    """Find aliases of a camera's place in the map of `landmarks`, best first, with at least a share of its own votes; in slices.
 
-    seen: the descriptors of what was recognized there, and where the map says that it is.
+    seen: descriptors of the landmarks recognized there, and their points in the map.
     """
     used = np.linspace(0, len(seen.points_map) - 1, min(len(seen.points_map), _MAX_FEATURES)).astype(np.int64)
     points_map = seen.points_map[used]
@@ -89,7 +89,7 @@ class _Votes:
         self._shape: tuple[int, int] = tuple(np.ceil((high - self._low) / _CELL_M).astype(int).tolist())
         offsets = points_map[:, :2] - map_from_cam[:2, 3]
         self._offsets = [np.ascontiguousarray(offsets @ turn.T) for turn in _QUARTER_TURNS]
-        # Landmarks of the place itself vote for it alone. Near a camera they lie in the same cell from whichever side they are seen.
+        # Landmarks of the place itself vote for it alone. Near a camera they lie in the same cell, seen from any side.
         away_m = np.linalg.norm(landmarks_map[pairs[:, 1]] - points_map[pairs[:, 0]], axis=1)
         self._others = np.ascontiguousarray(pairs[away_m > _OWN_LANDMARK_M])
         self._counts = np.stack([self._cast(self._others, quarter) for quarter in range(4)])
@@ -101,7 +101,7 @@ class _Votes:
         return core.camera_votes(pairs, self._offsets[quarter], self._landmarks_map, self._low, _CELL_M, *self._shape)
 
     def peaks(self, min_ratio: float, max_count: int) -> list[tuple[int, Array, float]]:
-        """Quarter turn, (x, y) and share of the own votes of the best cells, none near another one or near the place itself."""
+        """Quarter turn, (x, y) and relative votes of the best cells, excluding cells near a better one or near the place itself."""
         quarters, columns, rows = np.nonzero(self._counts >= _MIN_VOTES)
         centres = self._low + _CELL_M * (np.column_stack([columns, rows]) + 1.0)
         votes = self._counts[quarters, columns, rows]
@@ -118,7 +118,7 @@ class _Votes:
         return found
 
     def candidate(self, quarter: int, centre: Array, ratio: float, used: NDArray[np.int64]) -> AliasCandidate:
-        """The camera at a peak, in the median of its votes; used (F,): the numbers of the features among all that were recognized."""
+        """The camera at a peak, in the median of its votes; used (F,): numbers of the features among all recognized ones."""
         pairs = self._others
         cameras = self._landmarks_map[pairs[:, 1], :2] - self._offsets[quarter][pairs[:, 0]]
         voted = (np.abs(cameras - centre) < _CELL_M).all(axis=1)

@@ -1,4 +1,4 @@
-"""Landmarks that a camera should see, their matches among its features, and the places around a place. Pure.
+"""Landmarks expected in a camera's view, their matches among its features, and neighbouring places. Pure.
 
 Source: Mur-Artal et al. 2015 (ORB-SLAM), section V.D: a landmark is expected where it projects into the image, within the range of
 distances and close to the directions from which it was seen, at the octave that its distance predicts.
@@ -19,14 +19,14 @@ from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 
 Rows = NDArray[np.int64]
-COLUMNS, ROWS = 8, 6  # the parts of an image over which matches must be spread
+COLUMNS, ROWS = 8, 6  # image cells over which matches must be spread
 
 
 class ViewingCones(NamedTuple):
     """The directions and distances from which N landmarks were seen.
 
-    points_map (N, 3); directions_map (N, 3) unit, from the landmark to the cameras that saw it; half_angles_rad (N,) around them;
-    max_distances_m (N,) at which it appears at the finest octave, 0 for one that nothing has seen.
+    points_map (N, 3); directions_map (N, 3) unit, from the landmark to its cameras; half_angles_rad (N,) around them;
+    max_distances_m (N,) at which it appears at the finest octave, 0 for one without observations.
     """
 
     points_map: Array
@@ -36,7 +36,7 @@ class ViewingCones(NamedTuple):
 
 
 class VisibleLandmarks(NamedTuple):
-    """Landmarks that a camera should see: rows (V,), pixels (V, 3) u_left v u_right, and the octaves (V,) they should appear at."""
+    """Landmarks expected in a camera's view: rows (V,), pixels (V, 3) u_left v u_right, and expected octaves (V,)."""
 
     rows: Rows
     pixels: Array
@@ -51,9 +51,9 @@ def visible_landmarks(
     max_view_angle_rad: float,
     distance_scale: float = 1.0,
 ) -> VisibleLandmarks:
-    """The landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones.
+    """Landmarks in a camera's image widened by margin_px, seen at most max_view_angle_rad outside their cones.
 
-    distance_scale: the camera's focal length as a multiple of the survey's; a longer lens sees a corner at the same scale from further.
+    distance_scale: the camera's focal length as a multiple of the survey's; a longer lens sees a corner at equal scale from farther away.
     """
     limits = distance_scale, margin_px, max_view_angle_rad, SCALE_FACTOR
     return VisibleLandmarks(
@@ -62,7 +62,7 @@ def visible_landmarks(
 
 
 def pinhole_of(camera: StereoCamera) -> Array:
-    """(6,) as the core takes it: focal, cx, cy, focal * baseline, width, height."""
+    """(6,) in the core's order: focal, cx, cy, focal * baseline, width, height."""
     return np.array([*camera.lens, camera.width_px, camera.height_px])
 
 
@@ -73,7 +73,7 @@ def match_visible(
     features: Features,
     settings: FixSettings,
 ) -> Rows:
-    """(V,) the feature that shows each expected landmark with descriptors (V, 32), -1 for none, within windows_px (V,) of its pixel."""
+    """(V,) matching feature of each expected landmark with descriptors (V, 32), -1 for none, within windows_px (V,) of its pixel."""
     octaves = np.column_stack([np.floor(expected.octaves) - 2, np.ceil(expected.octaves) + 2]).astype(np.int64)
     projected = Projected(expected.pixels[:, :2], windows_px, descriptors, octaves)
     found, _ = match_by_projection(projected, features, settings.guided_distance, settings.guided_ratio)
@@ -93,19 +93,19 @@ def cones_of_tiles(tiles: Sequence[Tile]) -> ViewingCones:
 def places_around(
     places_map_from_cam: Array, map_from_cam: Array, radius_m: float, min_cosine: float
 ) -> NDArray[np.bool_]:
-    """(K,) which places (K, 4, 4) lie within a radius of a camera and look its way, by the cosine between the axes."""
+    """(K,) True for places (K, 4, 4) within a radius of a camera and of similar viewing direction, by the cosine between the axes."""
     apart_m = np.linalg.norm(places_map_from_cam[:, :3, 3] - map_from_cam[:3, 3], axis=1)
     axes_map, axis_map = places_map_from_cam[:, :3, 2], map_from_cam[:3, 2]
     return np.asarray((apart_m < radius_m) & (axes_map @ axis_map > min_cosine))
 
 
 def image_cells(pixels: Array, camera: StereoCamera) -> Rows:
-    """(P,) which of COLUMNS x ROWS parts of the image each pixel (P, 2) lies in."""
+    """(P,) number of the cell, of COLUMNS x ROWS in the image, of each pixel (P, 2)."""
     column = np.clip(pixels[:, 0] / camera.width_px * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
     row = np.clip(pixels[:, 1] / camera.height_px * ROWS, 0, ROWS - 1).astype(np.int64)
     return np.asarray(column * ROWS + row)
 
 
 def joined(parts: Sequence[AnyArray], empty: tuple[int, ...], dtype: type[np.generic]) -> Any:
-    """The parts one after the other; an array of shape `empty` without any."""
+    """Concatenate the parts; an array of shape `empty` without any."""
     return np.concatenate(parts).astype(dtype) if parts else np.zeros(empty, dtype)

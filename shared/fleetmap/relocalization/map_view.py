@@ -1,4 +1,4 @@
-"""The part of a map that a robot holds: landmarks and places of the tiles around, ready to be looked up."""
+"""The part of a map in a robot's memory: landmarks and places of the surrounding tiles, indexed for queries."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,19 +26,19 @@ from fleetmap.relocalization.landmark_visibility import (
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
 
-_LEVEL = 2  # of the vocabulary's tree whose nodes are the cells of descriptors
-_CELLS = 4  # that are asked for each descriptor
-_NEAR_BITS = 40  # of 256: descriptors of one landmark days apart; two landmarks differ by more, but for look-alikes
-_UNSEEN_LANDMARKS = 8.0  # that no place has: a place of few landmarks is not much like anything
-_MIN_INLIER_SHARE = 0.35  # of what is matched at a fix
+_LEVEL = 2  # level of the vocabulary's tree whose nodes are the cells of descriptors
+_CELLS = 4  # cells queried for each descriptor
+_NEAR_BITS = 40  # of 256: descriptors of one landmark days apart; all others but look-alikes differ by more
+_UNSEEN_LANDMARKS = 8.0  # added to the landmarks of every place: a place of few landmarks resembles nothing strongly
+_MIN_INLIER_SHARE = 0.35  # of the matches at a fix
 _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE = 3.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class CovisibleLandmarks:
-    """Landmarks that should be seen from a fix, because the survey saw them from next to it.
+    """Landmarks expected in view from a fix, because the survey saw them from nearby.
 
-    ids (E,), points_map (E, 3), descriptors (E, 32), and whether each was found (E,).
+    ids (E,), points_map (E, 3), descriptors (E, 32), and found (E,), True for matched ones.
     """
 
     ids: NDArray[np.uint32]
@@ -48,9 +48,9 @@ class CovisibleLandmarks:
 
 
 class LookAlikes(NamedTuple):
-    """What places outside a map have in common with it, as its build measured.
+    """Similarity of places outside a map to it, measured by its build.
 
-    recall: the landmark recall that one of them exceeds with a probability of at most max_wrong_share, 0 where none was like the map.
+    recall: the landmark recall that one of them exceeds with a probability of at most max_wrong_share, 0 if none resembled the map.
     """
 
     recall: float
@@ -60,8 +60,8 @@ class LookAlikes(NamedTuple):
 class MapView:
     """Landmarks (N) and places (K) of some tiles of one version.
 
-    Landmark arrays are as in Tile. survey_focal_px is that of the camera that made the map: a robot's lens sees the same corner at
-    the same scale from a distance that grows with its own focal length.
+    Landmark arrays are as in Tile. survey_focal_px is that of the camera that made the map: a robot sees the same corner at
+    the same scale from a distance proportional to its own focal length.
     """
 
     def __init__(self, tiles: Iterable[Tile], vocabulary: Vocabulary, survey_focal_px: float) -> None:
@@ -90,9 +90,9 @@ class MapView:
         return len(self.points_map)
 
     def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
-        """Places of whose landmarks, by the rarity of their words, the descriptors (N, 32) show the largest share, best first.
+        """Rank places by the share of their landmarks, weighted by word rarity, found among descriptors (N, 32), best first.
 
-        Not the similarity of the two: a map within a budget holds a tenth of what a robot sees, and what it lacks says nothing. Each
+        Not by symmetric similarity: a map within a budget holds a tenth of what a robot sees, and absence from it proves nothing. Each
         place counts for itself: added up over its neighbours, fewer right ones are among the first (docs/studies/recognition.md).
         """
         if not len(descriptors):
@@ -107,12 +107,12 @@ class MapView:
     def visible(
         self, map_from_cam: Array, camera: StereoCamera, margin_px: float, max_view_angle_rad: float
     ) -> VisibleLandmarks:
-        """The landmarks that a camera there should see, in its image widened by margin_px."""
+        """Landmarks expected in a camera's image widened by margin_px."""
         scale = camera.focal_px / self._survey_focal_px
         return visible_landmarks(self.cones, map_from_cam, camera, margin_px, max_view_angle_rad, scale)
 
     def fix_finder(self, camera: StereoCamera, settings: RelocalizerSettings) -> core.FixFinder:
-        """What finds fixes of a camera in this map."""
+        """Create the finder of fixes of a camera in this map."""
         counts = [len(rows) for rows in self.place_rows]
         return core.FixFinder(
             self.cones,
@@ -131,14 +131,14 @@ class MapView:
         )
 
     def neighbourhood(self, place: int) -> Rows:
-        """Rows of all landmarks of places near one place that look a similar way."""
+        """Rows of all landmarks of places near one place with a similar viewing direction."""
         map_from_place = self.map_from_cam[place]
         near = places_around(self.map_from_cam, map_from_place, _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
         return np.unique(self._shown[near[self._place_of_shown]])
 
 
 def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: Rows) -> Rows:
-    """Rows of landmark ids, `order` sorts all of them; those in tiles that are not held are left out."""
+    """Rows of landmark ids, `order` sorts all of them; ids in unloaded tiles are left out."""
     if not len(order):
         return np.zeros(0, np.int64)
     at = np.searchsorted(landmark_ids, ids, sorter=order)
@@ -147,10 +147,10 @@ def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: R
 
 
 class DescriptorIndex:
-    """Descriptors (M, 32) by the cell of a vocabulary's tree that is nearest to them.
+    """Index of descriptors (M, 32) by their nearest cell in a vocabulary's tree.
 
-    A word is too small a cell: of two pictures of a corner, taken days apart, half lie in different words. Sources: Sivic and
-    Zisserman 2003 on inverted files, Jegou, Douze and Schmid 2008 on asking several cells and comparing bits within them.
+    A word is too small a cell: half of the corners, imaged again days later, fall into a different word. Sources: Sivic and
+    Zisserman 2003 on inverted files, Jegou, Douze and Schmid 2008 on querying several cells and comparing bits within them.
     """
 
     def __init__(self, descriptors: Descriptors, vocabulary: Vocabulary) -> None:
@@ -162,7 +162,7 @@ class DescriptorIndex:
         self._starts = np.searchsorted(cells[self._order], np.arange(len(self._centres) + 1))
 
     def near(self, descriptors: Descriptors, max_bits: int) -> NDArray[np.bool_]:
-        """(M,) which held descriptors are within max_bits of any of some others (N, 32)."""
+        """(M,) True for indexed descriptors within max_bits of any query (N, 32)."""
         found = np.zeros(len(self._held), bool)
         is_near = core.near_descriptors(packed(descriptors), self._centres, _CELLS, self._held, self._starts, max_bits)
         found[self._order] = is_near
@@ -170,7 +170,7 @@ class DescriptorIndex:
 
 
 def _nodes_at(vocabulary: Vocabulary, level: int) -> NDArray[np.int64]:
-    """The nodes of a level of the tree and the leaves above it; the root where it has no children."""
+    """The nodes of a level of the tree and the leaves above it; the root if it has no children."""
     nodes, leaves = np.zeros(1, np.int64), np.zeros(0, np.int64)
     for _ in range(level):
         counts = vocabulary.child_count[nodes]

@@ -1,4 +1,4 @@
-"""One frame placed in the map: by projection where it nearly is, by the landmarks that it shows where it might be anywhere. Pure."""
+"""Relocalization of one frame: by projection near a predicted place, by recognized landmarks without a prediction. Pure."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,24 +19,24 @@ from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, Reloca
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import TimeSliced
 
-_RANKED = 8  # so many times as many places are ranked as are tried
+_RANKED = 8  # ratio of ranked to tried places
 _TRIALS_AT_A_PLACE = 2
-_SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no other place looks so much the same so near
+_SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no look-alike place is so near
 _MIN_RANSAC_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A verified place of one frame.
+    """A verified pose of one frame.
 
-    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers, and image_coverage: how many parts of the image
-    hold them; inlier_share: of what was matched at the end. matches (P, 2): features and landmarks, rows of the view, of the inliers.
+    map_from_cam (4, 4); cov_rot_trans (6, 6) in map axes, rotation first; inliers, and image_coverage: number of image cells
+    with inliers; inlier_share: of the final matches. matches (P, 2): features and landmarks, rows of the view, of the inliers.
 
-    landmark_recall: share of the landmarks seen by the survey from next to there that are inliers; 1 where none is expected.
-    expected, seen: how many landmarks that is a share of, and how many were found; 0 where none is expected.
-    alias_ratio: support of the best other place relative to this one; 1 where no other place was searched for.
-    covisible: the landmarks behind landmark_recall, None where the survey did not pass.
-    matched: all that was matched at the end, before any gate.
+    landmark_recall: share of inliers among the landmarks that the survey saw from nearby; 1 if none is expected.
+    expected, seen: numbers of these landmarks and of the found ones; 0 if none is expected.
+    alias_ratio: support of the best other place relative to this one; 1 if no other place was searched for.
+    covisible: the landmarks behind landmark_recall, None if the survey did not pass here.
+    matched: all final matches, before any gate.
     """
 
     map_from_cam: Array
@@ -63,12 +63,12 @@ class Relocalizer:
         self._finder = view.fix_finder(camera, settings)
 
     def extract(self, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
-        """The features of one frame, in slices: see `finished`; of a pair no depth is measured yet."""
+        """Extract the features of one frame, in slices (see `finished`); the depth of a pair is not measured yet."""
         features = yield from extract_in_slices(frame.left, self._settings.orb)
         return FrameFeatures.of(frame, features, self._camera, self._settings.stereo)
 
     def near(self, query: FrameFeatures, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
-        """The fix near a predicted place whose covariance (map axes) sets the search window; None where nothing agrees."""
+        """Find the fix near a predicted pose whose covariance (map axes) sets the search window; None without agreement."""
         radius = self._radius_px(map_from_cam, cov_rot_trans)
         if radius > self._settings.fix.max_radius_px:
             return None
@@ -82,15 +82,15 @@ class Relocalizer:
         found: Sequence[Fix] = (),
         failed: list[Array] | None = None,
     ) -> TimeSliced[list[Fix]]:
-        """Fixes of all places that look like this one and verify, best first, duplicates removed; a slice for each place.
+        """Find verified fixes at all similar places, best first, duplicates removed; a slice for each place.
 
-        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, where it is known. found: fixes of
-        this frame that are known already, returned with the others. A place at which a fix or failed trials already stand is not
-        tried again: it is made of the same landmarks. One further on is, since identical bays and aisles must be able to compete.
+        allowed (K,): places that may be considered. map_from_cam_rotation: the orientation, if known. found: fixes of
+        this frame that are already known, returned with the others. A place with a fix or failed trials already is not
+        tried again, since it has the same landmarks. Places farther away are, since identical bays and aisles must compete.
         The aliases of the best fix are tried in any case.
 
-        failed: map_from_cam of places that were tried in vain for earlier frames of this view; others are tried first, and those that
-        fail now are appended. Empty again once no others are left.
+        failed: map_from_cam of places that failed for earlier frames of this view; others are tried first, and those that
+        fail now are appended. Cleared once no others are left.
         """
         settings = self._settings.fix
         fixes = [fix for k, fix in enumerate(found) if _is_new(fix, found[:k])]
@@ -120,7 +120,7 @@ class Relocalizer:
         return sorted(fixes, key=lambda f: -f.inliers)
 
     def by_projection(self, query: FrameFeatures, map_from_cam: Array, radius_px: float) -> Fix | None:
-        """The fix by guided matching of all landmarks visible from a place, twice: wide, then narrow around the first answer."""
+        """Find the fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result."""
         place = np.ascontiguousarray(map_from_cam)
         found = self._finder.by_projection(query.packed(), query.unmeasured(), place, radius_px)
         if found is None:
@@ -147,7 +147,7 @@ class Relocalizer:
         )
 
     def _ranked(self, query: FrameFeatures, allowed: NDArray[np.bool_] | None, failed: list[Array]) -> Rows:
-        """The places to try, the most similar first; failed ones and what lies around several left out, unless no others are left."""
+        """Places to try, the most similar first; without failed ones and neighbourhoods of several failures, unless none else is left."""
         top = _RANKED * self._settings.fix.top_places
         if not failed:
             return self.view.similar_places(query.features.descriptors, allowed, top)
@@ -183,10 +183,10 @@ class Relocalizer:
         return None if fix is None else self._in_best_minimum(query, fix)
 
     def _in_best_minimum(self, query: FrameFeatures, fix: Fix) -> Fix:
-        """The fix, or the one that more of its own matches agree with.
+        """Return the fix, or another solution with which more of its own matches agree.
 
-        Landmarks that lie nearly in a plane allow a second pose, turned about it, which least squares do not leave; its covariance
-        says nothing of the first. Three points at a time find either. Source: Schweighofer and Pinz 2006, on the two minima.
+        Nearly coplanar landmarks allow a second pose, rotated about the plane, a local minimum of least squares; its covariance
+        does not include the first. Three-point solutions find both. Source: Schweighofer and Pinz 2006, on the two minima.
         """
         if fix.matched is None:
             return fix
@@ -203,7 +203,7 @@ class Relocalizer:
         return other if other is not None and other.inliers > fix.inliers else fix
 
     def _with_aliases(self, query: FrameFeatures, fixes: list[Fix]) -> TimeSliced[list[Fix]]:
-        """The fixes, and those at the aliases of the best one."""
+        """Return the fixes, and those at the aliases of the best one."""
         settings, view, best = self._settings.fix, self.view, fixes[0]
         if best.matches is None:
             return fixes
@@ -243,7 +243,7 @@ class Relocalizer:
         )
 
     def _matched(self, query: FrameFeatures, features: NDArray[np.int64], rows: Rows) -> Correspondences:
-        """Points (P, 3) of landmarks and the features that show them, whose place is not known."""
+        """Points (P, 3) of landmarks and their matching features, for an unknown camera pose."""
         settings = self._settings
         measured = query.measured(features, self._camera, settings.stereo)
         scale = orb.SCALE_FACTOR ** np.minimum(query.features.octaves[features], 5).astype(np.float64)
@@ -253,7 +253,7 @@ class Relocalizer:
         )
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
-        """Three sigmas of a landmark's predicted pixel, at the median distance of what should be visible."""
+        """Three sigmas of a landmark's predicted pixel, at the median distance of the expected landmarks."""
         depth = self._finder.median_distance_m(np.ascontiguousarray(map_from_cam))
         if np.isnan(depth):
             return np.inf
@@ -264,16 +264,16 @@ class Relocalizer:
 
 
 def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_INLIERS) -> bool:
-    """Whether a fix may name a place: not by few landmarks where most of what stands there should have been seen and was not.
+    """True if a fix may determine the place: not with few landmarks if most of those expected there were not seen.
 
-    Racks repeat: some landmarks of any agree with some of any other.
+    Racks repeat: some landmarks of any rack agree with some of any other.
     """
     has_recall = fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_recall
     return fix.inliers >= strong_inliers or has_recall
 
 
 def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:
-    """How many places have mostly the same neighbourhood as a camera."""
+    """Number of places with mostly the same neighbourhood as a camera."""
     if not places:
         return 0
     return int(places_around(np.stack(places), map_from_cam, _SAME_PLACE_M, _SAME_PLACE_COSINE).sum())

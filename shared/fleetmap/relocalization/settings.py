@@ -1,22 +1,22 @@
-"""Settings of relocalization: the same for a robot and for the server that judges what robots will see."""
+"""Settings of relocalization, shared by robots and by the server, which predicts the robots' results."""
 
 from typing import NamedTuple
 
 from fleetmap.config import Section
 from fleetmap.features.settings import OrbSettings, StereoSettings
 
-STRONG_INLIERS = 60  # of a fix that may name a place however many landmarks it lacks
+STRONG_INLIERS = 60  # inliers with which a fix may determine a place regardless of missing landmarks
 
 
 class FixSettings(Section, frozen=True):
-    """How one frame is placed in the map."""
+    """Settings for the fix of one frame."""
 
     min_inliers: int = 15  # of a pose
     min_cells: int = 6  # of the image with inliers
     min_recall: float = 0.13
     top_places: int = 8  # most similar places that are tried
-    top_places_found: int = 1  # the same while a pose is known that agrees
-    alias_votes_share: float = 0.2  # also try every place whose votes reach this share of the best one's
+    top_places_found: int = 1  # the same while a consistent pose is known
+    alias_votes_share: float = 0.2  # also try every place with at least this share of the best place's votes
     most_aliases: int = 64  # aliases that are tried
     max_distance: int = 75  # bits of 256
     ratio: float = 0.9  # best over second best distance
@@ -35,7 +35,7 @@ class FixSettings(Section, frozen=True):
 
 
 class RelocalizerSettings(NamedTuple):
-    """What a relocalizer needs: features, disparities, how a frame is placed, and the seed of its RANSAC."""
+    """Settings of a relocalizer: features, disparities, fixes, and the seed of its RANSAC."""
 
     seed: int = 0
     stereo: StereoSettings = StereoSettings()

@@ -15,7 +15,7 @@ SIGNED_AXES = [
 
 
 def axes_in_words(body_from_sensor: Array) -> str:
-    """What is wrong with a sensor that a signed permutation (3, 3) turns to the body's axes."""
+    """Describe the fault of a sensor whose axes a signed permutation (3, 3) rotates to the body's."""
     signs = np.diag(body_from_sensor)
     if not (np.abs(signs) == 1.0).all():
         return f"has its axes exchanged ({in_axes(body_from_sensor)})"

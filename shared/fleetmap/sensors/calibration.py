@@ -1,4 +1,4 @@
-"""Calibration of a robot's sensors: lenses, mounting, noise. Values only; reading files is the recordings' job."""
+"""Calibration of a robot's sensors: lenses, mounting, noise. Values only; `recordings` reads the files."""
 
 from dataclasses import dataclass, field
 
@@ -15,7 +15,7 @@ class CameraCalibration:
 
     model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy. body_from_cam (4, 4).
     imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu). line_delay_s: from
-    one row to the next of a rolling shutter, 0 for a global one; it is reported and not corrected.
+    one row to the next of a rolling shutter, 0 for a global one; reported, not corrected.
     """
 
     model: str
@@ -28,7 +28,7 @@ class CameraCalibration:
     line_delay_s: float = 0.0
 
     def __post_init__(self) -> None:
-        # Files are read by numpy, whose scalars no encoder knows.
+        # Values from files are numpy scalars, which encoders do not support.
         _set_numbers(self, int, "width_px", "height_px")
         _set_numbers(self, float, "imu_minus_cam_s", "line_delay_s")
 
@@ -64,7 +64,7 @@ NO_BASE = (
 class RigCalibration:
     """All sensors of one robot. Cameras left first; `imu` is None for a rig without one.
 
-    assumed: the names of the values here that nothing said, of `imu` and `base_from_body`.
+    assumed: names of values without a source, of `imu` and `base_from_body`.
     """
 
     cameras: tuple[CameraCalibration, ...]
@@ -74,7 +74,7 @@ class RigCalibration:
 
     @property
     def wheels_fault(self) -> str:
-        """Why wheels cannot be used, and what to do; empty where they can."""
+        """Reason why wheels cannot be used, with advice; empty if they can."""
         return NO_BASE if "base_from_body" in self.assumed else ""
 
 
@@ -84,7 +84,7 @@ def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> 
 
 
 def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:
-    """`camera` itself; raises CalibrationError naming the first value that cannot be right."""
+    """Return `camera`; raise CalibrationError naming the first invalid value."""
     if camera.model not in CAMERA_MODELS:
         raise CalibrationError(f"{name}: unknown camera model {camera.model!r}; known are {', '.join(CAMERA_MODELS)}")
     counts = CAMERA_MODELS[camera.model].distortion_counts

@@ -1,7 +1,7 @@
-"""Whether the images of a moving rig fit the lens of its calibration, or another lens far better.
+"""Check whether the images of a moving rig fit the lens of its calibration, or another lens far better.
 
-Points are followed from a frame to a later one. A right lens makes of them a scene that one motion explains; a wrong one bends the
-scene. A focal length that is wrong alone stretches it, which shows in turns, and hardly in straight drives.
+Points are tracked from a frame to a later one. With the right lens one rigid motion explains them; a wrong lens bends the
+scene. An error of the focal length alone stretches it, which shows in turns, but hardly in straight drives.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,10 +16,10 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
 
 _CORNERS, _LEAST_POINTS, _LEAST_ALL, _LEAST_MOTION_PX = 300, 20, 150, 1.0
-_MOST_ERROR_PX = 3.0  # an error counts as no more: of points that are followed wrongly or move by themselves
+_MOST_ERROR_PX = 3.0  # errors are clipped to this: wrongly tracked or moving points
 _NEAR_M, _FAR_M = 0.2, 60.0
-_GOOD_PX2, FITS_PX2 = 0.25, 2.0  # mean squared error: no lens would fit better; a lens that fits at all
-DOUBTFUL_RATIO = 1.7  # of squared errors: other lenses of a right calibration come to 1.5, as on straight drives
+_GOOD_PX2, FITS_PX2 = 0.25, 2.0  # mean squared errors: of a perfect fit; of an acceptable fit
+DOUBTFUL_RATIO = 1.7  # of squared errors: with a right calibration other lenses reach 1.5, on straight drives
 _PAIRS, _APART_S, _TOO_FAR_S = 8, 0.2, 0.6
 _MORE_OFTEN = 0.75  # of the pairs of frames
 _FACTORS = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0)
@@ -37,7 +37,7 @@ class FollowedPoints:
 
 @dataclass(frozen=True, slots=True)
 class LensFit:
-    """What a lens leaves: mean squared errors in px^2, each at most 9. other: in words, the lens that leaves best_px2."""
+    """Residuals of a lens: mean squared errors in px^2, each at most 9. other: description of the lens with best_px2."""
 
     given_px2: float
     best_px2: float
@@ -45,7 +45,7 @@ class LensFit:
 
     @property
     def ratio(self) -> float:
-        """How much more the given lens leaves than the best one; 1 if none is better."""
+        """Ratio of the residuals of the given lens and the best one; 1 if none is better."""
         return self.given_px2 / max(self.best_px2, 1e-9)
 
     @property
@@ -54,7 +54,7 @@ class LensFit:
         return self.ratio > DOUBTFUL_RATIO
 
     def words(self, camera: CameraCalibration) -> str:
-        """A sentence on the camera's lens, with what to do where another one fits better."""
+        """A sentence on the camera's lens, with advice if another one fits better."""
         given = f"{camera.model}, fx {camera.intrinsics_px[0]:.1f} px at {camera.width_px}x{camera.height_px}"
         if not self.is_doubtful:
             return f"the images fit the given lens ({given}; {np.sqrt(self.given_px2):.2f} px), no other one clearly better"
@@ -78,7 +78,7 @@ def lens_of_frames(rig: RigCalibration, stamps_ns: Stamps, read: Callable[[int],
 
 
 def follow_points(frame: CameraFrame, later: CameraFrame) -> FollowedPoints | None:
-    """Corners of the left image in the later one and, of a pair, in the right one; None where there are too few."""
+    """Track corners of the left image to the later one and, for a pair, to the right one; None if there are too few."""
     best = cv2.goodFeaturesToTrack(frame.left, _CORNERS, 0.01, 10)
     if best is None or (frame.right is None and frame.depth_m is None):
         return None
@@ -103,7 +103,7 @@ def follow_points(frame: CameraFrame, later: CameraFrame) -> FollowedPoints | No
 
 
 def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | None:
-    """How the given lens fits, and the best of others: other focal lengths, models, resolutions. None where nothing moves enough."""
+    """Compare the given lens with others (focal lengths, models, resolutions); None without enough motion."""
     if sum(len(points.left) for points in pairs) < _LEAST_ALL:
         return None
     motions_px = np.concatenate([np.linalg.norm(points.later - points.left, axis=1) for points in pairs])
@@ -122,7 +122,7 @@ def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | 
 
 
 def _followed(image: Image, other: Image, corners: NDArray[np.float32]) -> tuple[Array, NDArray[np.bool_]]:
-    """Places (N, 2) in the other image, and which of them lead back."""
+    """Pixels (N, 2) in the other image, and a mask of those that pass the backward check."""
 
     def follow(
         first: Image, second: Image, points: NDArray[np.float32]
@@ -163,7 +163,7 @@ def _scaled(rig: RigCalibration, factors: Array) -> RigCalibration:
 
 
 def _with_lens(rig: RigCalibration, model: str, distortion: Array | None) -> RigCalibration:
-    """distortion: None for the coefficients that the rig has, under the other name."""
+    """distortion: None to keep the rig's coefficients under the other name."""
     cameras = []
     for camera in rig.cameras:
         own = np.zeros(4)
@@ -177,12 +177,12 @@ def _is_possible(camera: CameraCalibration) -> bool:
 
 
 def _errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> Array:
-    """(K,) mean squared error of each pair of frames: where the points of the first lie in the later one, and in their own."""
+    """(K,) mean squared error of each pair of frames: pixels of the first frame's points in the later one, and in their own."""
     return np.array([_error_px2(rig, points) for points in pairs])
 
 
 def _smaller_errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints], given: Array) -> Array | None:
-    """(K,) as `_errors_px2`; None as soon as they cannot be smaller than `given` as often as another lens must be better."""
+    """(K,) as `_errors_px2`; None as soon as too few of them can be smaller than `given`."""
     errors = np.zeros(len(pairs))
     for number, points in enumerate(pairs, 1):
         errors[number - 1] = _error_px2(rig, points)
@@ -226,7 +226,7 @@ def _between_rays(left: Array, right: Array, rig: RigCalibration) -> Array:
 
 
 def _moved(scene: Array, seen: Array, within: float) -> Array | None:
-    """(N, 3) the scene in the later camera's axes; seen: (N, 2) on the plane z = 1. None where no motion explains it."""
+    """(N, 3) the scene in the later camera's axes; seen: (N, 2) on the plane z = 1. None if no motion explains it."""
     lens = np.eye(3)
     found, rotvec, shift, inliers = cv2.solvePnPRansac(
         scene, np.ascontiguousarray(seen), lens, None, iterationsCount=100, reprojectionError=0.7 * within

@@ -1,7 +1,7 @@
-"""Rectification of a rig with lenses to the camera that all geometry uses: a rectified pinhole pair.
+"""Rectification of a rig to the camera model of all geometry: a rectified pinhole pair.
 
 After rectification a point at (x, y, z) in `cam0` (rectified axes) is seen at u = f x/z + cx, v = f y/z + cy on the
-left and at u - f b/z on the right, same row. An RGB-D frame becomes the same thing with a baseline chosen here, a
+left and at u - f b/z on the right, same row. An RGB-D frame becomes such a pair with a baseline chosen here, a
 single camera has baseline 0.
 """
 
@@ -18,7 +18,7 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
-_MAX_ZOOM = 1.5  # beyond it one rig sees corners that the other cannot
+_MAX_ZOOM = 1.5  # beyond it the rigs do not see the same corners
 RGBD_BASELINE_M = 0.08  # a depth sensor's triangulation base: turns depth noise into disparity noise
 
 
@@ -35,7 +35,7 @@ class StereoCamera:
 
     @property
     def lens(self) -> Array:
-        """(4,) as the core takes it: focal, cx, cy, focal * baseline."""
+        """(4,) in the core's order: focal, cx, cy, focal * baseline."""
         return np.array([self.focal_px, self.cx_px, self.cy_px, self.focal_px * self.baseline_m])
 
     @property
@@ -51,7 +51,7 @@ class StereoCamera:
         return np.stack([u, v, u - self.focal_px * self.baseline_m / z], axis=1)
 
     def point_from_pixel(self, pixels: Array, disparities_px: Array) -> Array:
-        """(N, 3) points in `cam0` of left pixels (N, 2) with disparities (N,); not finite where the disparity is 0."""
+        """(N, 3) points in `cam0` of left pixels (N, 2) with disparities (N,); not finite if the disparity is 0."""
         with np.errstate(divide="ignore", invalid="ignore"):
             z = self.focal_px * self.baseline_m / disparities_px
             return np.stack(
@@ -62,7 +62,7 @@ class StereoCamera:
 
 @dataclass(frozen=True)
 class RectifiedFrame:
-    """A CameraFrame seen by the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor."""
+    """A CameraFrame rectified to the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor."""
 
     stamp_ns: int
     left: Image
@@ -71,12 +71,12 @@ class RectifiedFrame:
 
     @cached_property
     def half_left(self) -> Image:
-        """The left image at half size, smoothed; made once."""
+        """The left image at half size, smoothed; cached."""
         return _halved(self.left)
 
     @cached_property
     def half_right(self) -> Image:
-        """The right one of a pair."""
+        """The right image of a pair at half size."""
         assert self.right is not None
         return _halved(self.right)
 
@@ -87,10 +87,10 @@ def _halved(image: Image) -> Image:
 
 
 class Rectifier:
-    """Turns recorded frames of one rig into rectified ones; holds the look-up tables.
+    """Rectifies recorded frames of one rig; holds the look-up tables.
 
-    pinhole: the camera to rectify to, all but its baseline, so that rigs of one site see alike; one that suits the rig
-    without it. Raises CalibrationError where its focal length is too far from the rig's.
+    pinhole: the target camera without its baseline, common to the rigs of a site; one that suits the rig
+    if omitted. Raises CalibrationError if its focal length is too far from the rig's.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Rectifier:
             )
 
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
-        """The rectified frame; raises RecordingError where an image's size is not the calibration's."""
+        """Rectify a frame; raises RecordingError if an image's size differs from the calibration's."""
         left = self._remap(frame.left, 0, frame.stamp_ns)
         right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
         disparity = None
@@ -150,7 +150,7 @@ class Rectifier:
 
 
 def _rectifying_rotation(left: CameraCalibration, right: CameraCalibration) -> tuple[Array, float]:
-    """cam0_from_rect (3, 3) and the baseline: x along the baseline, z as near to both optical axes as that allows."""
+    """cam0_from_rect (3, 3) and the baseline: x along the baseline, z as near to both optical axes as possible."""
     cam0_from_cam1 = se3_inverse(left.body_from_cam) @ right.body_from_cam
     baseline_cam0 = cam0_from_cam1[:3, 3]
     baseline_m = float(np.linalg.norm(baseline_cam0))
@@ -188,7 +188,7 @@ def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
 
 @lru_cache(
     maxsize=4
-)  # those of two pairs: a build makes the rectifier of a recording for its checks, and again for its survey
+)  # tables of two pairs: a build creates the rectifier of a recording for its checks, and again for its survey
 def _remap_tables(
     rectified: StereoCamera,
     model: str,
@@ -197,7 +197,7 @@ def _remap_tables(
     distortion: tuple[float, ...],
     cam_from_rect: tuple[float, ...],
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
-    """Fixed-point look-up tables for cv2.remap, or None where the image is rectified already (as KITTI's are)."""
+    """Fixed-point look-up tables for cv2.remap, or None if the image is already rectified (as KITTI's are)."""
     u, v = np.meshgrid(
         np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64)
     )

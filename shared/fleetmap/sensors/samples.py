@@ -1,4 +1,4 @@
-"""Samples of sensors, as values. Stamps are `stamp_ns` on the sensor clock."""
+"""Sensor samples. Stamps are `stamp_ns` on the sensor clock."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -12,16 +12,14 @@ from fleetmap.geometry import Array, interpolate_se3
 
 Image = NDArray[np.uint8]
 Stamps = NDArray[np.int64]
-# A longer time without images is a pause, which no motion is carried through: with an accelerometer off by 0.03 m/s^2, as good ones of
-# robots are, a position drifts 1.5 m in 10 s and grows with the square of the time, and a speed says nothing of what comes after a stop.
+# A longer time without images is a pause, over which no motion is propagated: with an accelerometer error of 0.03 m/s^2, as good ones of
+# robots have, a position drifts 1.5 m in 10 s, growing with the square of the time, and a speed does not predict the motion after a stop.
 PAUSE_NS = 10_000_000_000
-INTEGRATED_NS = (
-    60_000_000_000  # inertial samples that are there may carry a motion for longer; in a minute that drift is 54 m
-)
+INTEGRATED_NS = 60_000_000_000  # complete inertial samples allow a longer time; the drift in a minute is 54 m
 
 
 class SensorSet(StrEnum):
-    """What a recording carries, recognised from its content."""
+    """Sensors of a recording, recognised from its content."""
 
     STEREO_INERTIAL = "stereo-inertial"
     STEREO = "stereo"
@@ -81,17 +79,17 @@ class WheelSample:
 
 
 def wheel_between(samples: Sequence[WheelSample], start_ns: int, end_ns: int) -> Sequence[WheelSample]:
-    """Those with start_ns <= stamp < end_ns of samples in order of their stamps."""
+    """Samples with start_ns <= stamp < end_ns, from samples in order of their stamps."""
     first = bisect_left(samples, start_ns, key=lambda sample: sample.stamp_ns)
     return samples[first : bisect_left(samples, end_ns, lo=first, key=lambda sample: sample.stamp_ns)]
 
 
 @dataclass(frozen=True, slots=True)
 class PositionPrior:
-    """A coarse place in `map` from a dock, tag, zone or operator.
+    """A coarse pose in `map` from a dock, tag, zone or operator.
 
-    map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown. is_revisable: from a person, who
-    may err: it takes the place of what the robot believed, and fixes may contradict it.
+    map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown. is_revisable: from an operator, who
+    may err: it replaces the robot's estimate, and fixes may contradict it.
     """
 
     stamp_ns: int
@@ -100,7 +98,7 @@ class PositionPrior:
     is_revisable: bool = False
 
 
-# What a person's pose leaves unsaid is not known exactly: roll pitch yaw (rad), x y z (m). Yaw, x and y are what RViz sends.
+# Default sigmas of an operator's pose: roll pitch yaw (rad), x y z (m). Yaw, x and y are those of RViz.
 UNSAID_SIGMAS = np.array([0.05, 0.05, np.radians(15.0), 0.5, 0.5, 0.25])
 
 
@@ -120,7 +118,7 @@ class Trajectory:
         return np.asarray(self.frame_from_body[:, :3, 3])
 
     def at(self, stamp_ns: int, max_gap_ns: int = 200_000_000) -> Array | None:
-        """Interpolated frame_from_body at `stamp_ns`; None outside, or inside a gap longer than `max_gap_ns`."""
+        """Interpolate frame_from_body at `stamp_ns`; None outside, or inside a gap longer than `max_gap_ns`."""
         index = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if index < len(self) and self.stamps_ns[index] == stamp_ns:
             return np.asarray(self.frame_from_body[index])
@@ -135,7 +133,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class DataIssue:
-    """Something that a recording should hold and does not: what, and how much in words."""
+    """A fault of a recording's data: its kind, and details as text."""
 
     what: str
     detail: str = field(default="")

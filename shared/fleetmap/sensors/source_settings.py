@@ -1,4 +1,4 @@
-"""Where sensors are read from, as configurations say it; apart from the code, so that reading one loads no library of a source."""
+"""Settings of sensor sources; separate from the code, so that reading them loads no library of a source."""
 
 from typing import Literal
 
@@ -6,7 +6,7 @@ from fleetmap.config import Section
 
 
 class SourceSection(Section, frozen=True):
-    """Kind of the sensor source, and its options; a kind ignores those of others. sensors: of topics, with the IMU if the rig has one."""
+    """Kind of the sensor source, and its options; a kind ignores options of others. sensors: of topics, with the IMU if the rig has one."""
 
     kind: str = "ros2"
     sensors: Literal["stereo", "rgbd", "mono"] = "stereo"
@@ -24,7 +24,7 @@ class SourceSection(Section, frozen=True):
 
 
 class Topics(Section, frozen=True):
-    """Topic names in MCAP files and ROS bags. An image topic also stands for itself with `/compressed` behind it."""
+    """Topic names in MCAP files and ROS bags. An image topic also matches itself followed by `/compressed`."""
 
     left: str = "/cam0/image_raw"
     right: str = "/cam1/image_raw"

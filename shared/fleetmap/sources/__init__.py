@@ -1,1 +1,1 @@
-"""Sensor sources of running robots and surveys, and the queue between them and who takes the frames."""
+"""Sensor sources of running robots and surveys, and the queue between them and the consumer of frames."""

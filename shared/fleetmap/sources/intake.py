@@ -1,6 +1,6 @@
-"""Bounded queue of sensor samples between the threads that receive them and the one that localizes.
+"""Bounded queue of sensor samples between the receiving threads and the localizing one.
 
-Stereo frames may drop, the oldest first, and are counted; inertial samples never do.
+Stereo frames may be dropped, the oldest first, and are counted; inertial samples never are.
 """
 
 import threading
@@ -15,15 +15,15 @@ from fleetmap.recordings.ordering import UNITS, wrong_unit
 from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 
-_IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
+_IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
 _ABSURD = 1e5
-_SET_BACK_NS = 1_000_000_000  # by more, a stamp is not one that was late on its way
-_STAYS_NS = 500_000_000  # for so long the older stamps must go on before it is the clock that was set
+_SET_BACK_NS = 1_000_000_000  # a stamp older by more than this is not due to a late arrival
+_STAYS_NS = 500_000_000  # duration of older stamps after which the clock counts as set back
 
 
 @dataclass
 class IntakeCounts:
-    """Samples received, and those dropped or refused. imu_late: frames that were handled without all of their IMU samples."""
+    """Counts of received, dropped and refused samples. imu_late: frames handled without all of their IMU samples."""
 
     frames: int = 0
     frames_dropped: int = 0
@@ -48,14 +48,14 @@ class _ImuQueue:
 
 
 class _Forward:
-    """Takes stamps that increase. After a pause the first one waits for a second that confirms it: a wrong one costs itself alone."""
+    """Accepts increasing stamps. After a pause the first one waits for confirmation by a second: a single wrong stamp is dropped alone."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._ahead_ns: int | None = None
 
     def takes(self, stamp_ns: int) -> bool:
-        """Whether the value with this stamp is taken."""
+        """True if the value with this stamp is accepted."""
         last_ns, ahead_ns, self._ahead_ns = self._last_ns, self._ahead_ns, None
         if last_ns is not None and stamp_ns <= last_ns:
             return False
@@ -69,10 +69,10 @@ class _Forward:
 
 
 class Intake:
-    """Put to from any thread; taken from by one. unreadable_why: the reason of the last message or picture that could not be read."""
+    """Queue with any number of producer threads and one consumer. unreadable_why: reason for the last unreadable message or image."""
 
     def __init__(self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float) -> None:
-        """frames: how many may wait. imu_wait_s: how long a frame waits for the inertial samples up to it."""
+        """frames: capacity. imu_wait_s: longest wait of a frame for the inertial samples up to it."""
         self.counts = IntakeCounts()
         self.unreadable_why = ""
         self._frames: deque[CameraFrame | StoredFrame] = deque()
@@ -89,7 +89,7 @@ class Intake:
         self._set_back = ""
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """A frame; the oldest that waits makes room. One that is not newer than all before, or alone far ahead, is refused and counted.
+        """Put a frame, dropping the oldest if full. A frame not newer than all before, or alone far ahead, is refused and counted.
 
         RecordingError for a stamp in another unit than the IMU's.
         """
@@ -112,7 +112,7 @@ class Intake:
             self._changed.notify_all()
 
     def put_imu(self, samples: ImuSamples) -> None:
-        """Inertial samples; what is not finite, absurd or not newer is refused and counted.
+        """Put inertial samples; those that are not finite, implausible or not newer are refused and counted.
 
         RecordingError for stamps in another unit than the frames'.
         """
@@ -137,51 +137,51 @@ class Intake:
             self._changed.notify_all()
 
     def put_wheel(self, sample: WheelSample) -> None:
-        """Wheel odometry; RecordingError for a stamp in another unit than the frames'."""
+        """Put wheel odometry; RecordingError for a stamp in another unit than the frames'."""
         with self._changed:
             _check_unit("wheel odometry", sample.stamp_ns, self._last_frame_ns)
             self._wheel.append(sample)
             del self._wheel[:-1000]
 
     def put_prior(self, prior: PositionPrior) -> None:
-        """A coarse place."""
+        """Put a coarse pose."""
         with self._changed:
             self._priors.append(prior)
             del self._priors[:-10]
 
     def put_forget(self) -> None:
-        """The robot is to forget its place, and priors that wait, and to search for itself from the next frame on."""
+        """Order the robot to forget its place and waiting priors, and to relocalize from the next frame on."""
         with self._changed:
             self._priors.clear()
             self._forget = True
 
     def count_unreadable(self, why: str) -> None:
-        """A message or picture that could not be read; the last reason is kept."""
+        """Count an unreadable message or image; the last reason is kept."""
         with self._changed:
             self.counts.unreadable += 1
             self.unreadable_why = why
 
     def finish(self) -> None:
-        """Ends the stream: no more samples will come."""
+        """End the stream: no more samples will come."""
         with self._changed:
             self._finished = True
             self._changed.notify_all()
 
     @property
     def exhausted(self) -> bool:
-        """Whether the stream has ended and everything was taken."""
+        """True if the stream has ended and everything was taken."""
         with self._changed:
             return self._finished and not self._frames
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """Whether a frame can be put without dropping another, at the latest after timeout_s."""
+        """Wait until a frame can be put without dropping another; False after timeout_s."""
         with self._changed:
             return self._changed.wait_for(lambda: len(self._frames) < self._limit, timeout_s)
 
     def take(self, timeout_s: float) -> SensorBundle:
-        """The oldest frame with the samples before it, once its inertial samples are there or have been waited for.
+        """Take the oldest frame with the samples before it, once its inertial samples have arrived or their wait is over.
 
-        RecordingError once the stamps have gone back to stay: nothing would be taken until they have caught up.
+        RecordingError once the stamps have permanently gone back: nothing would be accepted until they have caught up.
         """
         with self._changed:
             has_come = self._changed.wait_for(lambda: self._frames or self._finished or self._set_back, timeout_s)
@@ -203,7 +203,7 @@ class Intake:
             return SensorBundle(frame, imu, wheel, priors, forget)
 
     def _note_older(self, what: str, stamp_ns: int, last_ns: int) -> None:
-        """Notices stamps that go on from far before the last one. The caller holds the lock."""
+        """Detect stamps that continue from far before the last one. The caller holds the lock."""
         since_ns = self._older_since_ns.get(what)
         if last_ns - stamp_ns < _SET_BACK_NS:
             self._older_since_ns.pop(what, None)
@@ -217,12 +217,12 @@ class Intake:
             self._changed.notify_all()
 
     def _imu_is_there(self) -> bool:
-        """Up to the oldest frame, which may be another one than when the wait began."""
+        """True if the IMU samples reach the oldest frame, which may have changed since the wait began."""
         return self._finished or self._last_imu_ns >= self._frames[0].stamp_ns + self._offset_ns
 
 
 def _coarser_unit(stamp_ns: int, other_ns: int) -> int | None:
-    """The nanoseconds in the unit in which a stamp is another sensor's, to 1 %; None for nanoseconds and where none fits."""
+    """Nanoseconds per unit in which a stamp equals another sensor's, to 1 %; None for nanoseconds and if no unit fits."""
     return next((ns for ns in UNITS if stamp_ns > 0 and abs(stamp_ns * ns - other_ns) < 0.01 * other_ns), None)
 
 

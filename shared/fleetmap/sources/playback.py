@@ -1,4 +1,4 @@
-"""Playback of a recording in place of the robot's sensors."""
+"""Playback of a recording instead of the robot's sensors."""
 
 import time
 from collections.abc import Callable
@@ -10,11 +10,11 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.replay_source import ReplaySource
 
 _ROOM_WAIT_S = 0.1
-_LONGEST_GAP_S = 10.0  # between frames: a longer one, of days where a clock was set, is not waited for
+_LONGEST_GAP_S = 10.0  # between frames: a longer one, such as days after a change of the clock, is skipped
 
 
 class RecordingSource:
-    """Plays all frames once, `speed` times as fast as they were recorded; 0 plays as fast as they are taken and drops none."""
+    """Plays all frames once, at `speed` times the recorded rate; 0 plays as fast as they are consumed and drops none."""
 
     def __init__(self, recording: Recording, *, speed: float, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._recording, self._speed, self._clock_s = recording, speed, clock_s

@@ -11,7 +11,7 @@ from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample, wheel_between
 
-_IMU_LEAD_NS = 10_000_000  # a frame is handled when the IMU has come a little past it
+_IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
 
 
 @dataclass(frozen=True)
@@ -27,35 +27,35 @@ class ReplaySource:
 
     @classmethod
     def of(cls, recording: Recording, selection: FrameSelection, *, reverse: bool) -> "ReplaySource":
-        """Raises UsageError where nothing is selected."""
+        """Create the source; raises UsageError if nothing is selected."""
         indices = selection.apply(recording)
         return cls(recording, indices[::-1] if reverse else indices, reverse)
 
     @property
     def calibration(self) -> RigCalibration:
-        """The rig as it is played."""
+        """Calibration of the rig as played."""
         return replace(self.recording.calibration, imu=None) if self.reverse else self.recording.calibration
 
     def __len__(self) -> int:
         return len(self.indices)
 
     def played_stamp_ns(self, recorded_ns: int) -> int:
-        """The stamp under which a frame is played: mirrored at the last one when backwards."""
+        """Stamp at which a frame is played: mirrored at the last one when backwards."""
         if not self.reverse:
             return recorded_ns
         return 2 * int(self.recording.frame_stamps_ns[self.indices[0]]) - recorded_ns
 
     def recorded_stamp_ns(self, number: int) -> int:
-        """The stamp at which frame `number` of the play was taken."""
+        """Original stamp of frame `number` of the playback."""
         return int(self.recording.frame_stamps_ns[self.indices[number]])
 
     def frame(self, number: int) -> CameraFrame:
-        """Frame `number` of the play, decoded."""
+        """Frame `number` of the playback, decoded."""
         frame = self.recording.read_frame(int(self.indices[number]))
         return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns))
 
     def imu_before_each(self) -> Iterator[ImuSamples]:
-        """For each frame of the play, the IMU samples that come before it is handled."""
+        """For each frame of the playback, the IMU samples that arrive before it is handled."""
         fed_ns = -(2**62)
         offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
         for number in range(len(self)):
@@ -67,7 +67,7 @@ class ReplaySource:
             fed_ns = until_ns
 
     def priors_before(self, number: int) -> list[PositionPrior]:
-        """Coarse places in the recording between the frame before and frame `number`; none backwards."""
+        """Coarse poses in the recording between the frame before and frame `number`; none backwards."""
         if self.reverse:
             return []
         since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
@@ -83,6 +83,6 @@ class ReplaySource:
         return wheel_between(self.recording.wheel, since + 1, until + 1)
 
     def truth_map_from_body(self, number: int) -> Array | None:
-        """The recording's ground truth at frame `number`, None where there is none."""
+        """The recording's ground truth at frame `number`, None if absent."""
         truth = self.recording.ground_truth
         return None if truth is None else truth.at(self.recorded_stamp_ns(number))

@@ -18,19 +18,19 @@ from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.intake import Intake
 
 _IDLE_S = 1.0
-_WAITING_IMAGES = 8  # of each side, for their partner
+_WAITING_IMAGES = 8  # images of each side waiting for their partner
 Take = Callable[[Intake, bool, bytes], None]
 
 
 class StereoPairs:
-    """Frames of two streams whose stamps are within the tolerance of one rig; what finds no partner is counted."""
+    """Pairs the images of two streams whose stamps are within the tolerance of one rig; images without a partner are counted."""
 
     def __init__(self) -> None:
         self._waiting: dict[str, deque[tuple[int, StoredImage]]] = {"left": deque(), "right": deque()}
         self.unpaired = 0
 
     def add(self, side: str, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
-        """The frame that `image` completes, None while its partner is missing. side: left or right."""
+        """Add an image; return the frame that it completes, None while its partner is missing. side: left or right."""
         others = self._waiting["right" if side == "left" else "left"]
         partner = min(others, key=lambda item: abs(item[0] - stamp_ns), default=None)
         if partner is None or abs(partner[0] - stamp_ns) > PAIR_TOLERANCE_NS:
@@ -49,7 +49,7 @@ class StereoPairs:
 
 
 class Ros2Source:
-    """Subscribes to the topics, to image topics also as image_transport sends them; the key names the type of a message."""
+    """Subscribes to the topics, to image topics also in image_transport's variants; the key names the type of a message."""
 
     def __init__(
         self,
@@ -62,14 +62,14 @@ class Ros2Source:
         has_depth: bool = False,
         map_frame: str = "map",
     ) -> None:
-        """images: False takes everything but images, which come from another source. has_depth: depth images in place of the right ones.
+        """images: False takes everything but images, which come from another source. has_depth: depth images instead of right ones.
 
-        A calibration of one camera takes left images alone. map_frame: the frame of priors; those in another one are refused.
+        A calibration of one camera takes only left images. map_frame: the frame of priors; those in another frame are refused.
         """
         self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
-        self._grey_peak = 0  # of images of 16 bits, until one shows that they have more than 12
+        self._grey_peak = 0  # used bits of 16-bit images, until one has more than 12
         self._topics: list[tuple[str, Take]] = [
             (topics.wheel, _take_wheel),
             (topics.prior, partial(_take_prior, map_frame)),
@@ -94,7 +94,7 @@ class Ros2Source:
                 handle.close()
 
     def subscribe(self, intake: Intake) -> list[Handle]:
-        """Subscriptions that put samples into the intake, until they are closed."""
+        """Subscribe; samples go to the intake until the subscriptions are closed."""
         return [
             self._bus.subscribe(self._layout.subscription(topic), partial(self._handle, intake, take))
             for topic, take in self._topics
@@ -112,7 +112,7 @@ class Ros2Source:
             )
             take(intake, is_compressed, payload)
         except (ValueError, FleetmapError) as error:
-            # An unreadable message is skipped; the health report has their number.
+            # An unreadable message is skipped; the health report counts them.
             intake.count_unreadable(str(error))
 
     def _take_image(self, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Input of one step of a robot: a frame and the other samples that came up to it. Pure."""
+"""Input of one step of a robot: a frame and the other samples up to it. Pure."""
 
 from dataclasses import dataclass, field
 
@@ -8,7 +8,7 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Whe
 
 @dataclass(frozen=True, slots=True)
 class SensorBundle:
-    """A frame, None where none came in time, and the samples to handle before it. forget: first, what was believed of the place."""
+    """A frame, None if none came in time, and the samples to handle before it. forget: first reset the pose estimate."""
 
     frame: CameraFrame | StoredFrame | None = None
     imu: ImuSamples = field(default_factory=ImuSamples.empty)

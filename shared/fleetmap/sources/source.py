@@ -20,16 +20,16 @@ from fleetmap.sources.uvc import UvcSource
 
 
 class Source(Protocol):
-    """Sensors. calibration: of the rig; has_depth: for a depth camera in place of a second one."""
+    """Sensors. calibration: of the rig; has_depth: for a depth camera instead of a second one."""
 
     calibration: RigCalibration
     has_depth: bool
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        """Puts samples into the intake until there are no more or `wait`, which sleeps for so many seconds, says to stop."""
+        """Put samples into the intake until they end or `wait`, which sleeps for the given seconds, returns that it must stop."""
 
     def close(self) -> None:
-        """Closes files and connections."""
+        """Close files and connections."""
 
 
 def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Source:
@@ -79,9 +79,9 @@ SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {
 
 
 def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") -> Source:
-    """The source that the section asks for; map_frame: the only one in which ROS 2 topics may give position priors.
+    """Open the source configured in the section; map_frame: the only accepted frame of position priors on ROS 2 topics.
 
-    UsageError for an unknown kind or what it lacks, RecordingError and CalibrationError for files that cannot be used.
+    UsageError for an unknown kind or a missing option, RecordingError and CalibrationError for unusable files.
     """
     if section.kind not in SOURCES:
         raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(SOURCES)}")

@@ -1,4 +1,4 @@
-"""A UVC stereo camera that delivers both pictures side by side, through OpenCV; IMU and wheels come as ROS 2 topics."""
+"""A UVC stereo camera that delivers both images side by side, through OpenCV; IMU and wheels come as ROS 2 topics."""
 
 import time
 from collections.abc import Callable
@@ -20,9 +20,9 @@ _CLOCKS_AGREE_S = 1.0
 class UvcSource:
     """Frames of a side-by-side camera, stamped on the clock of the topics.
 
-    A frame's stamp is that of its driver where it has one on the monotonic clock, as Linux's has, else that of its arrival; and in
-    both cases minus delay_s, which is measured once for a camera (half its exposure and, by arrival, its transfer). A camera that
-    is unplugged is opened again until it is back.
+    A frame's stamp is the driver's if it uses the monotonic clock, as Linux's does, else the arrival time; in
+    both cases minus delay_s, measured once for a camera (half its exposure and, for the arrival time, its transfer). A camera that
+    is unplugged is reopened once it is back.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class UvcSource:
         monotonic_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """section: the pictures that are asked for, width_px x height_px together. topics: of the other sensors, None for none."""
+        """section: requested size of both images together, width_px x height_px. topics: of the other sensors, None for none."""
         self._open, self._section, self._topics = open_capture, section, topics
         self._monotonic_s, self._wall_ns = monotonic_s, wall_ns
         self.calibration, self.has_depth = calibration, False
@@ -60,14 +60,14 @@ class UvcSource:
             self._topics.close()
 
     def _read_frames(self, capture: cv2.VideoCapture, intake: Intake, wait: Callable[[float], bool]) -> None:
-        """Until the camera is gone or it is time to stop."""
+        """Read frames until the camera is gone or a stop is requested."""
         if not capture.isOpened():
             return
         for prop, value in (
             (cv2.CAP_PROP_FRAME_WIDTH, self._section.width_px),
             (cv2.CAP_PROP_FRAME_HEIGHT, self._section.height_px),
             (cv2.CAP_PROP_FPS, self._section.rate_hz),
-            (cv2.CAP_PROP_BUFFERSIZE, 1),  # of several, the oldest would come first
+            (cv2.CAP_PROP_BUFFERSIZE, 1),  # with several, the oldest would come first
         ):
             capture.set(prop, value)
         while not wait(0.0):
@@ -87,7 +87,7 @@ class UvcSource:
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:
-    """The left and right half of a picture (H, 2 W) or (H, 2 W, 3), grey; RecordingError for anything else."""
+    """Split an image (H, 2 W) or (H, 2 W, 3) into its left and right half, grey; RecordingError for anything else."""
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[1] % 2 or not picture.size:
         reason = f"the camera sent {picture.dtype} of shape {picture.shape}; two pictures side by side are expected"
         raise RecordingError(reason)

@@ -1,6 +1,6 @@
-"""What a robot and its server say to each other about the robot's certificate: the bundle, the question for a new one, the answer.
+"""Enrolment and renewal of a robot's certificate: the bundle, the request for a new certificate, the reply.
 
-The robot's key never leaves it. Who asks proves with the last key (the bundle's at first) that the new one may take its place.
+The robot's key never leaves it. The old key (the bundle's at first) signs a request, which proves that the new one may replace it.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ _Bytes = Annotated[bytes, msgspec.Meta(max_length=4_000)]
 
 
 class Bundle(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Everything that a robot needs to enrol, once. servers and own: PEM; own: key and certificate; root: the TUF root."""
+    """Everything that a robot needs for its enrolment. servers and own: PEM; own: key and certificate; root: the TUF root."""
 
     format: Literal[1]
     site: Name
@@ -45,7 +45,7 @@ class RenewalRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RenewalAnswer(msgspec.Struct, frozen=True, kw_only=True):
-    """certificate: of the new key; servers: who may sign servers' certificates from now on; both PEM."""
+    """certificate: of the new key; servers: authorities of servers' certificates from now on; both PEM."""
 
     certificate: _Pem
     servers: _Pem
@@ -53,7 +53,7 @@ class RenewalAnswer(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Renewal:
-    """A request that is proven. The fingerprints are SHA-256 of public keys; new_key is DER."""
+    """A verified request. The fingerprints are SHA-256 of public keys; new_key is DER."""
 
     old_fingerprint: str
     new_fingerprint: str
@@ -71,7 +71,7 @@ class CertificateInfo:
 
 
 def decode_bundle(data: bytes) -> Bundle:
-    """The bundle in a file's bytes; UsageError for anything else."""
+    """Decode a bundle file; UsageError for anything else."""
     try:
         return msgspec.json.decode(data, type=Bundle)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -81,13 +81,13 @@ def decode_bundle(data: bytes) -> Bundle:
 
 
 def new_key() -> bytes:
-    """A private key, PEM."""
+    """Create a private key, PEM."""
     key = ec.generate_private_key(ec.SECP256R1())
     return key.private_bytes(s.Encoding.PEM, s.PrivateFormat.PKCS8, s.NoEncryption())
 
 
 def renewal_request(old_pem: bytes, new_pem: bytes) -> bytes:
-    """The encoded question for a certificate of a new key; both PEM, what else is in them does not matter."""
+    """Encode a request for the certificate of a new key; both PEM, other PEM blocks are ignored."""
     old, new = _private(old_pem), _private(new_pem)
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "the server decides")])
     csr = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(new, hashes.SHA256()).public_bytes(_DER)
@@ -96,7 +96,7 @@ def renewal_request(old_pem: bytes, new_pem: bytes) -> bytes:
 
 
 def check_request(payload: bytes) -> Renewal:
-    """What is proven by a request; LinkError for one that proves nothing."""
+    """Verify a request; LinkError if its proof is invalid."""
     asked = decode_message(payload, RenewalRequest)
     try:
         csr, old = x509.load_der_x509_csr(asked.csr), s.load_der_public_key(asked.old_key)
@@ -112,7 +112,7 @@ def check_request(payload: bytes) -> Renewal:
 
 
 def certificate_info(pem: bytes) -> CertificateInfo:
-    """About the first certificate in PEM; UsageError where there is none."""
+    """Info on the first certificate in PEM; UsageError if there is none."""
     try:
         certificate = x509.load_pem_x509_certificate(pem)
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)

@@ -1,4 +1,4 @@
-"""The signed list of one site as values: which versions robots may run. Whether its signatures hold is not looked at here. Pure."""
+"""The signed list of one site as values: versions that robots may run. Does not verify signatures. Pure."""
 
 from datetime import datetime
 from typing import Annotated, Literal
@@ -11,9 +11,9 @@ from fleetmap.mapformat.names import check_name
 
 
 class VersionState(msgspec.Struct, frozen=True, kw_only=True):
-    """The `custom` field of a target. state: what the version is for its site; archive: the whole survey, for the next build.
+    """The `custom` field of a target. state: of the version in its site; archive: the whole survey, for the next build.
 
-    files: addresses of what the site keeps beside its versions, by kind (`fleetmap.mapformat.building`): it may change while the
+    files: addresses of the site's further files, by kind (`fleetmap.mapformat.building`): they may change while the
     version stays.
     """
 
@@ -35,7 +35,7 @@ class _Target(msgspec.Struct, frozen=True):
 
 
 class AdmittedVersion(msgspec.Struct, frozen=True):
-    """A version that robots may run: its manifest's address and size, and what the version is for its site."""
+    """A version that robots may run: its manifest's address and size, and its state in the site."""
 
     sha256: str
     length: int
@@ -53,29 +53,29 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class SiteList(msgspec.Struct, frozen=True):
-    """What the site's role signed. serial: counts its lists."""
+    """Content signed by the site's role. serial: counts its lists."""
 
     serial: int
     expires: datetime
     admitted: tuple[AdmittedVersion, ...]
 
     def state(self, name: str) -> AdmittedVersion | None:
-        """The version that is `current`, `previous` or on `trial`; None where none is."""
+        """The version that is `current`, `previous` or on `trial`; None if none is."""
         return next((entry for entry in self.admitted if entry.about.state == name), None)
 
 
 def site_role(site: str) -> str:
-    """Name of the role that signs a site's list. Not the bare name, because a site may be called `root` or `snapshot`."""
+    """Name of the role that signs a site's list. Prefixed, because a site may be named `root` or `snapshot`."""
     return f"site-{check_name(site, 'site')}"
 
 
 def manifest_target(site: str, version: int | str) -> str:
-    """Path of a version's manifest among what is signed; '*' for any version."""
+    """Path of a version's manifest among the signed targets; '*' for any version."""
     return f"{site}/{version}/manifest.json"
 
 
 def read_site_list(data: bytes, site: str) -> SiteList:
-    """The list in the bytes of `N.site-SITE.json`; UntrustedError for one that names what no list of the site can."""
+    """Read the list in the bytes of `N.site-SITE.json`; UntrustedError for a list with invalid targets."""
     try:
         signed = msgspec.json.decode(data, type=_File).signed
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""The robot's side of signed lists: what may be run, how old the last word of the server is, and what a wrong clock may not change."""
+"""The robot's side of signed lists: allowed versions, age of the last verified lists, and protection against wrong clocks."""
 
 import fcntl
 import logging
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from fleetmap.bus import Bus
 
 Ask = Callable[[str], bytes | None]
-"""The bytes of a file of the signed lists, None where the server says that it has none; UnreachableError where nobody answers."""
+"""Returns the bytes of a file of the signed lists, None if the server reports that it is absent; UnreachableError without a reply."""
 
 FIRST_ROOT = "1.root.json"
 _MAX_ROOT_BYTES = 64_000
-_TIMESTAMP_S = 86_400.0  # how long a timestamp lasts from the moment in which it is signed
-_CLOCK_EVERY_S = 600.0  # how old the clock on the disk may become: it is not written at every question
+_TIMESTAMP_S = 86_400.0  # validity of a timestamp after its signature
+_CLOCK_EVERY_S = 600.0  # largest age of the clock on the disk: it is not written at every query
 _log = logging.getLogger(__name__)
 
 
@@ -40,7 +40,7 @@ class _File(msgspec.Struct, frozen=True):
 
 
 class _Clock(NamedTuple):
-    """heard_s: when the last word came, by the robot's clock; signed_s: when timestamp `number` was signed. Seconds since 1970."""
+    """heard_s: time of the last verified lists by the robot's clock; signed_s: signature time of timestamp `number`. Seconds since 1970."""
 
     heard_s: float
     signed_s: float
@@ -48,20 +48,20 @@ class _Clock(NamedTuple):
 
 
 class TrustedMap:
-    """Which versions of a site may be run. `refresh` asks; without a fresh word nothing new may be run, and what runs goes on.
+    """Versions of a site that may be run. `refresh` updates; without fresh lists no new version may start, a running one continues.
 
-    The folder belongs to one robot and site: files of python-tuf's client, and `clock`: when the last word came, by the robot's clock,
-    and which timestamp it was and when that was signed. A robot's clock before that moment cannot make expired lists valid again; one
-    far ahead makes all lists expired, until it is right again. Where a later timestamp was signed at an earlier moment, the server's
-    clock was wrong and is not any more: numbers decide what is later, not clocks.
+    The folder belongs to one robot and site: files of python-tuf's client, and `clock`: time of the last verified lists by the robot's
+    clock, with number and signature time of the timestamp. A robot's clock before that time cannot make expired lists valid again; one
+    far ahead makes all lists expired, until it is right again. If a later timestamp was signed at an earlier time, the server's
+    clock was wrong and has been corrected: numbers define the order, not clocks.
     """
 
     def __init__(
         self, folder: Path, site: str, root: bytes | None, ask: Ask, wall_s: Callable[[], float] = time.time
     ) -> None:
-        """root: bytes of the trusted root; None pins the one that is met first, for a server on the same machine.
+        """root: bytes of the trusted root; None pins the first one received, for a server on the same machine.
 
-        A folder that cannot be used is no fresh word: `admitted` raises it, until it can be.
+        Without a usable folder no list is fresh: `admitted` raises the reason until it is usable.
         """
         self._folder, self._site, self._ask, self._wall_s = folder, check_name(site, "site"), ask, wall_s
         self._pinned_root, self._is_first_use = root, root is None
@@ -85,7 +85,7 @@ class TrustedMap:
         self._is_open = True
 
     def refresh(self) -> None:
-        """Asks the server for its lists. Why they cannot be had or believed is raised by `admitted`, not here."""
+        """Fetch the server's lists. Errors of fetching and verification are raised by `admitted`, not here."""
         try:
             if not self._is_open:
                 self._open()
@@ -101,9 +101,9 @@ class TrustedMap:
             self._fault = fault
 
     def admitted(self, wanted: WantedVersion) -> AdmittedVersion:
-        """The entry of a version by its number and manifest's address.
+        """Return the entry of a version by its number and manifest's address.
 
-        Raises UntrustedError where the lists do not name it or are not fresh, UnreachableError where nobody answered for them.
+        Raises UntrustedError if the lists do not contain it or are not fresh, UnreachableError if the server did not reply.
         """
         if self._list is None and self._fault is None:
             self.refresh()
@@ -125,14 +125,14 @@ class TrustedMap:
 
     @property
     def files(self) -> dict[str, str] | None:
-        """Addresses of what the site keeps beside its versions, by kind; None without a fresh word on it."""
+        """Addresses of the site's further files, by kind; None without fresh lists."""
         if self._list is None or self._fault is not None or not self._list.admitted:
             return None
         return self._list.admitted[-1].about.files
 
     @property
     def word_hours(self) -> float | None:
-        """Hours since the server last proved what may be run; None if it never did."""
+        """Hours since the last verified lists; None if there were none."""
         return None if self._clock.heard_s == 0 else max(0.0, self._wall_s() - self._clock.heard_s) / 3600
 
     def _with_next_step(self, error: UntrustedError) -> UntrustedError:
@@ -175,7 +175,7 @@ class TrustedMap:
             self._sync(before)
 
     def _check_delegated(self) -> None:
-        """A site that nobody signs for any more keeps its last list in the folder, where python-tuf does not look at it."""
+        """Refuse a site without a signing key: its last list stays in the folder, and python-tuf does not check it."""
         data = msgspec.json.decode((self._folder / "targets.json").read_bytes())
         roles = (data["signed"].get("delegations") or {}).get("roles", [])
         if site_role(self._site) not in {role["name"] for role in roles}:
@@ -194,13 +194,13 @@ class TrustedMap:
         return self._pinned_root
 
     def _files(self) -> dict[Path, bytes]:
-        """What is kept; every file is small."""
+        """Content of the folder; every file is small."""
         names = [*self._folder.glob("*.json"), *self._folder.glob("root_history/*.json"), *self._folder.glob("clock")]
         return {path: path.read_bytes() for path in names if not path.is_symlink()}
 
     def _read_clock(self) -> _Clock:
         try:
-            # Before, the file had the first value alone, and robots whose clock had been ahead waited for that moment.
+            # Older versions stored only the first value, and robots whose clock had been ahead waited until that time.
             heard, signed, number = [*(self._folder / "clock").read_text("ascii").split(), "0", "0"][:3]
             return _Clock(max(0.0, float(heard)), max(0.0, float(signed)), int(number))
         except (FileNotFoundError, ValueError):
@@ -209,7 +209,7 @@ class TrustedMap:
     def _sync(self, before: dict[Path, bytes]) -> None:
         """python-tuf renames without fsync: after a power cut the guard against rollback would be gone.
 
-        before: what was on the disk already.
+        before: content already on the disk.
         """
         changed = [path for path, data in self._files().items() if before.get(path) != data]
         for path in [*changed, *sorted({path.parent for path in changed})]:
@@ -217,7 +217,7 @@ class TrustedMap:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Programs of one machine that share a cache take turns."""
+        """Lock a cache shared by programs of one machine."""
         with (self._folder / "lock").open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
@@ -228,7 +228,7 @@ def _time(seconds: float) -> str:
 
 
 def ask_over(bus: "Bus", site: str, robot: str, timeout_s: float = 5.0) -> Ask:
-    """Asks the server on a bus. A file must come in one answer, so that nobody can make a robot wait for it byte by byte."""
+    """Fetch from the server over a bus. A file must come in one reply, so that no server can delay a robot byte by byte."""
 
     def ask(name: str) -> bytes | None:
         answer = bus.get(robot_key(site, robot, f"trust/{name}"), encode_message(ChunkRequest()), timeout_s=timeout_s)

@@ -1,6 +1,6 @@
-"""The update of a folder of signed lists by python-tuf's client, which follows the client workflow of the TUF specification.
+"""Update of a folder of signed lists by python-tuf's client, which follows the client workflow of the TUF specification.
 
-Slow to import (150 ms): only where a list is fetched.
+Slow to import (150 ms): import it only to fetch a list.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,9 +30,9 @@ CLIENT_LIMITS = UpdaterConfig(
 
 
 class ListFetcher(FetcherInterface):
-    """Fetches by a function that returns the bytes of a file, None where the other side says that it has none.
+    """Fetches with a function that returns the bytes of a file, None if the server reports that it is absent.
 
-    Only that ends the chain of roots. Silence must not: it would make an old root the newest one.
+    Only such a report ends the chain of roots. A missing reply must not: it would make an old root the newest one.
     """
 
     def __init__(self, ask: Callable[[str], bytes | None]) -> None:
@@ -55,17 +55,17 @@ class ListFetcher(FetcherInterface):
 
 
 def update_lists(folder: Path, site: str, root: bytes, ask: Callable[[str], bytes | None]) -> None:
-    """Brings root, timestamp, snapshot, targets and the site's list in `folder` up to date. What was verified stays if this fails.
+    """Update root, timestamp, snapshot, targets and the site's list in `folder`. Verified files stay if this fails.
 
-    root: the one that is trusted from the beginning; the folder's own is not believed without it.
+    root: the initially trusted root; the folder's own root is not trusted without it.
 
-    Raises UntrustedError for what must not be believed, UnreachableError and other errors of `ask`, OSError of the disk.
+    Raises UntrustedError for invalid lists, UnreachableError and other errors of `ask`, OSError of the disk.
     """
     fetcher = ListFetcher(ask)
     try:
         updater = Updater(str(folder), "bus://trust/", fetcher=fetcher, config=CLIENT_LIMITS, bootstrap=root)
         updater.refresh()
-        # A role comes with a target of it alone; nobody has a version 0.
+        # python-tuf loads a role only with one of its targets; version 0 never exists.
         updater.get_targetinfo(manifest_target(site, 0))
     except ExpiredMetadataError as error:
         raise UntrustedError("freeze", error) from error

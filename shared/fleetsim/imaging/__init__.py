@@ -1,1 +1,1 @@
-"""Image pipelines: what lens, sensor, image processor and codec of other cameras make of the renderer's pictures."""
+"""Image pipelines: effects of lens, sensor, image processor and codec of other cameras on rendered images."""

@@ -15,7 +15,7 @@ _WHITE = 255.0
 _ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 # Exponents of the tone curves that tint the grey scene: warm lights, cold shadows, so that edges are coloured as well.
 _TINT_EXPONENTS = {"red": 0.9, "green": 1.0, "blue": 1.15}
-# What a sensor's dyes pass of white light; the white balance divides by it, and noise grows with the division.
+# Share of white light that a sensor's dyes transmit; the white balance divides by it, which amplifies noise.
 _DYE_SHARE = {"red": 0.6, "green": 1.0, "blue": 0.5}
 _LUMA = {"red": 0.299, "green": 0.587, "blue": 0.114}
 
@@ -62,7 +62,7 @@ def bayer(picture: Grey, gain: float, rng: np.random.Generator) -> Grey:
         site = share[row::2, column::2] ** np.float32(_TINT_EXPONENTS[colour]) * np.float32(_WHITE)
         dye = np.float32(_DYE_SHARE[colour])
         mosaic[row::2, column::2] = sensor_noise(site * dye, gain, rng) / dye
-    # 16 bits with an offset hold noise below black, and what white balance lifts above white.
+    # 16 bits with an offset hold noise below black, and values above white after white balance.
     raw = np.rint(np.clip(mosaic * np.float32(64.0) + np.float32(8192.0), 0.0, 65535.0)).astype(np.uint16)
     colours = cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2RGB).astype(np.float32)
     luma = sum(np.float32(weight) * colours[..., k] for k, weight in enumerate(_LUMA.values()))
@@ -76,12 +76,12 @@ def gamma(picture: Grey, exponent: float) -> Grey:
 
 
 def sharpen(picture: Grey, amount: float, sigma_px: float) -> Grey:
-    """Unsharp mask: edges overshoot by `amount` of what a blur of sigma_px takes away."""
+    """Unsharp mask: edges overshoot by `amount` times the difference to a blur of sigma_px."""
     return picture + np.float32(amount) * (picture - lens_blur(picture, sigma_px))
 
 
 def rescale(picture: Grey, factor: float) -> Grey:
-    """The picture as if it had been made `factor` times as large and brought to its size by bicubic interpolation."""
+    """The image as captured at `factor` times its size and resized by bicubic interpolation."""
     height, width = picture.shape
     other = max(8, round(width * factor)), max(8, round(height * factor))
     there = cv2.resize(picture, other, interpolation=cv2.INTER_CUBIC)
@@ -142,7 +142,7 @@ def find_pipeline(name: str) -> ImagePipeline:
 
 
 def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int) -> CameraFrame:
-    """The frame as cameras with that pipeline give it; noise follows from seed, stamp and camera alone."""
+    """Apply a pipeline to a frame; noise depends on seed, stamp and camera alone."""
     if pipeline == ImagePipeline():
         return frame
     pictures = [

@@ -1,1 +1,1 @@
-"""Routes, splines, and how a robot's body moves."""
+"""Routes, splines, and motion of a robot's body."""

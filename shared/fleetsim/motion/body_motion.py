@@ -148,8 +148,8 @@ LIFT_M, LIFT_S = 0.5, 1.0
 
 
 class CarriedMotion:
-    """Several motions one after another. Between two of them hands lift the robot by LIFT_M within LIFT_S, and set it down as fast at the
-    start of the next: it sees and feels that, and nothing of the way between. Its wheels stand."""
+    """Several motions in sequence. Between two of them the robot is lifted by hand by LIFT_M within LIFT_S, and set down as fast at the
+    start of the next: its sensors measure both, but nothing of the transport between. Its wheels stand still."""
 
     def __init__(self, motions: Sequence[RouteMotion]) -> None:
         self._motions = list(motions)
@@ -176,7 +176,7 @@ class CarriedMotion:
         return gyro, force + self._height(times_s, 2)[:, None] * up_body
 
     def velocity_body(self, times_s: Array) -> Array:
-        """As RouteMotion.velocity_body of the piece in force, as the wheels know it: they do not feel the lift."""
+        """As RouteMotion.velocity_body of the piece in force, as measured by wheels, without the lift."""
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
     def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:

@@ -108,7 +108,7 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
     durations = np.concatenate([[route.rest_s], STEP_M / (0.5 * (speed[1:] + speed[:-1]))])
     for index, wait_s in stops.items():
         durations[index] += wait_s
-    # A wait lengthens the step before its place, which would be driven slowly: hold the place with a second sample.
+    # A wait would lengthen the step before it, which would be driven slowly: a second sample holds the position.
     times = np.cumsum(durations)
     held = np.array(sorted(stops), np.int64)
     waits = np.array([stops[int(index)] for index in held])

@@ -31,7 +31,7 @@ class Optics:
 
 
 def make_optics(camera: CameraCalibration) -> Optics:
-    """The optics of a calibrated camera. Raises CalibrationError where its lens sees nothing that can be painted."""
+    """The optics of a calibrated camera. Raises CalibrationError if no pixel has a ray that can be painted."""
     height, width = camera.height_px, camera.width_px
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
     if camera.model == "radial-tangential" and not np.any(camera.distortion):

@@ -1,4 +1,4 @@
-"""The stereo pair's renderer: one thread per camera, exposure, faults that spoil pictures."""
+"""The stereo pair's renderer: one thread per camera, exposure, image faults."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +24,7 @@ _PERSON_AHEAD_M = 0.8
 
 @dataclass(frozen=True, slots=True)
 class StereoShot:
-    """A pair as it is recorded, and the truth of the left picture."""
+    """A recorded pair, and the ground truth of the left image."""
 
     left: Image
     right: Image
@@ -46,7 +46,7 @@ class RenderOptions:
 
 
 class StereoRenderer:
-    """Renders what a rig sees while it moves through a world. Its two threads end with `close`."""
+    """Renders the images of a rig moving through a world. Its two threads end with `close`."""
 
     def __init__(self, world: World, rig: RigCalibration, motion: Motion, options: RenderOptions) -> None:
         self._world, self._rig, self._motion = world, rig, motion
@@ -62,7 +62,7 @@ class StereoRenderer:
         self._last_right: Image | None = None
 
     def close(self) -> None:
-        """Ends the threads."""
+        """End the threads."""
         self._workers.shutdown()
 
     def path(self, camera: int) -> Callable[[float], Array]:
@@ -75,7 +75,7 @@ class StereoRenderer:
         return map_from_cam
 
     def exposure(self, t_s: float) -> Exposure:
-        """Exposure that the automatic control has chosen."""
+        """Exposure chosen by the automatic control."""
         moments = np.maximum(t_s - 0.25 * np.arange(5), 0.0)
         map_from_cam = self._motion.map_from_body(moments) @ self._rig.cameras[0].body_from_cam
         places, forward = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]

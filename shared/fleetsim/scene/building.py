@@ -42,7 +42,7 @@ class HallMaker:
         return column * layout.chunk_length_m, y_min, x_max, y_max
 
     def add_chunk(self, builder: FaceBuilder, column: int, row: int) -> None:
-        """Everything of the hall that lies in the chunk."""
+        """Add all parts of the hall in the chunk."""
         self._add_floor_quad(builder, self.rectangle(column, row), 0.0, self._textures.concrete, row)
         self._add_markings(builder, column, row)
         self._add_walls(builder, column, row)
@@ -70,7 +70,7 @@ class HallMaker:
         return mix(self._seed, _TAG_HALL, column, 0 if self._layout.are_aisles_identical else row, number) >> 40
 
     def _offset_texels(self, x_m: float, y_m: float, row: int) -> tuple[float, float]:
-        """Concrete's texels at a floor quad's corner, so that tiles meet; per aisle where aisles are identical."""
+        """Concrete's texels at a floor quad's corner, so that tiles join seamlessly; per aisle if aisles are identical."""
         base = self._layout.margin_m + row * self._layout.pitch_m if self._layout.are_aisles_identical else 0.0
         return x_m / TEXEL_M, (self._layout.width_m + 10.0 - (y_m - base)) / TEXEL_M
 

@@ -77,7 +77,7 @@ class Surface(NamedTuple):
 class FaceBuilder:
     """Collects boxes and single faces, then makes `Faces` of them all at once.
 
-    stretched: textures that fill a face whatever its size. texture_sizes (T, 2): log2 width and height.
+    stretched: textures that fill a face of any size. texture_sizes (T, 2): log2 width and height.
     """
 
     texture_sizes: NDArray[np.int32]

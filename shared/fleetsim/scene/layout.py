@@ -11,12 +11,12 @@ Rectangle = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max in m
 class Layout(Section, frozen=True):
     """Parallel aisles along x, rack rows on both sides of each, open ground at both ends.
 
-    dock_m: further ground at low x, with packing stations between the docks and the racks. cross_bays: bays that every row leaves
-    out, so that they make cross aisles.
+    dock_m: further ground at low x, with packing stations between the docks and the racks. cross_bays: bays omitted in
+    every row, which form cross aisles.
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
     floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
-    restock_per_day: share of slots. moved_rows: rack rows that stand elsewhere than the plan says: number, and metres along y.
+    restock_per_day: share of slots. moved_rows: rack rows that deviate from the plan: number, and metres along y.
     """
 
     aisles: int = 3
@@ -80,7 +80,7 @@ class Layout(Section, frozen=True):
 
     @property
     def rack_runs(self) -> list[tuple[int, int]]:
-        """What lies between cross aisles of a rack row: its first bay, and the bay behind its last one."""
+        """Runs of a rack row between cross aisles: first bay, and the bay after the last one."""
         edges = pairwise((-1, *sorted(self.cross_bays), self.bays))
         return [(before + 1, behind) for before, behind in edges if behind > before + 1]
 

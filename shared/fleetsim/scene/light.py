@@ -29,7 +29,7 @@ class Exposure:
 
 
 class LampField:
-    """All lamps of a site, for questions about the light at a place without a ray."""
+    """All lamps of a site, to compute the light at a place without tracing rays."""
 
     def __init__(self, lamps: list[Lamp], floor_area_m2: float) -> None:
         self._places = np.array([(lamp.x_m, lamp.y_m, lamp.z_m) for lamp in lamps]).reshape(-1, 3)

@@ -69,7 +69,7 @@ MOVER_KINDS = {
 
 @dataclass(frozen=True, slots=True)
 class Mover:
-    """A thing that goes round the closed polyline `stations_map` (x, y) for ever; with two stations to and fro."""
+    """A mover that follows the closed polyline `stations_map` (x, y) endlessly; with two stations back and forth."""
 
     kind: str
     stations_map: tuple[tuple[float, float], ...]
@@ -93,13 +93,13 @@ class Mover:
 
 @dataclass(frozen=True, slots=True)
 class Apparition:
-    """A mover whose place is given by a function of time; None while it is not there."""
+    """A mover placed by a function of time; None while absent."""
 
     kind: str
     place_at: Callable[[float], tuple[float, float, float] | None]
 
     def place(self, t_s: float) -> tuple[float, float, float]:
-        """x, y, yaw in map at t; far below the floor while it is not there."""
+        """x, y, yaw in map at t; far below the floor while absent."""
         return self.place_at(t_s) or (-1e4, -1e4, 0.0)
 
 
@@ -107,7 +107,7 @@ AnyMover = Mover | Apparition
 
 
 def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Textures, t_s: float) -> Array:
-    """Adds the movers as they stand at t; their soft shadows (M, 3): x, y, 1 / radius^2."""
+    """Add the movers at time t; return their soft shadows (M, 3): x, y, 1 / radius^2."""
     materials = {f"cloth{number}": cloth for number, cloth in enumerate(textures.cloth)}
     materials |= {"vest": textures.vest, "grey": textures.grey, "dark": textures.dark, "hazard": textures.hazard}
     materials |= {"wood": textures.wood, "goods": textures.skus[3].front}
@@ -123,7 +123,7 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
 
 
 def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
-    """Light samples of the movers' faces: the floor's light where each stands, by side."""
+    """Light samples of the movers' faces: the floor's light at each one's place, by side."""
     boxes_of = [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers]
     of_box = np.repeat(np.array(floor_light), boxes_of)
     per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]

@@ -17,7 +17,7 @@ class RackMaker:
         self._layout, self._textures, self._seed, self._day = layout, textures, seed, day
 
     def add_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
-        """Everything of one bay: the frame at its low x (and high x for the last one of a run), shelves, labels, goods."""
+        """Add one bay: the frame at its low x (and high x for the last one of a run), shelves, labels, goods."""
         self._add_frame(builder, row, bay)
         if bay == self._layout.bays - 1 or bay + 1 in self._layout.cross_bays:
             self._add_frame(builder, row, bay + 1)
@@ -27,7 +27,7 @@ class RackMaker:
             self._add_goods(builder, Slot(row, bay, level))
 
     def add_plain_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
-        """The bay as seen from afar: one block of cartons per slot, beams, posts."""
+        """Add a bay for distant views: one block of cartons per slot, beams, posts."""
         layout, textures = self._layout, self._textures
         x, y = layout.bay_x_m(bay), layout.row_y_m(row)
         depth = layout.rack_depth_m / 2
@@ -48,7 +48,7 @@ class RackMaker:
             builder.add_box(centre, half, surface, sides=NO_BOTTOM, is_solid=False)
 
     def add_end_guards(self, builder: FaceBuilder, row: int, bay: int, *, is_far_end: bool) -> None:
-        """The hazard-striped guard where a run ends, at the low x of a bay, with a poster on the frame where the site has landmarks."""
+        """The hazard-striped guard where a run ends, at the low x of a bay, with a poster on the frame if the site has landmarks."""
         layout, textures = self._layout, self._textures
         x = layout.bay_x_m(bay) + (0.12 if is_far_end else -0.12)
         y, half = layout.row_y_m(row), layout.rack_depth_m / 2
@@ -88,7 +88,7 @@ class RackMaker:
                 y += sku.width_m + rng.uniform(0.05, 0.4)
 
     def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
-        """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot does."""
+        """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot."""
         layout, textures = self._layout, self._textures
         rng = slot_generator(layout, self._seed, self._day, Slot(layout.rows + number, 0, 0))
         pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
@@ -105,7 +105,7 @@ class RackMaker:
                 builder.add_box(centre, half, surface, yaw_rad=yaw)
 
     def _scramble(self, tag: int, row: int, *rest: int) -> int:
-        """Bits for the dirt of a fixed thing; the same in every aisle where aisles are identical."""
+        """Bits for the dirt of a fixed thing; the same in every aisle if aisles are identical."""
         return mix(self._seed, tag, row % 2 if self._layout.are_aisles_identical else row, *rest) >> 40
 
     def _add_frame(self, builder: FaceBuilder, row: int, bay: int) -> None:

@@ -44,7 +44,7 @@ def last_restock_day(layout: Layout, seed: int, day: int, slot: Slot) -> int:
 
 
 def slot_generator(layout: Layout, seed: int, day: int, slot: Slot) -> np.random.Generator:
-    """The generator that decides the slot's content on `day`: the same until the slot is restocked.
+    """Random generator of the slot's content on `day`: the same until the slot is restocked.
 
     With identical aisles a slot that was never restocked has the content of its fellow in every other aisle.
     """

@@ -1,7 +1,7 @@
 """A site on one day, built and lit chunk by chunk as the robot comes near.
 
 A chunk is one aisle wide and about four bays long. Near the camera chunks are detailed and lit with shadows, far away
-plain. What a chunk looks like depends on site, seed and day alone, never on the order in which chunks were visited.
+plain. A chunk's look depends on site, seed and day alone, never on the order of visits.
 """
 
 from collections import OrderedDict
@@ -58,7 +58,7 @@ class Scene:
 
 
 class World:
-    """One site with one day's stock. `workers` bake light; without them the caller does."""
+    """One site with one day's stock. `workers` bake light; without them the calling thread does."""
 
     def __init__(
         self, layout: Layout, *, seed: int = 0, day: int = 0, workers: ThreadPoolExecutor | None = None

@@ -1,1 +1,1 @@
-"""Robots, their sensors, and what goes wrong with them."""
+"""Robots, their sensors, and sensor faults."""

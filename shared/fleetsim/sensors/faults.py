@@ -1,4 +1,4 @@
-"""Things that go wrong, by name and time. To add one: a line in FAULTS and its effect below."""
+"""Faults, by name and time. To add one: a line in FAULTS and its effect below."""
 
 from dataclasses import dataclass
 
@@ -31,12 +31,12 @@ class Fault:
     end_s: float
 
     def covers(self, time_s: float) -> bool:
-        """Whether it is in force."""
+        """True if it is active."""
         return self.start_s <= time_s < self.end_s
 
 
 def parse_fault(text: str) -> Fault:
-    """The fault written as NAME@START+DURATION, seconds; UsageError otherwise."""
+    """Parse a fault written as NAME@START+DURATION, seconds; UsageError otherwise."""
     name, _, times = text.partition("@")
     start, _, duration = times.partition("+")
     if name not in FAULTS:
@@ -58,11 +58,11 @@ class FaultPlan:
     faults: tuple[Fault, ...] = ()
 
     def has(self, name: str, time_s: float) -> bool:
-        """Whether a fault of that name is in force."""
+        """True if a fault of that name is active."""
         return any(fault.name == name and fault.covers(time_s) for fault in self.faults)
 
     def spoil_imu(self, samples: ImuSamples) -> ImuSamples:
-        """The samples without those in gaps and with spikes: one sample of 20 rad/s and 60 m/s^2 per fault."""
+        """Remove samples in gaps and insert spikes: one sample of 20 rad/s and 60 m/s^2 per fault."""
         times = (samples.stamps_ns - START_NS) * 1e-9
         gyro, accel = samples.gyro_radps.copy(), samples.accel_mps2.copy()
         for fault in self.faults:

@@ -16,7 +16,7 @@ def stamps_from_s(times_s: Array) -> Stamps:
 
 
 def sample_times(duration_s: float, rate_hz: float) -> Array:
-    """Times from 0 to the end, both included where they fit."""
+    """Times from 0 to the end, both included if they fit."""
     return np.arange(int(np.floor(duration_s * rate_hz + 1e-9)) + 1) / rate_hz
 
 
@@ -45,7 +45,7 @@ def measure_wheels(
 ) -> tuple[WheelSample, ...]:
     """Wheel odometry of the base, height_m straight below the body: scale errors of this robot, noise per sample.
 
-    Wheels cannot feel sideways slip: they report 0 to the left, whatever the motion does.
+    Wheels cannot measure sideways slip: they always report 0 to the left.
     """
     times = sample_times(motion.duration_s, errors.rate_hz)
     velocity, (gyro, _) = motion.velocity_body(times), motion.rates(times)

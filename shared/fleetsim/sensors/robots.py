@@ -46,7 +46,7 @@ class WheelErrors:
 class HiddenErrors:
     """Errors that the calibration does not contain.
 
-    imu_minus_cam_s: of both cameras. turn_rad, shift_m: of each camera by itself, in a direction of its own.
+    imu_minus_cam_s: of both cameras. turn_rad, shift_m: of each camera separately, in its own direction.
     """
 
     imu_minus_cam_s: float = 0.0
@@ -61,7 +61,7 @@ class RobotKind:
     The IMU is the body, straight above the base; cameras sit baseline_m apart around their mount.
 
     pitch_rad: cameras look down by this.
-    hidden: by how much the true mounting and clock differ from the calibration.
+    hidden: differences between the true mounting and clock and the calibration.
     """
 
     limits: Limits
@@ -97,7 +97,7 @@ ROBOTS = {
 
 
 def nominal_calibration(kind: RobotKind) -> RigCalibration:
-    """Calibration as the robot knows it."""
+    """Nominal calibration, as used by the robot."""
     model, distortion, focal_share = LENSES[kind.lens]
     focal = focal_share * kind.width_px
     intrinsics = np.array([focal, focal, (kind.width_px - 1) / 2, (kind.height_px - 1) / 2])

@@ -1,4 +1,4 @@
-"""All textures in one flat store with their mip pyramids: what shading reads."""
+"""All textures in one flat store with their mip pyramids, the input of shading."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Letters, bar codes and noise for the textures: our own glyphs, because a library's change with its version."""
+"""Letters, bar codes and noise for the textures: own glyphs, because those of libraries change between versions."""
 
 from functools import lru_cache
 
@@ -31,7 +31,7 @@ _GLYPHS = {character: _glyph(character) for character in _ROWS}
 
 
 def write_text(image: Texture, x: int, y: int, text: str, dot: int, grey: float) -> None:
-    """Writes `text` with its top left at (x, y), `dot` texels per font dot; what does not fit is cut off."""
+    """Writes `text` with its top left at (x, y), `dot` texels per font dot; text that does not fit is cut off."""
     if not (0 <= x < image.shape[1] and 0 <= y < image.shape[0]):
         return
     dots = np.concatenate([_GLYPHS.get(character, _GLYPHS[" "]) for character in text.upper()], axis=1)
@@ -62,7 +62,7 @@ def noise(
     width = width or height
     spectrum = np.fft.fft2(rng.standard_normal((height, width))) * _gain(height, width, octaves, persistence)
     filtered = np.fft.ifft2(spectrum).real
-    # Rounded coarsely: the last bits of a Fourier transform depend on the machine, those of a texture must not.
+    # Rounded coarsely: the last bits of a Fourier transform depend on the machine, textures must not.
     return np.asarray(np.round(filtered / filtered.std(), 4), np.float32)
 
 

@@ -37,7 +37,7 @@ def _paint_skus(rng: np.random.Generator, atlas: AtlasBuilder) -> tuple[Sku, ...
 
 
 class Textures:
-    """Numbers of a site's textures in `atlas`, painted from its seed. `stretched` are those that fill their face whatever its size."""
+    """Numbers of a site's textures in `atlas`, painted from its seed. `stretched` are those that fill a face of any size."""
 
     def __init__(self, seed: int, aisles: int, *, are_aisles_identical: bool) -> None:
         """Identical aisles all carry the same sign and rack labels."""
@@ -75,5 +75,5 @@ class Textures:
 
 @lru_cache(maxsize=4)
 def paint_textures(seed: int, aisles: int, *, are_aisles_identical: bool = False) -> Textures:
-    """Every texture of a site with `aisles` aisles, painted once for all days and robots of the site, who only read them."""
+    """Every texture of a site with `aisles` aisles, painted once for all days and robots of the site; read-only."""
     return Textures(seed, aisles, are_aisles_identical=are_aisles_identical)

@@ -19,8 +19,8 @@ from fleetmap.sensors.samples import ImuSamples, WheelSample
 class InvariantFilter(core.Filter):
     """Keeps the current state and a window of past body transforms (clones) with their joint covariance.
 
-    Without an IMU the state moves by `predict_random_walk` instead of `propagate`; velocity and biases are then idle. `covariance`
-    weighs and gates measurements; `true_error_cov` is what is reported, see `core.Filter`.
+    Without an IMU the state moves by `predict_random_walk` instead of `propagate`; velocity and biases are then unused. `covariance`
+    weighs and gates measurements; `true_error_cov` is reported, see `core.Filter`.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class InvariantFilter(core.Filter):
         cameras: Sequence[tuple[StereoCamera, Array]],
         true_error_cov: Array | None = None,
     ) -> None:
-        """nav_covariance (15, 15) in the filter's error; true_error_cov: that of the true error, where it differs.
+        """nav_covariance (15, 15) in the filter's error; true_error_cov: covariance of the true error, if different.
 
         cameras: each with its body_from_cam (4, 4).
         """
@@ -46,15 +46,15 @@ class InvariantFilter(core.Filter):
 
     @property
     def state(self) -> NavState:
-        """A copy of the state as it is now."""
+        """A copy of the current state."""
         return NavState(*self.nav_state())
 
     def propagate(
         self, imu: ImuSamples, start_ns: int, end_ns: int, noise: ImuNoise, true_noise: ImuNoise | None = None
     ) -> Array:
-        """Moves the state from start_ns to end_ns; returns the last angular rate (3,), bias removed.
+        """Move the state from start_ns to end_ns; return the last angular rate (3,), bias removed.
 
-        noise weighs the prediction; true_noise, where it differs, goes into true_error_cov.
+        noise weighs the prediction; true_noise, if different, goes into true_error_cov.
         """
         judged = densities(noise), densities(true_noise or noise)
         return self.predict_inertial(imu.stamps_ns, imu.gyro_radps, imu.accel_mps2, int(start_ns), int(end_ns), *judged)

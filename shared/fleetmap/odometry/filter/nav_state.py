@@ -1,4 +1,4 @@
-"""The state that odometry estimates, and what it begins with."""
+"""State of the odometry, and its initial value."""
 
 from dataclasses import dataclass, field
 
@@ -24,11 +24,11 @@ class NavState:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
-        """In this order."""
+        """All fields, in order."""
         return self.rotation, self.velocity_mps, self.position_m, self.gyro_bias_radps, self.accel_bias_mps2
 
     def copy(self) -> "NavState":
-        """One that shares no array with this one."""
+        """A deep copy."""
         return NavState(*(np.array(values, np.float64, order="C") for values in self.arrays))
 
 

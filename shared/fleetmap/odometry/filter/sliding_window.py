@@ -1,4 +1,4 @@
-"""The window of frames that odometry estimates over: the filter, its clones, and the observations that tie them."""
+"""Sliding window of the odometry: the filter, its clones, and the observations that link them."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from fleetmap.sensors.rectification import StereoCamera
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
 _CAMERA = 0  # the only one of a rig yet
-# The filter contradicts the images where it takes less than that share of so many tracks that were due in so many updates.
+# The filter contradicts the images if it accepts less than this share of so many tracks that were due in so many updates.
 _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryRig:
-    """The rectified camera on its body, and what the calibration says of the other sensors.
+    """The rectified camera on its body, and the calibration of the other sensors.
 
     body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures.
     """
@@ -47,11 +47,11 @@ class SlidingWindow:
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
         self.contradicts_images = False
-        self._judged = deque[NDArray[np.int8]](maxlen=_JUDGED_UPDATES)  # tracks that were taken or refused
-        self._refused_frames = 0  # in a row, since the filter refused tracks and took none
+        self._judged = deque[NDArray[np.int8]](maxlen=_JUDGED_UPDATES)  # accepted and refused tracks
+        self._refused_frames = 0  # in a row in which the filter refused tracks and accepted none
         settings = rig.settings.filter
         true_error_cov = settings.real_start_share**2 * covariance
-        if rig.imu is not None:  # the mean of a steady gyro is far better than what it is weighed by
+        if rig.imu is not None:  # the mean of a steady gyro is far more accurate than its weight
             true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
             true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
         self.filter = InvariantFilter(state, covariance, settings, [(rig.camera, rig.body_from_cam)], true_error_cov)
@@ -65,7 +65,7 @@ class SlidingWindow:
         window.scene_depth_m = self.scene_depth_m
         return window
 
-    # --- what it knows ---
+    # --- queries ---
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """As `Odometry.motion_since`."""
@@ -87,7 +87,7 @@ class SlidingWindow:
         return since if kept == frame_index else frame_from_kept @ since
 
     def _kept(self, frame_index: int) -> tuple[int, Array]:
-        """The frame that stands for one that was dropped, and frame_from_kept (4, 4); for any other that frame itself."""
+        """The kept frame that represents a dropped one, and frame_from_kept (4, 4); for a kept frame itself."""
         kept_from_frame = np.eye(4)
         while frame_index in self._merged:
             frame_index, kept_from_earlier = self._merged[frame_index]
@@ -95,13 +95,13 @@ class SlidingWindow:
         return frame_index, se3_inverse(kept_from_frame)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """(4, 4) from a frame's camera to the one at the state; None where the frame is not kept."""
+        """(4, 4) from a frame's camera to the current one; None if the frame is not kept."""
         if frame_index not in self.filter.clone_ids:
             return None
         return self.filter.cam_from_earlier(frame_index, self.rig.cam_from_body)
 
     def matched_body(self, tracked: Tracked) -> tuple[int, Array] | None:
-        """After a gap: the best matched clone and odom_from_body (4, 4) as vision measured it since then."""
+        """After a gap: the best matched clone and odom_from_body (4, 4) by vision since then."""
         best = next((e for e in tracked.earlier if e.frame_index in self.filter.clone_ids), None)
         if best is None:
             return None
@@ -110,24 +110,24 @@ class SlidingWindow:
         return best.frame_index, np.asarray(odom_from_cam @ self.rig.cam_from_body)
 
     def seconds_since(self, frame_index: int) -> float:
-        """From a frame that is kept to the state."""
+        """Time from a kept frame to the state."""
         return (self.stamp_ns - self._stamps_ns[frame_index]) * 1e-9
 
     def seconds_between(self, earlier_index: int, later_index: int) -> float:
-        """Between two frames that are kept."""
+        """Time between two kept frames."""
         return (self._stamps_ns[later_index] - self._stamps_ns[earlier_index]) * 1e-9
 
     # --- one frame ---
 
     def seed(self, frame_index: int, tracked: Tracked) -> None:
-        """Begins an empty window with one frame; the tracks go on from it alone."""
+        """Start an empty window with one frame; the tracks continue from it."""
         self._add_clone(frame_index)
         self.filter.observe(frame_index, _CAMERA, tracked.ids, tracked.pixels)
 
     def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
-        """Adds a frame at the state and uses tracks that ended, that are due in their turn, or (after a gap) all.
+        """Add a frame at the state and use the tracks that ended, those that are due, or (after a gap) all.
 
-        Every observation serves exactly once. Returns what `core.Filter.update` does.
+        Every observation is used exactly once. Returns the result of `core.Filter.update`.
         """
         self._add_clone(frame_index)
         self._observe(frame_index, tracked)
@@ -158,7 +158,7 @@ class SlidingWindow:
 
     @property
     def _first_depth_m(self) -> float:
-        """Where to look for a point without disparity first."""
+        """Initial depth of a point without disparity."""
         return _FAR_DEPTH_M
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
@@ -174,7 +174,7 @@ class SlidingWindow:
         return camera.focal_px * camera.baseline_m / middle(known) if len(known) else _UNKNOWN_DEPTH_M
 
     def _prune(self) -> None:
-        """Drops the second newest clone where the robot hardly moved since the one before, else the oldest."""
+        """Drop the second newest clone if the robot hardly moved since the one before, else the oldest."""
         settings = self.rig.settings.filter
         self._merged.clear()
         while len(self.filter.clone_ids) >= settings.clones:

@@ -1,4 +1,4 @@
-"""Alignment of visual odometry with an IMU: gyro bias, gravity, accelerometer bias, velocities, and the scale where it is open.
+"""Alignment of visual odometry with an IMU: gyro bias, gravity, accelerometer bias, velocities, and the scale if unknown.
 
 Sources: Mur-Artal and Tardos 2017 (linear alignment), Qin et al. 2018 (gravity on a sphere).
 """
@@ -15,14 +15,14 @@ from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 
-_MAX_BIAS_SIGMAS = 6.0  # an accelerometer bias beyond it means that something else was fitted
+_MAX_BIAS_SIGMAS = 6.0  # a larger accelerometer bias indicates a wrong fit
 
 
 @dataclass(frozen=True, slots=True)
 class VisualMotion:
     """K views in axes of vision: rotations (K, 3, 3) vision_from_body, positions (K, 3) positions_m + scale * unscaled.
 
-    unscaled (K, 3) is None where vision has metres. Sigmas are those of one interval's position and velocity;
+    unscaled (K, 3) is None if vision is metric. Sigmas are those of one interval's position and velocity;
     gravity_weights are those of the first, linear step.
     """
 
@@ -36,7 +36,7 @@ class VisualMotion:
 
     @property
     def unknowns(self) -> int:
-        """Before the velocities in `solve`'s order: gravity's direction (2), accelerometer bias (3), scale where it is open."""
+        """Number of unknowns before the velocities, in this order: gravity's direction (2), accelerometer bias (3), scale if unknown."""
         return 5 if self.unscaled is None else 6
 
 
@@ -44,7 +44,7 @@ class VisualMotion:
 class Alignment:
     """Gravity's direction (3,) in axes of vision with a basis (3, 2) across it, biases (3,), and the last step's result.
 
-    solution (n,), covariance (n, n): direction (2), accelerometer bias (3), scale where it was open, velocities (3 each).
+    solution (n,), covariance (n, n): direction (2), accelerometer bias (3), scale if unknown, velocities (3 each).
     """
 
     direction: Array
@@ -64,14 +64,14 @@ def align(
     gravity_slack: float,
     steps: int,
 ) -> Alignment | None:
-    """The alignment after so many Gauss-Newton steps; None where what fits is no gravity or too large a bias of either sensor.
+    """Align with the given number of Gauss-Newton steps; None if the fitted gravity is implausible or a bias of either sensor too large.
 
-    gravity_slack: how many times the settings' error gravity's size may have in the linear step.
+    gravity_slack: factor on the settings' tolerance of gravity's size in the linear step.
     """
     gyro_bias = np.zeros(3)
     for _ in range(2):
         gyro_bias = gyro_bias + _gyro_bias_step(motion, imu, noise, gyro_bias)
-    # What no gyro reads at rest is pictures that were followed wrongly.
+    # A bias larger than that of any gyro at rest comes from wrong tracks.
     if not np.linalg.norm(gyro_bias) < settings.start.steady_gyro_mean_radps:
         return None
     terms = [preintegrate(imu, a, b, gyro_bias, np.zeros(3), noise) for a, b in pairwise(motion.stamps_ns)]
@@ -104,7 +104,7 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
         alignment.accel_bias_mps2,
     )
     size = len(alignment.covariance)
-    # order: gravity direction, accelerometer bias, last velocity, then what vision and gyro leave open
+    # order: gravity direction, accelerometer bias, last velocity, then the unknowns of vision and gyro
     joint = np.zeros((8, size))
     joint[:5, :5] = np.eye(5)
     joint[5:8, size - 3 :] = np.eye(3)
@@ -133,7 +133,7 @@ def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro
 
 
 def _free_gravity(motion: VisualMotion, terms: list[Preintegrated]) -> Array | None:
-    """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale where it is open.
+    """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale if unknown.
 
     For each interval, p and v of the body: p' - p - R dp = 0.5 dt^2 g + dt v and -R dv = dt g + v - v'.
     """
@@ -160,7 +160,7 @@ def _sphere_step(
 ) -> tuple[Array, Array]:
     """One Gauss-Newton step with gravity's size known: solution and covariance, see `Alignment`.
 
-    Where the scale is open, residuals beyond the sigmas widen the covariance.
+    If the scale is unknown, residuals beyond the sigmas widen the covariance.
     """
     count, first = len(motion.rotations), motion.unknowns
     size = first + 3 * count
@@ -208,7 +208,7 @@ def dynamic_initialization(
 ) -> InitialState | None:
     """Aligns visual odometry (metric, body transforms in any frame) with the IMU, see `imu_alignment`.
 
-    None where the alignment does not give gravity its size.
+    None if the alignment contradicts gravity's size.
     """
     stamps = [int(stamp) for stamp in vision.stamps_ns]
     rotations = vision.frame_from_body[:, :3, :3]
@@ -222,7 +222,7 @@ _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS = 0.006, 0.04
 
 @dataclass(frozen=True, slots=True)
 class MonoInertialStart:
-    """A first state, the metres in one unit of vision, and the standard deviation of that as a share of it."""
+    """Initial state, metres per unit of vision, and the relative standard deviation of that."""
 
     start: InitialState
     metres_per_unit: float
@@ -232,10 +232,10 @@ class MonoInertialStart:
 def mono_inertial_initialization(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, body_from_cam: Array, settings: OdometrySettings
 ) -> MonoInertialStart | None:
-    """Aligns a camera's way up to scale with the IMU's, see `imu_alignment`.
+    """Align a camera's path up to scale with the IMU's, see `imu_alignment`.
 
-    vision holds vision_from_cam at IMU stamps. None where the motion does not show the scale to within the settings' share, or
-    where what fits is no gravity.
+    vision holds vision_from_cam at IMU stamps. None if the motion does not determine the scale to within the settings' share, or
+    if the fitted gravity is implausible.
     """
     stamps = [int(stamp) for stamp in vision.stamps_ns]
     rotations = vision.frame_from_body[:, :3, :3] @ body_from_cam[:3, :3].T  # vision_from_body

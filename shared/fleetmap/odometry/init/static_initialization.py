@@ -16,7 +16,7 @@ _JUDGED_NS = 500_000_000
 
 
 def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySettings) -> InitialState | None:
-    """The state at the end of the latest steady window before `until_ns`; None where the IMU was never steady."""
+    """State at the end of the latest steady window before `until_ns`; None if the IMU was never steady."""
     window_ns = int(settings.start.steady_window_s * 1e9)
     if not len(imu):
         return None
@@ -30,17 +30,17 @@ def static_initialization(imu: ImuSamples, until_ns: int, settings: OdometrySett
 
 
 def is_steady(window: ImuSamples, settings: StartSettings) -> bool:
-    """Whether the means of tenths of the window agree: vibration averages out, motion that matters does not.
+    """True if the means of tenths of the window agree: vibration averages out, relevant motion does not.
 
-    Standing still and rolling at constant speed look alike here; gravity can be read in both, so the speed stays open.
+    Standstill and constant speed cannot be distinguished; both show gravity, so the speed stays unknown.
     """
     return core.is_steady(window.gyro_radps, window.accel_mps2, _limits(settings))
 
 
 def polynomial_rate(samples: Sequence[tuple[int, Array]], degree: int) -> Array | None:
-    """Acceleration (3,) of samples (stamp, value (3,)): speeds for degree 1, places for degree 2; None for less than half a second of them.
+    """Acceleration (3,) of samples (stamp, value (3,)): speeds for degree 1, positions for degree 2; None for less than half a second.
 
-    By the polynomial of that degree that fits them best.
+    By a least-squares polynomial of that degree.
     """
     if len(samples) < 2 * degree + 3 or samples[-1][0] - samples[0][0] < _JUDGED_NS:
         return None
@@ -50,7 +50,7 @@ def polynomial_rate(samples: Sequence[tuple[int, Array]], degree: int) -> Array 
 
 
 def _limits(settings: StartSettings) -> tuple[float, float, float, float, float]:
-    """As the core takes them."""
+    """Limits in the core's order."""
     spreads = settings.steady_gyro_sigma_radps, settings.steady_accel_sigma_mps2
     return *spreads, settings.steady_gyro_mean_radps, GRAVITY_MPS2, settings.max_gravity_error_mps2
 

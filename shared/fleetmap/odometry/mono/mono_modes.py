@@ -1,4 +1,4 @@
-"""Odometry with one camera: metric once the IMU has shown the scale, up to scale, and labelled so, until then or without an IMU."""
+"""Odometry with one camera: metric once the IMU has determined the scale; before that, or without an IMU, up to scale and marked so."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,22 +27,22 @@ from fleetmap.sensors.samples import Trajectory
 
 _STILL_S = 0.5
 _STILL_SIGMA_MPS = 0.02
-_FAR_M = 200.0  # points beyond it lie on almost parallel rays and say nothing of the scene's depth
-_UNSCALED_FRAMES = 2400  # that are kept to be placed anew once the IMU has shown the scale
+_FAR_M = 200.0  # points beyond it lie on almost parallel rays and carry no information on the scene's depth
+_UNSCALED_FRAMES = 2400  # kept for new poses once the IMU has determined the scale
 _SIGHTINGS = 12  # of one track that are kept to place its point
 _NONE_USED = np.zeros(0, np.int8)
 Ids = NDArray[np.int64]
 
 
 class MonocularWindow(SlidingWindow):
-    """The window of one camera: depth comes from points that several frames triangulate."""
+    """The window of one camera: depth comes from points triangulated from several frames."""
 
     def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
         super().__init__(rig, state, covariance, stamp_ns)
         self._sightings: dict[int, list[tuple[int, Array]]] = {}
 
     def points_in_camera(self, ids: Ids) -> Array:
-        """(N, 3) tracked points in the newest frame's camera, NaN where they cannot be triangulated; updates the depth."""
+        """(N, 3) tracked points in the newest frame's camera, NaN if they cannot be triangulated; updates the depth."""
         held = {clone: k for k, clone in enumerate(self.filter.clone_ids)}
         out = np.full((len(ids), 3), np.nan)
         if not held:
@@ -88,7 +88,7 @@ class MonocularWindow(SlidingWindow):
 
 
 class _UnscaledFrame(NamedTuple):
-    """A frame without metres; vision_from_cam (4, 4) is None where vision could not place it."""
+    """A frame of unknown scale; vision_from_cam (4, 4) is None if vision could not locate it."""
 
     frame_index: int
     stamp_ns: int
@@ -96,7 +96,7 @@ class _UnscaledFrame(NamedTuple):
 
 
 class MonocularMode(Mode):
-    """One camera alone, up to scale, until an IMU shows the scale and the direction of gravity."""
+    """One camera alone, up to scale, until an IMU determines the scale and the direction of gravity."""
 
     def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
         self._rig, self.imu = rig, imu
@@ -114,9 +114,9 @@ class MonocularMode(Mode):
         return self._stamp_ns
 
     def resume(self, mode: VisualMode) -> None:
-        """Goes on after a mode to which the filter gave way; vision begins again without metres.
+        """Continue after the filter was abandoned; vision restarts without scale.
 
-        Without the IMU where that was given up, else by those of its samples that led to no wrong start.
+        Without the IMU if that was abandoned, else by those of its samples that caused no wrong start.
         """
         self._stamp_ns, self._still_since_ns = mode.stamp_ns, None
         if isinstance(mode, StartingMode):
@@ -132,7 +132,7 @@ class MonocularMode(Mode):
         self._stamp_ns = stamp_ns
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """See Mode: the last motion once more, for the frame before."""
+        """See Mode: repeats the last motion, for the frame before."""
         return self._visual_odometry.motion_guess()
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
@@ -143,7 +143,7 @@ class MonocularMode(Mode):
         return True
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode; switches to the filter once the scale is known, and places earlier frames anew then."""
+        """See Mode; switches to the filter once the scale is known, and revises earlier frames then."""
         self._detect_standstill(tracked)
         visual = self._visual = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
         if self.imu is not None:
@@ -156,7 +156,7 @@ class MonocularMode(Mode):
         return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in visual.revised))
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """See Mode; velocity and biases are zero, for they are unknown."""
+        """See Mode; velocity and biases are unknown, reported as zero."""
         visual = self._visual
         there = np.eye(4) if visual.vision_from_cam is None else visual.vision_from_cam
         turn = np.kron(np.eye(2), self._rig.body_from_cam[:3, :3])
@@ -195,7 +195,7 @@ class MonocularMode(Mode):
         self._unscaled = kept[-_UNSCALED_FRAMES:]
 
     def _detect_standstill(self, tracked: Tracked) -> None:
-        """Keeps since when the image stands still."""
+        """Track since when the image stands still."""
         still_px = self._rig.settings.monocular.still_px
         still = is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, still_px)
         if not still:
@@ -205,7 +205,7 @@ class MonocularMode(Mode):
         self._newest_pixels = (tracked.ids, tracked.pixels)
 
     def _metric_start(self, imu: ImuInputs, visual: VisualEstimate) -> tuple[InitialState, float | None] | None:
-        """By rest, if image and IMU agree on it, else by motion; with the metres in one unit of vision, which rest leaves open."""
+        """Start by rest, if image and IMU agree on it, else by motion; with the metres per unit of vision, unknown after rest."""
         stamp_ns, settings = self._stamp_ns, self._rig.settings
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
             since = imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
@@ -227,7 +227,7 @@ class MonocularMode(Mode):
         return None if found is None else (found.start, found.metres_per_unit)
 
     def _spaced_trajectory(self) -> Trajectory:
-        """vision_from_cam of placed frames far enough apart in time, the newest among them; in order of time."""
+        """vision_from_cam of located frames far enough apart in time, including the newest, in order of time."""
         settings = self._rig.settings
         stamps: list[int] = []
         vision_from_cams: list[Array] = []
@@ -249,9 +249,9 @@ class MonocularMode(Mode):
         return window
 
     def _go_metric(self, frame_index: int, tracked: Tracked, mode: InertialMode, metres_per_unit: float | None) -> Step:
-        """Switches to the filter and revises earlier frames: in metres and in the frame that gravity levels.
+        """Switch to the filter and revise earlier frames: in metres, in a gravity-aligned frame.
 
-        After motion these are all since vision began, after rest those since the image stands still.
+        After motion: all frames since vision began; after rest: those since the image stands still.
         """
         mode.predict(self._stamp_ns)
         mode.window.seed(frame_index, tracked)
@@ -277,13 +277,13 @@ def make_odometry(
     settings: OdometrySettings,
     stereo_settings: StereoSettings | None = None,
 ) -> Odometry:
-    """The odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor."""
+    """Create the odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor."""
     kind = MonocularOdometry if camera.baseline_m == 0 else Odometry
     return kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings)
 
 
 class MonocularTracker(Tracker):
-    """The tracker with points that were triangulated from several frames, where no second camera shows their depth."""
+    """A tracker whose point depths are triangulated from several frames, for lack of a second camera."""
 
     def __init__(
         self, camera: StereoCamera, settings: TrackerSettings, points_in_camera: Callable[[NDArray[np.int64]], Array]
@@ -294,7 +294,7 @@ class MonocularTracker(Tracker):
     def track(
         self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
     ) -> Tracked:
-        """As Tracker's; followed points are enough to go on, since without parallax none of them can be triangulated."""
+        """As Tracker's; tracked points suffice to continue, since without parallax none of them can be triangulated."""
         before = self._points.ids
         tracked = super().track(frame, motion_since, rotation_sigma_rad)
         followed = int(np.isin(tracked.ids, before).sum())
@@ -310,18 +310,18 @@ class MonocularTracker(Tracker):
 
 
 class MonocularOdometry(Odometry):
-    """The class `Odometry` for one camera; `scale_known` of its estimates says whether its metres are metres."""
+    """The class `Odometry` for one camera; its estimates are metric if `scale_known`."""
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        """The estimate at `frame`, of one image in spite of the name; newer than any before."""
-        if isinstance(self._mode, VisualMode):  # the IMU was given up, or its filter diverged
+        """Return the estimate at `frame`, which has one image in spite of the name and must be newer than any before."""
+        if isinstance(self._mode, VisualMode):  # the IMU was abandoned, or its filter diverged
             self._vision.resume(self._mode)
             self._mode = self._vision
         return super().handle_stereo(frame)
 
     @property
     def refuses_imu(self) -> bool:
-        """As Odometry's, also once vision goes on without the IMU."""
+        """As Odometry's, also after vision continues without the IMU."""
         return super().refuses_imu or (self._rig.imu is not None and self._vision.imu is None)
 
     def _first_mode(self) -> Mode:

@@ -15,14 +15,14 @@ from fleetmap.sensors.rectification import StereoCamera
 Ids = NDArray[np.int64]
 _HUBER_SIGMAS = 2.5
 _ITERATIONS = 8
-# Points share the errors of the views they come from: a resection's own sigma is too small by about this.
+# Points share the errors of their views: a resection's own sigma is too small by about this factor.
 _CORRELATION = 3.0
 _LONGEST_WAIT = 60  # frames without a first pair before the search starts again from a later one
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One camera of the window: vision_from_cam (4, 4), the ids (N,) that it saw and their pixels (N, 2)."""
+    """One camera of the window: vision_from_cam (4, 4), its observed ids (N,) and their pixels (N, 2)."""
 
     frame_index: int
     vision_from_cam: Array
@@ -32,10 +32,10 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class VisualEstimate:
-    """What one frame gave: vision_from_cam, None before the first pair of views and where tracking was lost.
+    """Result of one frame: vision_from_cam, None before the first pair of views and after lost tracking.
 
-    cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are placed only now, (frame index, vision_from_cam).
-    lost: nothing ties this frame to the ones before, and `vision` starts again. depth: median along the optical axis.
+    cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are located only now, (frame index, vision_from_cam).
+    lost: this frame has no link to earlier ones, and `vision` restarts. depth: median along the optical axis.
     """
 
     vision_from_cam: Array | None
@@ -47,7 +47,7 @@ class VisualEstimate:
 
 @dataclass
 class _LocalMap:
-    """The window's views and the points that they made, by track id; vision_from_cam and pixel of tracks still without one."""
+    """The window's views and their points, by track id; for tracks without a point, their vision_from_cam and pixels."""
 
     views: list[View] = field(default_factory=list)
     points: dict[int, Array] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class _LocalMap:
 
 
 class VisualOdometry:
-    """Takes the tracked points of one frame after the other; lengths are in units of the first scene's median depth."""
+    """Processes the tracked points frame by frame; lengths are in units of the first scene's median depth."""
 
     def __init__(self, camera: StereoCamera, settings: MonocularSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -69,20 +69,20 @@ class VisualOdometry:
 
     @property
     def started(self) -> bool:
-        """Whether there are points to be located by."""
+        """True if there are points to locate frames by."""
         return bool(self._local_map.views)
 
     def points_in_camera(self, ids: Ids) -> Array:
-        """(N, 3) points of these tracks as the last frame's camera sees them, NaN where unknown."""
+        """(N, 3) points of these tracks in the last frame's camera, NaN where unknown."""
         known = np.array([self._local_map.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
         return transform_points(se3_inverse(self._last), known)
 
     def motion_guess(self) -> Array:
-        """cam_from_previous (4, 4), as if the last step went on."""
+        """cam_from_previous (4, 4), equal to the last step."""
         return se3_inverse(self._step)
 
     def add(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
-        """The estimate at one frame: ids (N,) and pixels (N, 2) of what it tracks."""
+        """Return the estimate at one frame from the ids (N,) and pixels (N, 2) of its tracks."""
         if not self.started:
             return self._first_views(frame_index, ids, pixels)
         located = self._locate(ids, pixels, self._last @ self._step)
@@ -127,7 +127,7 @@ class VisualOdometry:
             first = self._waiting[0]
             _, a, b = np.intersect1d(first[1], ids, return_indices=True)
             if len(a) < s.first_min_points or len(self._waiting) > _LONGEST_WAIT:
-                self._waiting.pop(0)  # too little is left of the oldest: begin later
+                self._waiting.pop(0)  # too few tracks of the oldest frame are left: begin later
                 continue
             if np.median(np.linalg.norm(first[2][a] - pixels[b], axis=1)) < s.first_parallax_px:
                 return nothing
@@ -173,9 +173,9 @@ class VisualOdometry:
         )
 
     def _place_between(self) -> list[tuple[int, Array]] | None:
-        """All waiting frames located by the points of the first and the last; None where one cannot be. Some become views.
+        """Locate all waiting frames by the points of the first and the last; None if one fails. Some become views.
 
-        Twice, with an adjustment between: two views of a flat scene alone can leave the turn between them off by many degrees.
+        Twice, with an adjustment between: two views of a flat scene alone can leave the rotation between them off by many degrees.
         """
         between = self._located_between()
         if between is None:
@@ -201,7 +201,7 @@ class VisualOdometry:
         return found
 
     def _normalise(self, vision_from_first: Array, placed: list[tuple[int, Array]]) -> None:
-        """Scales the new world so that half of its points lie nearer than the depth that is the unit."""
+        """Scale the new map so that the median depth of its points is the unit."""
         points = transform_points(se3_inverse(vision_from_first), np.array(list(self._local_map.points.values())))
         unit = self.depth / float(np.median(points[:, 2]))
 
@@ -220,7 +220,7 @@ class VisualOdometry:
     # --- one frame, and the window ---
 
     def _locate(self, ids: Ids, pixels: Array, guess: Array) -> tuple[Array, Array] | None:
-        """vision_from_cam and covariance (6, 6, camera axes) by points that are known; None where too few agree."""
+        """vision_from_cam and covariance (6, 6, camera axes) by known points; None if too few agree."""
         s = self._settings
         rows = [n for n, i in enumerate(ids.tolist()) if i in self._local_map.points]
         if len(rows) < s.min_points:
@@ -245,14 +245,14 @@ class VisualOdometry:
         return bool(np.median(np.linalg.norm(last.pixels[a] - view.pixels[b], axis=1)) > wanted_px)
 
     def _grow(self) -> None:
-        """The window adjusted, and what left it forgotten."""
+        """Adjust the window and forget views and points that left it."""
         self._adjust(held=2)
         self._local_map.views = self._local_map.views[-self._settings.window_views :]
         seen = {i for v in self._local_map.views for i in v.ids.tolist()}
         self._local_map.points = {i: p for i, p in self._local_map.points.items() if i in seen}
 
     def _place_new(self, view: View) -> None:
-        """Gives a point to every track that by now is seen at an angle large enough since it was first seen."""
+        """Triangulate every track whose parallax since its first observation is large enough."""
         points, first_seen = self._local_map.points, self._local_map.first_seen
         wanted = np.array([i not in points for i in view.ids.tolist()], bool)
         for track_id, pixel in zip(view.ids[wanted].tolist(), view.pixels[wanted], strict=True):
@@ -272,7 +272,7 @@ class VisualOdometry:
                 del first_seen[track_id]
 
     def _between(self, first: Array, before: Array, last: Array, now: Array) -> Array:
-        """(N, 3) points midway between rays of cameras first (N, 4, 4) and last (4, 4); NaN where angle or pixels forbid."""
+        """(N, 3) points midway between rays of cameras first (N, 4, 4) and last (4, 4); NaN where angle or pixels forbid it."""
         rays_a = np.einsum("nij,nj->ni", first[:, :3, :3], rays_from_pixels(self._camera, before))
         rays_b = rays_from_pixels(self._camera, now) @ last[:3, :3].T
         points, cosines = midpoints(rays_a, rays_b, last[:3, 3] - first[:, :3, 3])
@@ -327,6 +327,6 @@ _NOWHERE = np.full(3, np.nan)
 
 
 def _orthonormal(vision_from_cam: Array) -> Array:
-    """The nearest rigid transform: guesses are products of earlier answers, in which rounding would triple with every frame."""
+    """The nearest rigid transform: guesses are products of earlier results, in which rounding errors triple with every frame."""
     u, _, vt = np.linalg.svd(vision_from_cam[:3, :3])
     return se3(u @ vt, vision_from_cam[:3, 3])

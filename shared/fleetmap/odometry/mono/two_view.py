@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, se3
 from fleetmap.sensors.rectification import StereoCamera
 
 _SCORED_PX = 3.0
-_RIVAL_SHARE = 0.75  # a second answer that explains so much of what the best one does leaves the motion open
+_RIVAL_SHARE = 0.75  # a second solution that explains at least this share of the best one makes the motion ambiguous
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class TwoView:
 def two_view_motion(
     camera: StereoCamera, pixels_a: Array, pixels_b: Array, *, threshold_px: float, seed: int
 ) -> TwoView | None:
-    """The motion that most matched pixels (N, 2) agree on; None where none does, or where two motions do equally well.
+    """The motion with which most matched pixels (N, 2) agree; None without one, or if two motions fit equally well.
 
     Candidates come from the essential matrix and from a homography (a flat scene has both); each is scored by the points that it
     puts in front of both cameras and near their pixels. Sources: Nister 2004 (essential matrix), Malis and Vargas 2007 (homography).

@@ -1,4 +1,4 @@
-"""Points followed through a recording: optical flow where frames are close, descriptors where they are not."""
+"""Point tracking: optical flow between close frames, descriptors after gaps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ MotionSince = Callable[[int], Array | None]
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """Observations of an earlier frame, for tracks that were begun there only now, and the motion since.
+    """Observations of an earlier frame for tracks that start there in hindsight, and the motion since.
 
     ids (N,), pixels (N, 3) u_left v u_right, cam_from_earlier (4, 4).
     """
@@ -35,11 +35,11 @@ class Earlier:
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """What one frame saw.
+    """Tracks of one frame.
 
     ids (N,), ascending, and pixels (N, 3) u_left v u_right of the current frame. cam_from_previous: the motion measured since the
-    previous frame, None where too few points agree; `information` (6, 6) of a left perturbation of it, None after a gap. Then
-    (by_descriptors) `earlier` holds what was matched, best first.
+    previous frame, None if too few points agree; `information` (6, 6) of a left perturbation of it, None after a gap. Then
+    (by_descriptors) `earlier` holds the matches, best first.
     """
 
     ids: Ids
@@ -52,7 +52,7 @@ class Tracked:
 
     @property
     def lost(self) -> bool:
-        """Whether nothing ties this frame to any earlier one."""
+        """True if this frame has no link to any earlier one."""
         return self.cam_from_previous is None and not self.earlier
 
 
@@ -66,7 +66,7 @@ class _Remembered:
 
 
 class Tracker:
-    """Feeds on rectified frames in order; ids never repeat. What close frames need is `core.Tracker`."""
+    """Tracks points through rectified frames in order; ids never repeat. `core.Tracker` handles close frames."""
 
     def __init__(
         self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: StereoSettings | None = None
@@ -84,10 +84,10 @@ class Tracker:
     def track(
         self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
     ) -> Tracked:
-        """Follows the points into `frame`.
+        """Track the points into `frame`.
 
-        motion_since(frame_index) predicts cam_from_earlier (4, 4) since a frame counted from 0, None where it is
-        forgotten; rotation_sigma_rad says how well its rotation is known, None where it is only a guess.
+        motion_since(frame_index) predicts cam_from_earlier (4, 4) since a frame counted from 0, None if it is
+        forgotten; rotation_sigma_rad: uncertainty of its rotation, None if it is only a guess.
         """
         self._frame_index += 1
         previous, self._previous = self._previous, frame
@@ -122,7 +122,7 @@ class Tracker:
         return self._points.track(frame.left, pair, frame.disparity_px, guess, is_predicted, points_cam)
 
     def _points_cam(self) -> Array | None:
-        """(N, 3) the points in the camera of the frame before; None where their disparities tell."""
+        """(N, 3) the points in the camera of the frame before; None if their disparities give the depth."""
         return None
 
     def _rematch(
@@ -132,7 +132,7 @@ class Tracker:
         motion_since: MotionSince,
         rotation_sigma_rad: float | None,
     ) -> tuple[tuple[Earlier, ...], float]:
-        """After a gap: new tracks from descriptor matches with the last few frames.
+        """Start new tracks after a gap, from descriptor matches with the last few frames.
 
         The matches with each frame are verified by one rigid motion.
         """
@@ -166,7 +166,7 @@ class Tracker:
         guess: Array,
         rotation_sigma_rad: float | None,
     ) -> Earlier | None:
-        """Matches with one earlier frame; adds their tracks to the current points and takes them out of `free`."""
+        """Match with one earlier frame; adds the tracks to the current points and removes them from `free`."""
         usable = np.flatnonzero(free)
         known = np.flatnonzero(np.isfinite(old.disparities))
         pairs = match_mutual(old.features.descriptors[known], current.features.descriptors[usable], 70, 0.85)
@@ -196,7 +196,7 @@ class Tracker:
     def _wide_motion(
         self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
     ) -> PnpResult | None:
-        """cam_from_previous from raw descriptor matches: with a known rotation first, without any guess else."""
+        """cam_from_previous from raw descriptor matches: first with a known rotation, then without a guess."""
         settings, least = self._settings, self._settings.min_inliers
         matches = Correspondences(self._camera, points_cam, measured, np.full((len(points_cam), 2), 1.5))
         if rotation_sigma_rad is not None:

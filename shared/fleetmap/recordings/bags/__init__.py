@@ -1,1 +1,1 @@
-"""Recordings as messages on topics, whatever file they lie in."""
+"""Recordings as messages on topics, independent of the file format."""

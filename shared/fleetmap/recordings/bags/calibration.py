@@ -1,4 +1,4 @@
-"""Calibration from an MCAP file's CameraInfo messages and static transforms, where it has no attachment of ours."""
+"""Calibration from an MCAP file's CameraInfo messages and static transforms, if it has no calibration attachment."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,26 +17,26 @@ _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
 class InfoCamera(NamedTuple):
-    """A camera by its CameraInfo; `is_rectified`: its images are rectified already."""
+    """A camera described by its CameraInfo; `is_rectified`: its images are rectified already."""
 
     info: CameraInfo
     is_rectified: bool
 
     @property
     def frame(self) -> str:
-        """The name of its frame in the transforms."""
+        """Name of its frame in the transforms."""
         return self.info.frame_id.lstrip("/")
 
 
 def same_lens(one: CameraInfo, other: CameraInfo) -> bool:
-    """True if both are one lens at one setting, to the digits that drivers round to."""
+    """True if both describe one lens at one setting, to the rounding of drivers."""
     sizes, others = ((i.width_px, i.height_px, i.lens, len(i.distortion), i.binning, i.roi) for i in (one, other))
     values, again = (np.hstack([i.matrix.ravel(), i.projection.ravel(), i.distortion]) for i in (one, other))
     return sizes == others and np.allclose(values, again, rtol=1e-3, atol=1e-3, equal_nan=True)
 
 
 def setting_of(info: CameraInfo) -> str:
-    """A CameraInfo's figures for messages."""
+    """Format a CameraInfo's values for messages."""
     fx, cx, cy = (float(info.matrix[at]) for at in ((0, 0), (0, 2), (1, 2)))
     x, y, width, height = info.roi
     binned = "" if info.binning == (1, 1) else f", binning {info.binning[0]} x {info.binning[1]}"
@@ -45,10 +45,10 @@ def setting_of(info: CameraInfo) -> str:
 
 
 def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> CameraInfo:
-    """The CameraInfo for images of `size_px`, which the driver bins or cuts out of the whole picture.
+    """The CameraInfo for images of `size_px`, which the driver bins or crops from the full image.
 
-    CalibrationError where binning and region of interest make another size. Source: the definition of sensor_msgs/CameraInfo. A binned
-    pixel's centre is that of the pixels that it joins.
+    CalibrationError if binning and region of interest give another size. Source: the definition of sensor_msgs/CameraInfo. A binned
+    pixel's centre is that of its source pixels.
     """
     (x, y, width, height), (bin_x, bin_y) = info.roi, info.binning
     width, height = width or info.width_px - x, height or info.height_px - y
@@ -77,10 +77,10 @@ def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> Ca
 def calibration_of_messages(
     cameras: Sequence[InfoCamera], links: Sequence[FrameLink], imu_frame: str | None, where: str
 ) -> RigCalibration:
-    """The calibration told by CameraInfo (left first) and transforms between frames.
+    """Build the calibration from CameraInfo (left first) and transforms between frames.
 
-    The body is `imu_frame` where transforms lead from there to every camera (the IMU's noise is then the default),
-    else the left camera; the right camera's place then comes from the transforms or from the baseline in its
+    The body is `imu_frame` if transforms connect it to every camera (the IMU's noise is then the default),
+    else the left camera; the right camera's pose then comes from the transforms or from the baseline in its
     projection matrix.
     """
     lenses = [_lens(camera, where) for camera in cameras]
@@ -102,7 +102,7 @@ def calibration_of_messages(
 
 
 def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:
-    """Words on cameras whose frame has the axes of the robot (x forward, z up), where images need one with z forward and y down."""
+    """Warning on cameras whose frame has the axes of the robot (x forward, z up); images need one with z forward and y down."""
     found = []
     for frame in dict.fromkeys(camera.frame for camera in cameras if "optical" not in camera.frame):
         bases = ((name, _target_from_source(links, name, frame)) for name in _BASE_FRAMES)
@@ -151,7 +151,7 @@ def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], 
 
 
 def _target_from_source(links: Sequence[FrameLink], target: str, source: str) -> Array | None:
-    """(4, 4) target_from_source along the links in either direction, None where they do not lead there."""
+    """(4, 4) target_from_source along the links in either direction, None if they are not connected."""
     target_from: dict[str, Array] = {target.lstrip("/"): np.eye(4)}
     waiting = list(target_from)
     while waiting:

@@ -1,4 +1,4 @@
-"""Files of messages: what MCAP, rosbag2's SQLite and ROS 1 bags look like to `streams`."""
+"""Files of messages: the common interface of MCAP, rosbag2's SQLite and ROS 1 bags for `streams`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from typing import Protocol
 from fleetmap.sensors.samples import DataIssue
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
-Place = tuple[int, int, int]  # of a message in its file, as its container numbers them
+Place = tuple[int, int, int]  # position of a message in its file, as numbered by its container
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic's channel. type_name: without ROS 2's `/msg/`, such as sensor_msgs/Imu; schema: as the file has it."""
+    """One topic's channel. type_name: without ROS 2's `/msg/`, such as sensor_msgs/Imu; schema: as in the file."""
 
     id: int
     topic: str
@@ -26,7 +26,7 @@ Message = tuple[Channel, int, Place, memoryview]
 
 
 class Container(Protocol):
-    """An open recording of messages. path: what errors name; files: all that its hash covers; name: what it calls itself, or nothing."""
+    """An open recording of messages. path: named in errors; files: covered by its hash; name: its own name, or empty."""
 
     path: Path
     files: Sequence[Path]
@@ -35,16 +35,16 @@ class Container(Protocol):
     issues: list[DataIssue]
 
     def messages(self) -> Iterator[Message]:
-        """Channel, log time in ns, place and bytes of every message that is whole, in the order of writing.
+        """Yield channel, log time in ns, place and bytes of every complete message, in the order of writing.
 
-        After it name, attachments and issues (what could not be read) are complete.
+        After that, name, attachments and issues (unreadable parts) are complete.
         """
 
     def keep(self, size: int) -> None:
         """See `KeptBytes`."""
 
     def read(self, place: Place) -> bytes:
-        """One message again; ValueError where it is damaged, RecordingError where the file is not what it was any more."""
+        """Read one message again; ValueError if it is damaged, RecordingError if the file has changed."""
 
     def close(self) -> None:
         """Closes the files."""

@@ -1,4 +1,4 @@
-"""Messages of one channel as values: ROS 2's CDR, ROS 1 by way of it, Foxglove's protobuf."""
+"""Decoding of the messages of one channel: ROS 2's CDR, ROS 1 converted to it, Foxglove's protobuf."""
 
 import struct
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
 
 class RosDecoder:
-    """ROS 2 messages in CDR. Methods raise ValueError for bytes that are no such message."""
+    """ROS 2 messages in CDR. Methods raise ValueError for invalid messages."""
 
     def __init__(self, channel: Channel) -> None:
         self.channel = channel
@@ -66,7 +66,7 @@ class Ros1Decoder(RosDecoder):
 
         name = self.channel.type_name
         try:
-            # By ROS 2's definitions: of those that are decoded here the header alone is another, which rosbags knows
+            # By ROS 2's definitions: among the types decoded here only the header differs, which rosbags handles
             return bytes(_store("ROS2_JAZZY").ros1_to_cdr(data, name.replace("/", "/msg/")))
         except (SerdeError, struct.error, ArithmeticError, LookupError, MemoryError) as error:
             raise ValueError(f"the {len(data)} bytes are no {name}") from error
@@ -85,7 +85,7 @@ ENCODINGS = tuple(_DECODERS)
 
 
 def decoder_of(channel: Channel) -> Decoder:
-    """A decoder of a channel with one of ENCODINGS; RecordingError where a library is missing."""
+    """Create the decoder of a channel with one of ENCODINGS; RecordingError if a library is missing."""
     if channel.encoding == "ros1":
         _store("ROS2_JAZZY")
     return _DECODERS[channel.encoding](channel)
@@ -100,12 +100,12 @@ def _store(name: str) -> Any:
             "ROS 1 messages need a library more: pip install '.[bags]' in fleetmap's source folder"
         ) from error
     store = get_typestore(Stores[name])
-    if name == "ROS1_NOETIC":  # rosbags ships it without
+    if name == "ROS1_NOETIC":  # missing in rosbags
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
     return store
 
 
 @cache
 def ros1_digest(type_name: str) -> str:
-    """The MD5 by which ROS 1 knows the definition of a type that is decoded here, such as sensor_msgs/Imu."""
+    """ROS 1's MD5 of the definition of a type decoded here, such as sensor_msgs/Imu."""
     return str(_store("ROS1_NOETIC").generate_msgdef(type_name.replace("/", "/msg/"))[1])

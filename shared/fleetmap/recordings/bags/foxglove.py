@@ -18,18 +18,18 @@ from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink, frame_link
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
-Message = Any  # made at run time from the schema in the file
+Message = Any  # created at run time from the schema in the file
 
 
 class FoxgloveDecoder:
-    """Decodes by the descriptors that the file itself carries; methods as those of RosDecoder."""
+    """Decodes with the descriptors contained in the file; methods as those of RosDecoder."""
 
     def __init__(self, channel: Channel) -> None:
         self.channel = channel
         self._class: Any = None
 
     def __reduce__(self) -> tuple[type["FoxgloveDecoder"], tuple[Channel]]:
-        """The class made of the file's descriptors is made again where it is unpickled."""
+        """Unpickling recreates the class from the file's descriptors."""
         return FoxgloveDecoder, (self.channel,)
 
     def stamp_ns(self, data: bytes) -> int:
@@ -43,7 +43,7 @@ class FoxgloveDecoder:
         return StoredImage(message.encoding, message.data, where, message.width, message.height, message.step)
 
     def imu(self, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
-        """Messages of the convention in this module's head."""
+        """Messages of the convention in this module's docstring."""
         parsed = [self._parse(data) for data in messages]
         stamps_ns = np.array([_stamp_ns(message) for message in parsed], np.int64)
         gyro = np.array([_xyz(message.angular_velocity) for message in parsed])

@@ -1,6 +1,6 @@
-"""Opens ROS 1 bags: rosbags reads them and turns their messages into ROS 2's, which are decoded here as any others.
+"""Opens ROS 1 bags: rosbags reads them and converts their messages to ROS 2's, which are decoded like all others.
 
-Files may be hostile: what an index may make and a chunk may unpack to is limited. Source of the layout: ROS's bag format 2.0.
+Files may be hostile: the sizes of an index and of an unpacked chunk are limited. Source of the layout: ROS's bag format 2.0.
 """
 
 import struct
@@ -23,22 +23,22 @@ from fleetmap.sensors.samples import DataIssue
 
 _MAGIC = b"#ROSBAG V"
 _ADVICE = {"not indexed": "rosbag reindex", "encryption": "rosbag decrypt", "Compression": "rosbag decompress"}
-# What rosbags raises of damaged files beside its ReaderError, which is not at hand where it is not installed
+# Exceptions of rosbags for damaged files beside its ReaderError, which is unavailable if it is not installed
 _DAMAGED = (struct.error, ValueError, LookupError, AssertionError, EOFError, OSError, RuntimeError, OverflowError)
 
 
 def recognises(path: Path) -> bool:
-    """True for a file that begins as a bag does or is named .bag."""
+    """True for a file with the magic bytes of a bag or named .bag."""
     return path.is_file() and (path.suffix == ".bag" or file_head(path, len(_MAGIC)) == _MAGIC)
 
 
 def open_bag(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a ROS 1 bag."""
+    """Open the recording in a ROS 1 bag."""
     return open_messages(path, "rosbag1", partial(BagFile, path), options)
 
 
 class BagFile(KeptBytes):
-    """An open bag as a Container. A place: connection, log time in ns, which of its messages at that time."""
+    """An open bag as a Container. A place: connection, log time in ns, index among its messages at that time."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, path.stat().st_size)
@@ -95,7 +95,7 @@ class BagFile(KeptBytes):
 
 
 class _BoundedFile(BufferedReader):
-    """A file of which no more is read at once than a message may have."""
+    """A file with a limit on single reads: the largest size of a message."""
 
     def read(self, size: int | None = -1) -> bytes:
         if size is None or not 0 <= size <= MAX_MESSAGE_BYTES:
@@ -103,11 +103,11 @@ class _BoundedFile(BufferedReader):
         return super().read(size)
 
     def readline(self, size: int | None = -1) -> bytes:
-        return super().readline(100)  # its first line is all that is read so
+        return super().readline(100)  # only its first line is read this way
 
 
 class _BagPath:
-    """As much of a path as rosbags asks for."""
+    """The subset of Path's interface that rosbags uses."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -156,7 +156,7 @@ def _bounded_reader() -> Any:
 
 
 def _reason(error: BaseException, path: Path) -> str:
-    # Others than these are of Python, about bytes that make no sense
+    # Other exceptions come from Python, for invalid bytes
     is_told = type(error) is ValueError or type(error).__name__ == "ReaderError"
     words = " ".join(str(error).split())[:200].rstrip(".") if is_told else "a record makes no sense"
     for sign, advice in _ADVICE.items():

@@ -1,8 +1,8 @@
 """Opens rosbag2 recordings in SQLite: a .db3 file, or a folder with the files of one recording, with or without metadata.yaml.
 
-Files may be hostile. They are opened read-only and by their own tables alone, no value is longer than a message may be, and rows are
-taken in the order of their ids, so that nothing is sorted or unpacked on the way. rosbags' reader does none of this, needs metadata.yaml,
-and reads no single message again. Source of the layout: rosbag2_storage_sqlite3.
+Files may be hostile. They are opened read-only, restricted to their own tables, values are limited to the size of a message, and rows are
+read in the order of their ids, without sorting or unpacking. rosbags' reader does none of this, needs metadata.yaml,
+and cannot read a single message again. Source of the layout: rosbag2_storage_sqlite3.
 """
 
 import sqlite3
@@ -22,20 +22,18 @@ _MAGIC, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _PACKED = ".db3.zstd"
 _TOPICS = "SELECT id, name, type, serialization_format FROM topics"
 _MESSAGES = "SELECT rowid, topic_id, timestamp, data FROM messages"
-_ROW_BYTES = (
-    4  # fewer are no row; a table whose pages refer to each other in a circle has more rows than its file has bytes
-)
+_ROW_BYTES = 4  # no row is shorter; a table whose pages form a cycle has more rows than its file has bytes
 
 
 def recognises(path: Path) -> bool:
-    """True for an SQLite file, or a folder with .db3 files, packed ones too."""
+    """True for an SQLite file, or a folder with .db3 files, also compressed ones."""
     if path.is_dir():
         return any(path.glob("*.db3")) or any(path.glob(f"*{_PACKED}"))
     return path.is_file() and (path.name.endswith((".db3", _PACKED)) or file_head(path, len(_MAGIC)) == _MAGIC)
 
 
 def open_sqlite(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a rosbag2 .db3 file, or in the folder of several."""
+    """Open the recording in a rosbag2 .db3 file, or in a folder of several."""
     files = [path]
     if path.is_dir():
         files = sorted([*path.glob("*.db3"), *path.glob(f"*{_PACKED}")], key=lambda file: natural_key(file.name))
@@ -63,7 +61,7 @@ class SqliteFiles(KeptBytes):
             raise
 
     def messages(self) -> Iterator[Message]:
-        """See Container: in the order of rows, which is that of writing."""
+        """See Container: in the order of rows, which is the order of writing."""
         channels: dict[tuple[str, str, str], Channel] = {}
         for number, (file, database) in enumerate(zip(self.files, self._databases, strict=True)):
             if file.with_name(f"{file.name}-wal").exists():
@@ -124,11 +122,11 @@ class SqliteFiles(KeptBytes):
 
 
 def _opened(file: Path) -> sqlite3.Connection:
-    """A connection that writes nothing, not even beside the file; RecordingError for what is no recording."""
+    """Open a connection that writes nothing, not even beside the file; RecordingError for anything but a recording."""
     if file_head(file, len(_MAGIC)) != _MAGIC:
         fault = what_file_instead(file) or "no SQLite database; copy the recording again"
         raise RecordingError(f"{file} is {fault}")
-    # Used by one thread at a time, but not always by that which opened it
+    # Used by one thread at a time, but not always by the one that opened it
     database = sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_MESSAGE_BYTES)
     database.text_factory = lambda text: text.decode("utf-8", "replace")
@@ -156,5 +154,5 @@ def _recovery(file: Path) -> str:
 
 
 def _unpacked(data: bytes) -> bytes:
-    """A message, of recordings that are compressed message by message too; ValueError where it cannot be unpacked."""
+    """Unpack a message if the recording is compressed per message; ValueError if that fails."""
     return unpack("zstd", data) if data.startswith(_ZSTD) else data  # CDR begins with 0

@@ -1,4 +1,4 @@
-"""A recording made of the messages in a container: topics chosen, stamps put in order, images left where they are."""
+"""Building of a recording from the messages in a container: chooses topics, orders stamps, leaves images in the file."""
 
 import hashlib
 import re
@@ -56,7 +56,7 @@ _LAST_NS = 2**63 - 1  # MCAP's times have a bit more
 _SAME_LENS = 0.02  # of the focal length
 _MOST_LENSES = 20  # of one camera in a recording
 _HEADER_BYTES = (
-    12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: what differs in messages that say the same
+    12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: the difference between messages of equal content
 )
 _RECTIFIED = re.compile(r"(?<![a-z])(rect(?![a-z])|rectified)")  # image_rect, rect/image; not direct, image_unrect
 _UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
@@ -70,7 +70,7 @@ _Images = ImageSeries[_Source]
 class _Stream:
     """The messages of one channel with their log times: images by their place and size, everything else by its bytes.
 
-    damaged: how many are left out; why_damaged: the reason of the first image.
+    damaged: number of messages left out; why_damaged: the reason for the first image.
     """
 
     decoder: Decoder
@@ -92,7 +92,7 @@ class _Stream:
         return self.channel.type_name in IMAGE_TYPES
 
     def values(self, decode: Callable[[bytes], V]) -> list[tuple[int, V]]:
-        """Stamps of logging and values of all messages that can be decoded; the others are counted."""
+        """Log times and values of all messages that can be decoded; the others are counted."""
         found = []
         for log_time_ns, data in zip(self.log_times_ns, self.messages, strict=True):
             try:
@@ -104,24 +104,24 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _Lenses:
-    """The lenses that CameraInfo tells, each once, and the number of the one that each image (N,) was taken with."""
+    """The distinct lenses of the CameraInfo messages, and the lens number of each image (N,)."""
 
     infos: list[CameraInfo]
     numbers: NDArray[np.int64]
 
     @property
     def usual(self) -> int:
-        """The number of the lens of most images."""
+        """Number of the lens of most images."""
         return int(np.bincount(self.numbers).argmax())
 
 
-_Roles = Mapping[str, list[_Stream]]  # the streams by the role that `choose_topics` gives their topic
+_Roles = Mapping[str, list[_Stream]]  # streams by the role that `choose_topics` assigns to their topic
 
 
 def open_messages(path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions) -> Recording:
-    """The recording at `path`, whose messages `opener` gives access to, as far as they are whole; its issues say what is not.
+    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages.
 
-    opener: can be pickled; part of the frames may be read in another process.
+    opener: must be picklable, because other processes may read part of the frames.
     """
     log = ReadLog()
     given = calibration_of_options(options, log)
@@ -135,9 +135,9 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
 
 
 class MessageReader:
-    """An ImageReader of the image messages of an open container, or of one that the first read opens.
+    """An ImageReader of the image messages of a container, which the first read opens if necessary.
 
-    read_files: the files that the content's hash covers, the recording first.
+    read_files: files covered by the content's hash, the recording first.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class MessageReader:
         return MessageReader(self._opener, None, self._read_files)
 
     def hash_into(self, digest: "hashlib._Hash", images: list[_Source]) -> None:
-        """The bytes of the recording's files, then those of the calibration file where one was given."""
+        """Hash the bytes of the recording's files, then those of the calibration file if one was given."""
         for path in self._read_files:
             hash_file(path, digest)
 
@@ -241,7 +241,7 @@ def _parts(
 
 
 def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_Stream], list[Channel]]:
-    """The streams of all channels whose messages may be needed, and the other channels."""
+    """Collect the streams of all channels that may be needed, and the other channels."""
     streams: dict[int, _Stream] = {}
     unused: dict[int, Channel] = {}
     for channel, logged_ns, place, data in container.messages():
@@ -273,7 +273,7 @@ def _may_be_needed(channel: Channel, topics: Topics) -> bool:
 
 
 def _takes_image(stream: _Stream, data: bytes, topic: str, log: ReadLog) -> bool:
-    """True for a whole image, whose stamp and size the stream then has; else it keeps the reason."""
+    """Add an image with stamp and size to the stream if it is whole and return True; else keep the reason."""
     stamp_ns = None
     try:
         stamp_ns = stream.decoder.stamp_ns(data)
@@ -290,9 +290,9 @@ def _takes_image(stream: _Stream, data: bytes, topic: str, log: ReadLog) -> bool
 
 
 def _takes_lens(stream: _Stream, data: bytes) -> bool:
-    """True for a CameraInfo that says something else than the one before; lenses repeat with every image.
+    """Keep a CameraInfo and return True if it differs from the previous one; lenses repeat with every image.
 
-    Before the first that tells a lens only the latest is kept: uncalibrated drivers send zeros, others at their start.
+    Before the first valid lens only the latest is kept: uncalibrated drivers send zeros, others do so at their start.
     """
     if stream.lens is not None and data[_HEADER_BYTES:] == stream.messages[-1][_HEADER_BYTES:]:
         return False
@@ -310,7 +310,7 @@ def _takes_lens(stream: _Stream, data: bytes) -> bool:
 
 
 def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]) -> Topics:
-    """The wanted topics, with those that a Kalibr file notes where they exist and the caller asked for no other."""
+    """The wanted topics, completed by those noted in a Kalibr file if they exist and the caller chose no other."""
     changes = {}
     for role, key in (("left", "cam0"), ("right", "cam1"), ("imu", "imu0")):
         hint = given.topics.get(key, "") if given else ""
@@ -320,7 +320,7 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
 
 
 def _lenses(images: Sequence[_Stream], streams: Sequence[_Stream]) -> _Lenses:
-    """CalibrationError where the lenses never end, as of one that focuses by itself."""
+    """CalibrationError if the number of lenses keeps growing, as with autofocus."""
 
     def stamped(stream: _Stream) -> list[tuple[int, tuple[int, CameraInfo]]]:
         return stream.values(lambda data: (stream.decoder.stamp_ns(data), stream.decoder.camera_info(data)))
@@ -369,7 +369,7 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses
 
 
 def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of the images with the lens of most; the others are noted in `log`."""
+    """(N,) mask of the images with the most frequent lens; the others are noted in `log`."""
     kept = np.asarray(lenses.numbers == lenses.usual)
     if not kept.all():
         other = lenses.infos[int(lenses.numbers[~kept][0])]
@@ -419,7 +419,7 @@ def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None
 
 
 def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: CameraCalibration, log: ReadLog) -> None:
-    """Notes a depth topic with a CameraInfo of its own that is not the left camera's: its pixels are others."""
+    """Note a depth topic whose CameraInfo differs from the left camera's: its pixels do not correspond."""
     left, depth = (roles[role][0].channel.topic for role in ("left", "depth"))
     fx, _, cx, cy = camera.intrinsics_px
     beside = [stream for stream in streams if stream.channel.topic in info_topics(depth)]

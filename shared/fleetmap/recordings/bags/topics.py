@@ -1,4 +1,4 @@
-"""Roles of the topics in an MCAP file: by the conventional name, else by type and name where one choice is left."""
+"""Roles of the topics in an MCAP file: by the conventional name, else by type and name if the choice is unique."""
 
 from collections.abc import Iterable, Mapping
 
@@ -36,14 +36,14 @@ _LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", 
 
 
 def transports(topic: str, role: str) -> tuple[str, ...]:
-    """The topics on which ROS's image_transport may send the images of `topic`; the topic alone for other roles."""
+    """Topics on which ROS's image_transport may send the images of `topic`; only `topic` for other roles."""
     if role not in ("left", "right", "depth") or not topic:
         return (topic,)
     return (topic, *(topic + packed for packed in _PACKED[: 2 if role == "depth" else 1]))
 
 
 def video_issues(channels: Iterable[Channel]) -> list[DataIssue]:
-    """A note of the topics whose messages are pieces of a video; none without such topics."""
+    """Issue about topics whose messages are parts of a video stream; none without such topics."""
     names = sorted(
         f"{channel.topic} ({channel.type_name})" for channel in channels if channel.type_name in _VIDEO_TYPES
     )
@@ -52,10 +52,10 @@ def video_issues(channels: Iterable[Channel]) -> list[DataIssue]:
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: ReadLog) -> dict[str, list[int]]:
-    """The ids of the channels for each role; several where one topic was recorded on several channels.
+    """Choose the channel ids for each role; several if one topic was recorded on several channels.
 
-    RecordingError where a topic that was asked for by name is not there, or where no left image can be told from the
-    others.
+    RecordingError if a topic requested by name is absent, or if the left image is
+    ambiguous.
     """
     by_topic: dict[str, list[Channel]] = {}
     for channel in channels:
@@ -123,7 +123,7 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
 
 
 def _of_one_camera(topics: list[str]) -> str | None:
-    """The topic to read of one camera's: unpacked before packed, as it was taken before rectified; None for several cameras' or none."""
+    """The topic to read of one camera's topics: raw before compressed, original before rectified; None for several cameras or none."""
     cameras = {_camera(topic) for topic in topics}
     return (
         min(topics, key=lambda topic: (topic.endswith(_PACKED), "rect" in topic, topic)) if len(cameras) == 1 else None
@@ -131,7 +131,7 @@ def _of_one_camera(topics: list[str]) -> str | None:
 
 
 def _camera(topic: str) -> str:
-    """What the names of all topics with the images of one camera begin with."""
+    """Common prefix of all topics with the images of one camera."""
     for suffix in _PACKED:
         topic = topic.removesuffix(suffix)
     parent, _, last = topic.rpartition("/")
@@ -150,7 +150,7 @@ def _choose_infos(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str])
 
 
 def info_topics(image_topic: str) -> tuple[str, ...]:
-    """Where ROS and Foxglove have the lens of the camera with this topic of images."""
+    """Topics on which ROS and Foxglove publish the lens of the camera with this image topic."""
     for suffix in _PACKED:
         image_topic = image_topic.removesuffix(suffix)
     parent = image_topic.rpartition("/")[0]

@@ -39,7 +39,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_euroc(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a EuRoC folder. The body is the IMU where imu0/sensor.yaml exists, else EuRoC's body frame."""
+    """Open the recording in a EuRoC folder. The body is the IMU if imu0/sensor.yaml exists, else EuRoC's body frame."""
     root = path.resolve().parent if path.name == "mav0" else path
     log = ReadLog()
     if not (root / "mav0/cam0").is_dir():

@@ -1,4 +1,4 @@
-"""KITTI odometry folders: rectified image pairs, calib.txt, poses.txt and times.txt where they are. No IMU."""
+"""KITTI odometry folders: rectified image pairs, calib.txt, poses.txt and times.txt if present. No IMU."""
 
 import re
 from pathlib import Path
@@ -37,7 +37,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a KITTI folder. The body is the camera that poses.txt is about (KITTI's rectified camera 0)."""
+    """Open the recording in a KITTI folder. The body is the camera of poses.txt (KITTI's rectified camera 0)."""
     log = ReadLog()
     left_name, right_name, left_row, right_row = next(
         pair for pair in _PAIRS if (path / pair[0]).is_dir() or (path / pair[1]).is_dir()
@@ -111,7 +111,7 @@ def _calibration(file: Path, first_image: Path, numbers: tuple[int, int]) -> Rig
 
 
 def _projections(file: Path) -> dict[int, Array]:
-    """The 3x4 matrices by number, of lines with or without `P0:` before twelve numbers."""
+    """Read the projection matrices by number, from lines of twelve numbers with or without a leading `P0:`."""
     rows: dict[int, Array] = {}
     for line in read_table(file).splitlines():
         label, colon, numbers = line.partition(":") if ":" in line else ("", "", line)

@@ -1,4 +1,4 @@
-"""What folder formats share: lists of image files, tables of samples, and the recording made of them."""
+"""Common parts of folder formats: lists of image files, tables of samples, and the recording built from them."""
 
 import contextlib
 import hashlib
@@ -33,7 +33,7 @@ ImageFiles = ImageSeries[Path]
 
 @dataclass(frozen=True)
 class FileReader:
-    """An ImageReader of image files below `root`. read_files: all other files read, for the content's hash."""
+    """An ImageReader of image files below `root`. read_files: all other files that were read, for the content's hash."""
 
     root: Path
     read_files: Sequence[Path]
@@ -45,7 +45,7 @@ class FileReader:
         return self
 
     def hash_into(self, digest: "hashlib._Hash", images: list[Path]) -> None:
-        """Names, sizes and bytes of all files read, in the order of their names."""
+        """Hash names, sizes and bytes of all files read, in the order of their names."""
         named = {self._portable_name(path): path for path in (*self.read_files, *images)}
         for name in sorted(named):
             digest.update(f"{name}\0{named[name].stat().st_size}\0".encode())
@@ -71,12 +71,12 @@ def file_frames(
 
 
 def paired_cameras(cameras: Sequence[ImageFiles], log: ReadLog) -> tuple[ImageFiles, ImageFiles | None]:
-    """Left and right images of the same moments, see `pair_images`; no right ones for one camera."""
+    """Pair left and right images by time, see `pair_images`; no right images for one camera."""
     return (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
 
 
 def read_image(path: Path) -> StoredImage:
-    """The image in a file, not decoded; RecordingError where it cannot be read or has more bytes than any image."""
+    """Read an image file without decoding it; RecordingError if it is unreadable or too large."""
     try:
         if (size := path.stat().st_size) > MAX_IMAGE_BYTES:
             raise RecordingError(
@@ -88,15 +88,15 @@ def read_image(path: Path) -> StoredImage:
 
 
 def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: ReadLog) -> ImageFiles:
-    """The images with increasing stamps that exist, are whole and of the size of most; the others are noted in `log`.
+    """Select the images with increasing stamps that exist, are whole and have the most frequent size; the others are noted in `log`.
 
-    RecordingError where none is left.
+    RecordingError if none is left.
     """
     series = ImageSeries(stamps_ns, tuple(paths)).forward(what, log)
     folders = [folder for folder in {path.parent for path in series.sources} if folder.is_dir()]
     file_bytes: dict[str, int] = {}
     for entry in (entry for folder in folders for entry in os.scandir(folder)):
-        with contextlib.suppress(OSError):  # a link to a file that is not there
+        with contextlib.suppress(OSError):  # a link to a missing file
             file_bytes[entry.path] = entry.stat().st_size
     left_out: dict[str, list[str]] = {}
     kept, sizes_px = [], []
@@ -122,7 +122,7 @@ def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: Re
 
 
 def _fault_and_size(path: Path, file_bytes: int) -> tuple[str, tuple[int, int] | None]:
-    """Why a file is no whole image, empty if it is one; and its width and height, None where its head does not say."""
+    """Reason why a file is not a whole image, empty if it is one; and its width and height, None if unknown."""
     if not file_bytes:
         return "without a byte", None
     try:
@@ -151,14 +151,14 @@ def _fault_and_size(path: Path, file_bytes: int) -> tuple[str, tuple[int, int] |
 
 
 def read_table(path: Path) -> str:
-    """The text of a table; bytes that are no text are replaced, so that damage costs lines and not the file."""
+    """Read the text of a table; invalid bytes are replaced, so that damage costs lines and not the file."""
     return read_text(path, "the recording is incomplete, copy it again", errors="replace")
 
 
 def read_image_list(path: Path, log: ReadLog, *, seconds: bool = False) -> tuple[Stamps, list[Path]]:
-    """Stamps (N,) and image files that a list gives in its first two columns: in ns, or in decimal seconds.
+    """Read stamps (N,), in ns or decimal seconds, and image files from the first two columns of a list.
 
-    RecordingError for a line that has none, but for names of columns in the first, and for files outside the list's folder.
+    RecordingError for an invalid line other than a header, and for files outside the list's folder.
     """
     stamps, files = [], []
     for number, line in enumerate(read_table(path).splitlines(), start=1):
@@ -187,7 +187,7 @@ def read_image_list(path: Path, log: ReadLog, *, seconds: bool = False) -> tuple
 
 
 def _whole_ns(word: str, where: str) -> int:
-    """RecordingError for a number with a decimal point or exponent, with the unit that it looks like; ValueError for other words."""
+    """RecordingError for a number with a decimal point or exponent, naming its likely unit; ValueError for other text."""
     if word.isdecimal():
         return int(word)
     try:
@@ -202,9 +202,9 @@ def _whole_ns(word: str, where: str) -> int:
 
 
 def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
-    """Stamps (N,) in ns and values (N, columns) of a text table, separated by commas or blanks; # begins a comment.
+    """Read stamps (N,) in ns and values (N, columns) of a text table, separated by commas or blanks; # begins a comment.
 
-    Lines that are no such row (a file cut off in the middle of one) are noted in `log`; RecordingError where no line is one, and for
+    Invalid lines (such as the last one of a truncated file) are noted in `log`; RecordingError if no line is valid, and for
     stamps with decimals.
     """
     text = read_table(path).replace(",", " ").replace(";", " ")
@@ -220,7 +220,7 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
         table = _whole_rows(path, text, dtype, log)
     if len(table) == 0:
         first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
-        with contextlib.suppress(ValueError):  # it looks like no unit
+        with contextlib.suppress(ValueError):  # no likely unit
             _whole_ns(first.split()[0] if first else "", str(path))
         there = f"its first is {first[:80]!r}" if first else "it is empty"
         raise RecordingError(
@@ -248,9 +248,9 @@ def _whole_rows(path: Path, text: str, dtype: "np.dtype[np.void]", log: ReadLog)
 
 
 def read_imu(path: Path, log: ReadLog) -> ImuSamples:
-    """The samples in a table of stamps, gyro rad/s and accelerometer m/s^2; none where there is no such file.
+    """Read a table of stamps, gyro rad/s and accelerometer m/s^2; no samples if the file is absent.
 
-    The columns may come in another order than EuRoC's where the first line names them.
+    The column order may differ from EuRoC's if the first line names the columns.
     """
     if not path.is_file():
         return ImuSamples.empty()
@@ -269,12 +269,12 @@ def read_imu(path: Path, log: ReadLog) -> ImuSamples:
 
 
 def read_ground_truth(path: Path, log: ReadLog) -> Trajectory | None:
-    """The trajectory in a table of stamps and x y z qw qx qy qz; None where there is no such file or no usable row."""
+    """Read a trajectory from a table of stamps and x y z qw qx qy qz; None if the file is absent or no row is usable."""
     return trajectory_of_rows(*read_stamped_rows(path, 7, log), log) if path.is_file() else None
 
 
 def optional_truth(file: Path, log: ReadLog, read: Callable[[Path], Trajectory]) -> Trajectory | None:
-    """The ground truth in a file beside a recording, which is used without it where it cannot be read."""
+    """Read the optional ground truth beside a recording; a file that cannot be read is noted and ignored."""
     if not file.is_file():
         return None
     log.files.append(file)
@@ -286,7 +286,7 @@ def optional_truth(file: Path, log: ReadLog, read: Callable[[Path], Trajectory])
 
 
 def read_numbers(path: Path, widths: Sequence[int]) -> Array:
-    """(N, width) of a text table of finite numbers, with one of the widths; RecordingError for anything else."""
+    """Read a text table of finite numbers (N, width), with one of the widths; RecordingError for anything else."""
     rows: list[list[float]] = []
     expected = " or ".join(str(width) for width in widths)
     for number, line in enumerate(read_table(path).splitlines(), start=1):

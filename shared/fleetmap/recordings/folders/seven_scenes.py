@@ -1,9 +1,9 @@
-"""RGB-D folders as 7-Scenes has them: frame-NNNNNN.color, .depth.png in mm, .pose.txt; 30 Hz by the frame number.
+"""RGB-D folders in the layout of 7-Scenes: frame-NNNNNN.color, .depth.png in mm, .pose.txt; 30 Hz by the frame number.
 
 Unless a calibration file says otherwise, colour has f = 525 px and depth f = 585 px, both centred in the image, and the
-depth camera sits 25 mm to the left: the data set's authors give no transform between the two sensors, so this is the
-nominal place of the sensor they used. A calibration file's cam0 is the colour camera, and cam1, where there is one, the
-depth camera. The poses were found from depth, so they are the depth camera's.
+depth camera sits 25 mm to the left: the data set's authors publish no transform between the two sensors, so this is the
+nominal position in their sensor. A calibration file's cam0 is the colour camera, and cam1, if present, the
+depth camera. The poses were computed from depth, so they are the depth camera's.
 """
 
 from dataclasses import replace
@@ -27,7 +27,7 @@ from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import Trajectory
 
 _COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0  # of images that are 640 px wide
-# Of a Kinect. On the red kitchen depth's edges lie on colour's edges best with 28 mm and these focal lengths.
+# Of a Kinect. In the red kitchen sequence, edges in depth and colour align best with 28 mm and these focal lengths.
 _DEPTH_LEFT_OF_COLOUR_M = 0.025
 _FRAME_RATE_HZ = 30
 Depth = NDArray[np.float32]
@@ -39,7 +39,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a 7-Scenes folder. The body is the colour camera; depth comes registered to colour."""
+    """Open the recording in a 7-Scenes folder. The body is the colour camera; depth is returned registered to colour."""
     log = ReadLog()
     colour, depth = pair_images(_files(path, "color", log), _files(path, "depth", log), log, tolerance_ns=0)
     if len(colour) == 0:
@@ -61,7 +61,7 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
 
 
 class DepthRegistration:
-    """Brings depth images of one camera into another one's pixels."""
+    """Reprojects depth images of one camera into another one's pixels."""
 
     def __init__(self, colour: CameraCalibration, depth: CameraCalibration) -> None:
         self._colour = colour
@@ -70,7 +70,7 @@ class DepthRegistration:
         self._is_same_place = bool(np.linalg.norm(colour_from_depth[:3, 3]) < 1e-6)
         self._colour_from_depth = colour_from_depth
         if self._is_same_place:
-            # The depth pixel of every colour pixel, whatever the depth
+            # The depth pixel of every colour pixel, for any depth
             rays_colour = colour.ray_from_pixel(_pixels(colour))
             pixels = depth.pixel_from_ray(rays_colour @ colour_from_depth[:3, :3])
             self._map = np.nan_to_num(pixels, nan=-1e4).astype(np.float32).reshape(colour.height_px, colour.width_px, 2)
@@ -82,7 +82,7 @@ class DepthRegistration:
     def registered(self, depth_m: Depth, where: str) -> Depth:
         """(H, W) metres along the colour camera's axis, 0 where unknown, of a depth image in the depth camera's pixels.
 
-        From one place the nearest depth pixel is taken. From another place points are projected one by one and the
+        With a common centre the nearest depth pixel is taken. Otherwise points are projected one by one and the
         nearest surface wins, so that thin gaps stay unknown.
         """
         if depth_m.shape != self._depth_size:
@@ -148,7 +148,7 @@ def _ground_truth(colour: ImageFiles, depth_from_body: Array, log: ReadLog) -> T
 
 
 def _rigid(file: Path) -> Array | None:
-    """(4, 4) of a file; None where the tracking of the data set had failed or the file is damaged."""
+    """(4, 4) pose in a file; None if the data set's tracking had failed or the file is damaged."""
     try:
         matrix = np.array(read_table(file).split(), np.float64).reshape(4, 4)
     except (ValueError, RecordingError):

@@ -40,7 +40,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a TUM RGB-D folder. The body is the colour camera, or what a calibration file says; depth is read to one mm."""
+    """Open the recording in a TUM RGB-D folder. The body is the colour camera unless a calibration file differs. Depth: to one mm."""
     log = ReadLog()
     colour_files, depth_files = _images(path / "rgb.txt", log), _images(path / "depth.txt", log)
     colour, depth = pair_images(colour_files, depth_files, log, DEPTH_TOLERANCE_NS)
@@ -75,10 +75,10 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
 
 
 class _Scaled:
-    """Depth that is registered already, in its own unit."""
+    """Depth that is already registered, in its own unit."""
 
     def registered(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
-        """Metres, of what was read as whole mm."""
+        """Metres, from whole mm."""
         return depth_m / np.float32(_UNITS_PER_MM)
 
 

@@ -28,7 +28,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_tumvi(path: Path, options: OpenOptions) -> Recording:
-    """The recording in a TUM-VI folder. The body is the IMU, as in Kalibr's camchain."""
+    """Open the recording in a TUM-VI folder. The body is the IMU, as in Kalibr's camchain."""
     log = ReadLog()
     if not (path / "cam0/images").is_dir():
         raise RecordingError(f"{path / 'cam0/images'} is missing, cam1 is there; copy the recording again")
@@ -55,7 +55,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
 
 
 def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
-    """The images by times.txt (`name seconds exposure`), or by their names in ns where there is no such file."""
+    """List the images by times.txt (`name seconds exposure`), or by their names in ns if that is absent."""
     files = {p.stem: p for p in (folder / "images").iterdir() if p.is_file()}
     times = folder / "times.txt"
     if times.is_file():

@@ -1,7 +1,7 @@
 """Opens MCAP recordings: rosbag2 style (CDR) and Foxglove protobuf; whole, cut off or damaged, with or without their index.
 
-The mcap library parses the records. Its readers are not used, because they stop at the first damage, take memory as the file says, and
-lose the chunk that a power failure cut: here what does not fit is noted as a DataIssue, the walk goes on at the next chunk where the file
+The mcap library parses the records. Its readers are not used, because they stop at the first damage, allocate as the file declares, and
+lose a chunk truncated by a power failure. Here damage is noted as a DataIssue, reading continues at the next chunk if the file
 still has its index, and sizes are compared with limits before anything is read or unpacked.
 """
 
@@ -31,9 +31,9 @@ from fleetmap.sensors.samples import DataIssue
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_LARGEST_RECORD_BYTES = 1 << 31  # beyond it the bytes are no record at all
-_MAX_RECORD_BYTES = MAX_MESSAGE_BYTES + (64 << 10)  # a chunk that is not compressed, with its head
-_KEPT_CHUNKS = 2  # that were unpacked, so that going through in order is cheap
+_LARGEST_RECORD_BYTES = 1 << 31  # larger lengths are not those of a record
+_MAX_RECORD_BYTES = MAX_MESSAGE_BYTES + (64 << 10)  # an uncompressed chunk, with its header
+_KEPT_CHUNKS = 2  # unpacked chunks kept, so that sequential reading is cheap
 _MOST_ISSUES = 20
 _PARSED: dict[int, Any] = {
     Opcode.SCHEMA: records.Schema,
@@ -47,12 +47,12 @@ _PARSED: dict[int, Any] = {
 
 
 def recognises(path: Path) -> bool:
-    """True for a file that begins as MCAP does or is named .mcap, or a rosbag2 folder with one such file."""
+    """True for a file with MCAP's magic bytes or named .mcap, or a rosbag2 folder with one such file."""
     return _mcap_file(path) is not None
 
 
 def open_mcap(path: Path, options: OpenOptions) -> Recording:
-    """The recording in an MCAP file (or the one in a rosbag2 folder), as far as it is whole; its issues say what is not."""
+    """Open the recording in an MCAP file (or the one in a rosbag2 folder); its issues list damaged and missing parts."""
     file_path = _mcap_file(path)
     assert file_path is not None
     pieces = len(list(path.glob("*.mcap"))) if path.is_dir() else 1
@@ -69,7 +69,7 @@ def _mcap_file(path: Path) -> Path | None:
 
 
 class McapFile(KeptBytes):
-    """An open MCAP file as a Container. A place: byte, length, and -1 or the byte of the compressed chunk that it lies in unpacked."""
+    """An open MCAP file as a Container. A place: byte, length, and -1, or the byte of the compressed chunk in whose content they lie."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, path.stat().st_size)
@@ -172,7 +172,7 @@ class McapFile(KeptBytes):
         if chunk.compression:
             base, chunk_at = 0, at
         else:
-            base, chunk_at = at + 40, -1  # the records lie in the file as they are, behind the chunk's head
+            base, chunk_at = at + 40, -1  # the records are stored uncompressed after the chunk's header
         position = 0
         while position + _RECORD_HEAD.size <= len(unpacked):
             opcode, length = _RECORD_HEAD.unpack_from(unpacked, position)
@@ -184,7 +184,7 @@ class McapFile(KeptBytes):
             position += length
 
     def _content(self, opcode: int, content: memoryview, at: int, chunk_at: int) -> Iterator[Message]:
-        """The message in a record's content at byte `at`; other records are kept."""
+        """Return the message in a record's content at byte `at`; other records are kept."""
         try:
             if opcode != Opcode.MESSAGE:
                 self._keep_record(_parsed(opcode, content), content)
@@ -215,7 +215,7 @@ class McapFile(KeptBytes):
                 if crc and zlib.crc32(content[:-4]) != crc:
                     raise ValueError(f"the attachment {record.name[:80]!r} fails its checksum")
                 self.attachments[record.name] = record.data
-            case records.Metadata(name="fleetmap"):  # what McapRecordingWriter wrote of the whole recording
+            case records.Metadata(name="fleetmap"):  # metadata of the whole recording, by McapRecordingWriter
                 self.name = record.metadata.get("name", self.name)
                 if "stamps" in record.metadata:
                     self.issues.append(UNCERTAIN_STAMPS)
@@ -231,7 +231,7 @@ class McapFile(KeptBytes):
         return self._chunks[at]
 
     def _next_indexed_chunk(self, after: int) -> int | None:
-        """Start of the first chunk behind `after`, by the index at the file's end; None without one."""
+        """Start of the first chunk after `after`, by the index at the file's end; None without one."""
         if self._chunk_starts is None:
             self._chunk_starts = sorted(self._indexed_chunks())
         behind = bisect_right(self._chunk_starts, after)
@@ -263,7 +263,7 @@ class McapFile(KeptBytes):
 
 
 def _parsed(opcode: int, content: bytes | memoryview) -> Any:
-    """A record by the mcap library, which is given its content alone; ValueError for what is none."""
+    """Parse a record with the mcap library, from its content alone; ValueError for invalid content."""
     try:
         return _PARSED[opcode].read(ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:  # the last: of lengths beyond 63 bits

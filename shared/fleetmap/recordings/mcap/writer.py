@@ -35,16 +35,16 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Tra
 from fleetmap.sensors.source_settings import Topics
 
 BODY_FRAME, BASE_FRAME, MAP_FRAME, ODOM_FRAME = "body", "base", "map", "odom"
-_CHUNK_BYTES = 1 << 20  # what one flipped bit costs at most
+_CHUNK_BYTES = 1 << 20  # the most that a flipped bit can destroy
 
 
 class McapRecordingWriter:
     """Writes one recording to `path`; the file appears there when it is closed, complete or not at all.
 
-    Samples of one kind must come in the order of their stamps; kinds may interleave in any way, ROS tools like them
-    roughly in order. name: what the recording is called when it is opened again, the file's stem unless given.
-    in_place: for sensors, whose samples come once: the file is there from the beginning, and what was written of it can be read even
-    where nobody closed it. has_uncertain_stamps: it is noted where the file is opened.
+    Samples of one kind must be written in the order of their stamps; kinds may interleave in any way, ROS tools prefer them
+    roughly in order. name: name of the recording when opened, the file's stem unless given.
+    in_place: for live sensors: the file exists from the beginning, and can be read up to the last write even
+    if it was never closed. has_uncertain_stamps: noted as an issue when the file is opened.
     """
 
     def __init__(
@@ -77,11 +77,11 @@ class McapRecordingWriter:
         self._writer.add_attachment(0, 0, CALIBRATION_ATTACHMENT, "application/yaml", text)
 
     def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """A file within the file, which recordings do not look at."""
+        """Attach a file, which recordings ignore."""
         self._writer.add_attachment(0, 0, name, media_type, data)
 
     def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """One frame with its CameraInfo.
+        """Write one frame with its CameraInfo.
 
         Images that are JPEG or PNG already as CompressedImage, all others as Image.
         """
@@ -113,13 +113,13 @@ class McapRecordingWriter:
             self._write(self._topics.prior, "geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, data)
 
     def write_ground_truth(self, trajectory: Trajectory) -> None:
-        """True frame_from_body, all of it or a piece."""
+        """Write the true frame_from_body, all of it or a part."""
         for stamp_ns, frame_from_body in zip(trajectory.stamps_ns.tolist(), trajectory.frame_from_body, strict=True):
             data = messages.encode_pose(stamp_ns, MAP_FRAME, frame_from_body)
             self._write(self._topics.ground_truth, "geometry_msgs/PoseStamped", stamp_ns, data)
 
     def close(self) -> None:
-        """Ends the file and gives it its name. Closing twice does nothing."""
+        """Finish the file and give it its name. Closing twice does nothing."""
         if self._file.closed:
             return
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -127,7 +127,7 @@ class McapRecordingWriter:
         self._part.replace(self._path)
 
     def discard(self) -> None:
-        """Throws away what was written."""
+        """Discard the written file."""
         self._file.close()
         self._part.unlink(missing_ok=True)
 
@@ -189,9 +189,9 @@ class McapRecordingWriter:
 
 
 def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] = lambda: None) -> None:
-    """Writes all of `recording` to a new file at `path`; images keep their encoding, `on_frame` follows every frame.
+    """Write all of `recording` to a new file at `path`; images keep their encoding, `on_frame` is called after every frame.
 
-    Samples go before the frame that follows them, so that the file is in the order of time to within one frame. The
+    Samples precede the frame that follows them, so that the file is ordered in time to within one frame. The
     file appears at `path` only when it is complete.
     """
     is_uncertain = UNCERTAIN_STAMPS in recording.issues
@@ -208,7 +208,7 @@ def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] 
 
 
 def _write_between(recording: Recording, writer: McapRecordingWriter, start_ns: int, end_ns: int) -> None:
-    """Everything but frames with start_ns <= stamp < end_ns."""
+    """Write all samples except frames with start_ns <= stamp < end_ns."""
     writer.write_imu(recording.imu.between(start_ns, end_ns))
     writer.write_wheel(sample for sample in recording.wheel if start_ns <= sample.stamp_ns < end_ns)
     writer.write_prior(prior for prior in recording.priors if start_ns <= prior.stamp_ns < end_ns)

@@ -85,7 +85,7 @@ _SERVICES = {
 
 
 def service_definitions(name: str, request: str, response: str) -> dict[str, str]:
-    """The messages that a service such as std_srvs/srv/Empty is described by, and its own description. Source: REP 2016."""
+    """Definitions of a service such as std_srvs/srv/Empty and of its messages. Source: REP 2016."""
     return {
         f"{name}_Request": request,
         f"{name}_Response": response,
@@ -100,7 +100,7 @@ _SEPARATOR = "=" * 80
 
 
 def ros2msg(type_name: str) -> str:
-    """The full definition of a message type such as `sensor_msgs/Imu`, with those it is made of behind it."""
+    """The full definition of a message type such as `sensor_msgs/Imu`, followed by those of its parts."""
     parts = [DEFINITIONS[type_name]]
     for name in _parts_of(type_name):
         parts += [_SEPARATOR, f"MSG: {name}", DEFINITIONS[name]]

@@ -14,7 +14,7 @@ PUBLISHER, SUBSCRIPTION, SERVICE = "MP", "MS", "SS"
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """Quality of service, always reliable: how many messages are kept, and whether late subscribers get them (transient local)."""
+    """Quality of service, always reliable: depth of the history, and transient local (late subscribers get the history) or not."""
 
     depth: int = 10
     is_transient_local: bool = False
@@ -25,7 +25,7 @@ LATCHED = Qos(1, is_transient_local=True)
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """One publisher, subscription or service of a node. name: fully qualified, such as /tf; number: its own in the node, above 0."""
+    """One publisher, subscription or service of a node. name: fully qualified, such as /tf; number: unique in the node, above 0."""
 
     kind: str
     name: str
@@ -44,7 +44,7 @@ class NodeName:
 
 
 class RmwZenohKeys:
-    """Keys as rmw_zenoh makes them, from ROS 2 Iron on: earlier ones have no hashes of types."""
+    """Keys of rmw_zenoh, from ROS 2 Iron on: earlier releases have no type hashes."""
 
     def __init__(self, domain: int) -> None:
         self._domain = domain
@@ -53,18 +53,18 @@ class RmwZenohKeys:
         return ros_key(self._domain, name, type_name)
 
     def subscription(self, topic: str) -> str:
-        """Matches the keys of a topic, whatever its type."""
+        """Key expression for a topic of any type."""
         return ros_key_expr(self._domain, topic)
 
     def type_of(self, key: str) -> str:
-        """The message type of a key; empty where it names none."""
+        """The message type of a key; empty if it has none."""
         return type_of_key(key)
 
     def node_token(self, node: NodeName) -> str:
         return f"@ros2_lv/{self._domain}/{node.session}/0/0/NN/{self._place(node)}"
 
     def token(self, node: NodeName, endpoint: Endpoint) -> str:
-        """The quality of service leaves out what is rmw_zenoh's default: reliable 1, volatile 2, keep last 1, 42."""
+        """Liveliness token. Its quality of service omits rmw_zenoh's defaults: reliable 1, volatile 2, keep last 1, 42."""
         name, kind = f"%{topic_chunks(endpoint.name).replace('/', '%')}", dds_type(endpoint.type_name)
         qos = f":{'1' if endpoint.qos.is_transient_local else ''}:,{endpoint.qos.depth}:,:,:,,"
         start = f"@ros2_lv/{self._domain}/{node.session}/0/{endpoint.number}/{endpoint.kind}"
@@ -76,7 +76,7 @@ class RmwZenohKeys:
 
 
 class BridgedDdsKeys:
-    """Keys as zenoh-bridge-ros2dds makes them for robots on DDS."""
+    """Keys of zenoh-bridge-ros2dds for robots on DDS."""
 
     def key(self, name: str, _: str) -> str:
         return topic_chunks(name)
@@ -88,11 +88,11 @@ class BridgedDdsKeys:
         return ""
 
     def node_token(self, node: NodeName) -> str:
-        """To a bridge a node is another bridge."""
+        """Token of a node, which other bridges see as a bridge."""
         return f"@/{node.session}/@ros2_lv"
 
     def token(self, node: NodeName, endpoint: Endpoint) -> str:
-        """The quality of service is in Cyclone DDS's numbers: reliable 1, transient local 1, keep last 0."""
+        """Liveliness token. Its quality of service uses Cyclone DDS's numbers: reliable 1, transient local 1, keep last 0."""
         name, (package, *_, short) = topic_chunks(endpoint.name).replace("/", "§"), endpoint.type_name.split("/")
         if endpoint.kind == SERVICE:
             return f"@/{node.session}/@ros2_lv/SS/{name}/{package}§srv§{short}"

@@ -13,7 +13,7 @@ from typing import Any
 from fleetmap.errors import UsageError
 from fleetmap.recordings.ros2.definitions import DEFINITIONS
 
-# type_description_interfaces/FieldType: numbers of the types, and what is added for fixed and for unbounded arrays.
+# type_description_interfaces/FieldType: numbers of the types, and offsets for fixed and for unbounded arrays.
 _NUMBERS = "int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
 _TYPE_IDS = dict(zip(_NUMBERS.split(), range(2, 12), strict=True)) | {"bool": 15, "byte": 16, "string": 17}
 _NESTED, _FIXED_ARRAY, _BOUNDED, _SEQUENCE = 1, 48, 96, 144
@@ -28,31 +28,31 @@ def ros_key(domain: int, topic: str, type_name: str) -> str:
 
 
 def dds_type(type_name: str) -> str:
-    """The name of a type as DDS has it, such as sensor_msgs::msg::dds_::Imu_."""
+    """DDS name of a type, such as sensor_msgs::msg::dds_::Imu_."""
     package, kind, name = _long(type_name).split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 def ros_key_expr(domain: int, topic: str) -> str:
-    """Matches the keys of a topic, whatever its type."""
+    """Key expression for a topic of any type."""
     return f"{domain}/{topic_chunks(topic)}/*/*"
 
 
 def type_of_key(key: str) -> str:
-    """The message type, such as sensor_msgs/Imu, of a key; empty where it names none."""
+    """The message type, such as sensor_msgs/Imu, of a key; empty if it has none."""
     chunks = key.split("/")
     parts = chunks[-2].split("::") if len(chunks) >= 4 else []
     return f"{parts[0]}/{parts[3].removesuffix('_')}" if len(parts) == 4 and parts[1:3] == ["msg", "dds_"] else ""
 
 
 def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:
-    """The attachment of a message: its number and time at the publisher, whose name is 16 bytes."""
+    """Attachment of a message: sequence number, time, and the publisher's id of 16 bytes."""
     assert len(gid) == _GID_BYTES
     return _ATTACHMENT.pack(sequence, source_ns, _GID_BYTES) + gid
 
 
 def answer_attachment(question: bytes, source_ns: int) -> bytes:
-    """The attachment of a service's answer: number and name of the question's; empty where the question has none of rmw_zenoh."""
+    """Attachment of a service's reply: number and id of the request's; empty if the request has no attachment of rmw_zenoh."""
     if len(question) != _ATTACHMENT.size + _GID_BYTES or question[_ATTACHMENT.size - 1] != _GID_BYTES:
         return b""
     return attachment(_ATTACHMENT.unpack_from(question)[0], source_ns, question[_ATTACHMENT.size :])
@@ -98,7 +98,7 @@ def _long(type_name: str) -> str:
 
 
 def topic_chunks(topic: str) -> str:
-    """The chunks of a topic's or service's name in a key; UsageError for what is no name."""
+    """The chunks of a topic's or service's name in a key; UsageError for an invalid name."""
     chunks = topic.strip("/")
     if not chunks or not all(re.fullmatch(r"[A-Za-z_]\w*", chunk) for chunk in chunks.split("/")):
         raise UsageError(f"topic {topic!r}: write it like /cam0/image_raw, of letters, digits and _")

@@ -1,7 +1,7 @@
-"""The ROS 2 messages that recordings are made of: bytes (CDR) to the project's values and back.
+"""ROS 2 messages of recordings: conversion between bytes (CDR) and the project's values.
 
-Decoding raises ValueError for bytes that are no such message; the reader counts them. Rotations are written as
-quaternions x y z w and covariances translation first, as ROS does; here they are wxyz and rotation first.
+Decoding raises ValueError for invalid bytes; the reader counts them. Rotations are written as
+quaternions x y z w and covariances translation first, as in ROS; here they are wxyz and rotation first.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
-# Assumed of odometry without a covariance
+# Assumed for odometry without a covariance
 UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 _ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
 _IMU_DOUBLES = 37
-_SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand, and no rotation any more
+_SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand; not a rotation
 
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
     """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image.
 
-    matrix and projection are those of the whole picture, width_px x height_px. binning (2,): pixels that the driver joins to one; zeros
+    matrix and projection are those of the full image, width_px x height_px. binning (2,): pixels that the driver combines; zeros
     mean 1. roi (4,): x, y, width, height of the part that it sends, before binning; zeros mean all.
     """
 
@@ -44,9 +44,9 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class FrameLink:
-    """One transform of a /tf or /tf_static message: parent_from_child (4, 4), and its stamp where it was read.
+    """One transform of a /tf or /tf_static message: parent_from_child (4, 4), and its stamp if it was read from one.
 
-    issue: what is wrong with its numbers; parent_from_child is NaN where they are no transform.
+    issue: fault of its numbers; parent_from_child is NaN if they are not a transform.
     """
 
     parent: str
@@ -84,7 +84,7 @@ def encode_image(stamp_ns: int, frame_id: str, image: StoredImage) -> bytes:
 
 
 def decode_compressed_image(data: bytes, where: str) -> StoredImage:
-    """sensor_msgs/CompressedImage: an image file's bytes, behind a 12-byte head where compressed_depth_image_transport packed them."""
+    """sensor_msgs/CompressedImage: an image file's bytes, after a 12-byte header if packed by compressed_depth_image_transport."""
     reader = CdrReader(data)
     reader.stamp_ns(), reader.text()
     form, content = reader.text(), reader.blob()
@@ -143,7 +143,7 @@ def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) 
 def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
     """Stamps (N,), gyro (N, 3), accelerometer (N, 3) of sensor_msgs/Imu messages, and the frame_id of the first.
 
-    Messages of one length and byte order are read together; ValueError names none of them: the caller reads singly to
+    Messages of one length and byte order are read together; ValueError does not name the faulty one: the caller decodes one by one to
     find it.
     """
     if len({(len(data), data[:2]) for data in messages}) > 1:
@@ -238,7 +238,7 @@ def decode_frame_links(data: bytes) -> list[FrameLink]:
 
 
 def frame_link(parent: str, child: str, translation: Array, quat_wxyz: Array) -> FrameLink:
-    """The transform of a quaternion that may be a little off unit length; one that is no rotation costs this transform alone."""
+    """The transform of a quaternion that may deviate slightly from unit length; NaN with an issue if it is not a rotation."""
     parent, child, norm = parent.lstrip("/"), child.lstrip("/"), float(np.linalg.norm(quat_wxyz))
     is_usable = bool(np.isfinite(translation).all() and abs(norm - 1) < _MOST_OFF_UNIT)  # False for NaN
     issue = ""

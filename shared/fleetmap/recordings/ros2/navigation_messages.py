@@ -1,6 +1,6 @@
-"""Messages and services between a robot's localizer and nav2: bytes (CDR) to values and back.
+"""Messages and services between a robot's localizer and nav2: conversion between bytes (CDR) and values.
 
-Decoding raises ValueError for bytes that are no such message, FleetmapError for one whose content cannot be used.
+Decoding raises ValueError for invalid bytes, FleetmapError for unusable content.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True)
 class BondStatus:
-    """bond/Status: one side of a bond says that it lives, or that it ends."""
+    """bond/Status: one side of a bond reports that it is alive, or that it ends."""
 
     bond: str
     instance: str
@@ -53,9 +53,9 @@ class BondStatus:
 
 
 def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
-    """geometry_msgs/PoseWithCovarianceStamped of a person: a prior from this moment on, whatever its stamp.
+    """geometry_msgs/PoseWithCovarianceStamped of an operator: a prior from now on, independent of its stamp.
 
-    RecordingError for another frame, a pose or covariance that is not finite, and a covariance that is none.
+    RecordingError for another frame, a pose or covariance that is not finite, and an invalid covariance.
     """
     _, frame_id = header_of(data)
     if frame_id.lstrip("/") != map_frame:

@@ -1,5 +1,5 @@
 """Camera models: pixel_from_ray and ray_from_pixel for each. To add one: a file here, a line in CAMERA_MODELS, and one in _NAMES
-for each name that calibration files have for it. Parameters beyond fx, fy, cx and cy are its `distortion`."""
+for each of its names in calibration files. Parameters beyond fx, fy, cx and cy are its `distortion`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class _Unproject(Protocol):
 class CameraModel:
     """A lens model.
 
-    pixel_from_ray(intrinsics_px (4,) fx fy cx cy, distortion (k,), rays_cam (N, 3)) -> (N, 2) px, NaN where the lens cannot see.
+    pixel_from_ray(intrinsics_px (4,) fx fy cx cy, distortion (k,), rays_cam (N, 3)) -> (N, 2) px, NaN outside the lens's field of view.
     ray_from_pixel(intrinsics_px, distortion, pixels (N, 2)) -> (N, 3) unit rays, NaN where no ray maps to the pixel.
-    core_lens(distortion) -> the coefficients as the core takes them, and the x^2 + y^2 at which a radial-tangential image folds back.
+    core_lens(distortion) -> the coefficients in the core's order, and the x^2 + y^2 at which a radial-tangential image folds back.
     The core chooses the lens by their number: 8 are radial-tangential, 4 equidistant.
     """
 
@@ -44,7 +44,7 @@ CAMERA_MODELS = {
     )
 }
 
-# Names by which ROS, Kalibr, EuRoC, OpenCV and OpenVINS call a lens; ROS leaves it empty where it means plumb_bob
+# Lens names of ROS, Kalibr, EuRoC, OpenCV and OpenVINS; in ROS an empty name means plumb_bob
 _NAMES = {
     "plumb_bob": "radial-tangential",
     "radtan": "radial-tangential",
@@ -55,15 +55,15 @@ _NAMES = {
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
 }
-_NO_PINHOLES = ("omni", "mei", "sphere", "unified", "eucm")  # even where their coefficients are zero
+_NO_PINHOLES = ("omni", "mei", "sphere", "unified", "eucm")  # even if their coefficients are zero
 _NEXT_STEP = "calibrate with one of these, or record rectified images, or pass a calibration with --calibration FILE"
 
 
 def lens_of(name: str, coefficients: Array, where: str) -> tuple[str, Array]:
-    """The key of CAMERA_MODELS and the distortion of a lens as another program names it; `where` is for error messages.
+    """Translate another program's lens name to a key of CAMERA_MODELS and its distortion; `where` is for error messages.
 
     Coefficients are in OpenCV's order. Zeros at their end are cut off, so that one lens has one form: ROS writes five or
-    eight where four are known. CalibrationError for lenses that are not supported, for other counts and for what is not finite.
+    eight where four are known. CalibrationError for lenses that are not supported, for other counts and for values that are not finite.
     """
     name = name.lower()
     if not np.isfinite(coefficients).all():

@@ -37,7 +37,7 @@ def core_lens(distortion: Array) -> tuple[Array, float]:
 
 
 def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
-    """(N, 3) unit rays of pixels (N, 2). Newton's method on the radius; NaN where no angle gives it."""
+    """(N, 3) unit rays of pixels (N, 2). Newton's method on the radius; NaN if no angle gives it."""
     fx, fy, cx, cy = intrinsics_px
     x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     goal = np.hypot(x, y)

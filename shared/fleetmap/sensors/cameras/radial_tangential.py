@@ -1,4 +1,4 @@
-"""Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3 [k4 k5 k6]]; none at all for an empty distortion.
+"""Pinhole with radial-tangential distortion k1 k2 p1 p2 [k3 [k4 k5 k6]]; without distortion if the coefficients are empty.
 
 The radial factor is (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6). Sources: Brown 1966; OpenCV's order and its
 rational model.
@@ -60,7 +60,7 @@ def core_lens(distortion: Array) -> tuple[Array, float]:
 
 
 def ray_from_pixel(intrinsics_px: Array, distortion: Array, pixels: Array) -> Array:
-    """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN where it does not come back to the pixel."""
+    """(N, 3) unit rays of pixels (N, 2). Newton's method with a numeric Jacobian; NaN if it does not converge to the pixel."""
     fx, fy, cx, cy = intrinsics_px
     goal_x, goal_y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
     x, y = core.undistort(np.array(_coefficients(distortion)), goal_x, goal_y)
