@@ -1,7 +1,7 @@
-"""The compiled core, of shared/core. Arrays are taken as they are, C-contiguous and of the type named here, and never converted.
+"""The compiled core, built from shared/core. Arrays must be C-contiguous and of the type named here; they are never converted.
 
-Headers there say what each function does. Images (H, W) uint8 grey, descriptors (N, 4) uint64 of 256 bits, pixels (N, 2) float32.
-ValueError for sizes and numbers that cannot be, TypeError for another kind of array; what is not finite gives values.
+The headers there document each function. Images (H, W) uint8 grey, descriptors (N, 4) uint64 of 256 bits, pixels (N, 2) float32.
+ValueError for invalid sizes and numbers, TypeError for another kind of array; input that is not finite raises no error.
 """
 
 from collections.abc import Callable
@@ -18,14 +18,14 @@ _Reals = NDArray[np.float64]
 _Flags = NDArray[np.bool_]
 _Floats = NDArray[np.float32]
 _Octaves = NDArray[np.int8]
-# Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), whether the disparities are measured.
+# Of a keyframe: pixels (N, 2), octaves, descriptors, disparities (N, 2), points_cam (N, 3), True if the disparities are measured.
 _Features = tuple[_Reals, _Octaves, _Descriptors, _Reals, _Reals, bool]
 _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
 _Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
-    """Of each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
+    """For each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
 
 def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) -> _Indices:
     """(P, 2) pairs that are each other's nearest."""
@@ -33,7 +33,7 @@ def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) ->
 def mutual_within(
     a: _Descriptors, nodes_a: _Numbers, b: _Descriptors, nodes_b: _Numbers, max_distance: int, ratio: float
 ) -> _Indices:
-    """(P, 2) pairs that are each other's nearest, of nodes_a (A, 2) and nodes_b (B,) that share one."""
+    """(P, 2) pairs that are each other's nearest, among pairs with a common node in nodes_a (A, 2) and nodes_b (B,)."""
 
 def match_projected(
     predicted: _Reals,
@@ -46,7 +46,7 @@ def match_projected(
     max_distance: int,
     ratio: float,
 ) -> tuple[_Indices, _Numbers]:
-    """(A,) index of the feature of b, of pixels (B, 2), that shows each of a near predicted (A, 2); their distance."""
+    """(A,) index of the feature of b, at pixels (B, 2), that matches each of a near its predicted pixel (A, 2); their distance."""
 
 def descend(
     descriptors: _Descriptors,
@@ -61,11 +61,11 @@ def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
     """(N, 2) numbers of the nearest and the second nearest centre."""
 
 class InvertedFile:
-    """Places by the words that they show."""
+    """Index of places by their words."""
 
     def __init__(self, words: int) -> None: ...
     def add(self, word_ids: _Numbers, weights: _Floats) -> None:
-        """The next place: its words (W,), rising, and their weights."""
+        """Add the next place: its words (W,), ascending, and their weights."""
 
     def scores(self, word_ids: _Numbers, weights: _Floats) -> _Reals:
         """(P,) of each place: 1 - |a - b|_1 / 2, 1 for equal vectors."""
@@ -83,7 +83,7 @@ def refine_pnp(
 
     points (N, 3) in the source frame, pixels (N, 3) u_left v u_right (NaN none), weights (N, 2) 1 / sigma of u and v, of the disparity.
     lens: focal, cx, cy, focal * baseline. refinement: width of the robust weight in sigmas, squared gate of inliers, iterations on
-    all and on inliers. prior (6, 6): information that holds the start.
+    all and on inliers. prior (6, 6): information on the initial pose.
     """
 
 def ransac_pnp(
@@ -97,7 +97,7 @@ def ransac_pnp(
     draws: _Reals,
     confidence: float,
 ) -> tuple[_Reals, _Reals, _Reals] | None:
-    """As refine_pnp without a start. draws (I, 3) in [0, 1): which three points propose."""
+    """As refine_pnp without an initial pose. draws (I, 3) in [0, 1) select the three points of each proposal."""
 
 def pnp_with_rotation(
     points: _Reals,
@@ -110,7 +110,7 @@ def pnp_with_rotation(
     rotation: _Reals,
     rotation_sigma_rad: float,
 ) -> tuple[_Reals, _Reals, _Reals] | None:
-    """As ransac_pnp where the rotation (3, 3) is nearly known."""
+    """As ransac_pnp with a nearly known rotation (3, 3)."""
 
 def visible_landmarks(
     cones: tuple[_Reals, _Floats, _Floats, _Floats],
@@ -124,7 +124,7 @@ def visible_landmarks(
     """Rows (V,), pixels (V, 3) u_left v u_right and octaves (V,) of the landmarks in the image widened by margin_px.
 
     cones: points_map (N, 3), directions_map (N, 3), half_angles_rad (N,), max_distances_m (N,), these times distance_scale.
-    pinhole: focal, cx, cy, focal * baseline, width, height. max_view_angle_rad: how far outside its cone a landmark may be seen.
+    pinhole: focal, cx, cy, focal * baseline, width, height. max_view_angle_rad: largest angle of view outside a landmark's cone.
     """
 
 class FixFinder:
@@ -150,7 +150,7 @@ class FixFinder:
         refinement: tuple[float, float, tuple[int, int]],
     ) -> None: ...
     def median_distance_m(self, map_from_cam: _Reals) -> float:
-        """Of the landmarks that a camera should see; NaN without any."""
+        """Median distance of the landmarks expected in a camera's view; NaN without any."""
 
     def by_projection(
         self,
@@ -162,21 +162,21 @@ class FixFinder:
         tuple[_Reals, _Reals, int, _Indices, _Indices, _Flags, tuple[_Reals, _Reals, _Reals], _Indices, _Flags, bool]
         | None
     ):
-        """The verified place near map_from_cam, None without one.
+        """Find the verified pose near map_from_cam, None without one.
 
         features: pixels (M, 3) u_left v u_right, those in the left image (M, 2), octaves, descriptors. unmeasured: the pair of images,
-        pixels again and which features were tried (M,), both of which are written. Returns map_from_cam and its covariance, how many
-        parts of the image hold inliers, the features and landmarks matched at the end (P,), which of them are inliers, their points (P, 3),
-        pixels (P, 3) and sigmas (P, 2), the landmarks that should be seen (E,), which of them are, and whether the survey passed there.
+        pixels again and flags of tried features (M,), both of which are written. Returns map_from_cam and its covariance, the number of
+        image cells with inliers, features and landmarks of the final matches (P,), flags of inliers among them, their points (P, 3),
+        pixels (P, 3) and sigmas (P, 2), the expected landmarks (E,), flags of seen ones, and True if the survey passed there.
         """
 
 def nearest_cells(descriptors: _Descriptors, centres: _Descriptors, cells: int) -> _Numbers:
-    """(N, cells) numbers of the nearest centres, the nearest first; -1 where there are fewer."""
+    """(N, cells) numbers of the nearest centres, the nearest first; -1 if there are fewer."""
 
 def near_descriptors(
     descriptors: _Descriptors, centres: _Descriptors, cells: int, held: _Descriptors, starts: _Indices, max_bits: int
 ) -> _Flags:
-    """(M,) which of held are within max_bits of any of descriptors, in so many cells nearest to that; starts (C + 1,) of the cells."""
+    """(M,) True for held descriptors within max_bits of any query, in a number of cells nearest to it; starts (C + 1,) of the cells."""
 
 def lookalikes(
     features: _Descriptors,
@@ -192,10 +192,10 @@ def lookalikes(
 def camera_votes(
     pairs: _Numbers, offsets_m: _Reals, points_map: _Reals, low_m: _Reals, cell_m: float, columns: int, rows: int
 ) -> _Numbers:
-    """(columns, rows) features that vote for a camera in a square of two cells' side that begins at the cell's corner.
+    """(columns, rows) numbers of features that vote for a camera in a square of two cells' side that begins at the cell's corner.
 
-    pairs (P, 2) of features and landmarks, all those of a feature together. offsets_m (F, 2): from the camera to what each feature
-    shows, turned as the camera would be. points_map (N, 3). low_m (2,): where the cells begin.
+    pairs (P, 2) of features and landmarks, all those of a feature together. offsets_m (F, 2): from the camera to each feature's
+    point, in the rotation of the hypothesis. points_map (N, 3). low_m (2,): corner of the first cell.
     """
 
 def mark_shared(
@@ -204,7 +204,7 @@ def mark_shared(
     reach_m: float,
     max_bits: int,
 ) -> None:
-    """Sets flags (N,) of landmarks at points_odom (N, 3) that have one of the other place within reach_m that looks the same."""
+    """Set flags (N,) of landmarks at points_odom (N, 3) that have a look-alike of the other place within reach_m."""
 
 def block_log_odds(
     one: tuple[_Reals, _Reals, _Flags],
@@ -216,18 +216,18 @@ def block_log_odds(
 ) -> _Reals:
     """(room,) log odds of the first place against the second, of each block of cells by its strongest lattice.
 
-    one, other: points_odom (N, 3), log likelihoods (N, 2) where present and where absent, which are skipped (N,). lattices (L, 2): cell
+    one, other: points_odom (N, 3), log likelihoods (N, 2) if present and if absent, flags of skipped ones (N,). lattices (L, 2): cell
     size in metres, shift as a share of it. model: least landmarks, shares taken, different, odd; threshold.
     """
 
 def thin(image: _Grey, every: int, bright: int) -> tuple[_Grey, int, int, int]:
-    """Each every-th pixel of each every-th row, their sum, that of their squares, how many are at least so bright."""
+    """Every n-th pixel of every n-th row: sum, sum of squares, number of pixels at least as bright as the limit."""
 
 def row_steps(image: _Grey, every: int) -> tuple[int, int, int]:
-    """Number, sum and sum of squares of the steps from pixel to pixel along each every-th row."""
+    """Number, sum and sum of squares of the steps from pixel to pixel along every n-th row."""
 
 def undistort(lens: _Reals, goals_x: _Reals, goals_y: _Reals) -> tuple[_Reals, _Reals]:
-    """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 brings to the goals; not checked."""
+    """Points x, y (N,) of the plane z = 1 that the lens k1 k2 p1 p2 k3 k4 k5 k6 maps to the goals; not checked."""
 
 def register_depth(
     depth: _Floats,
@@ -239,10 +239,10 @@ def register_depth(
     width: int,
     height: int,
 ) -> _Floats:
-    """(height, width) depth in a camera of the nearest point around each pixel, 0 where there is none.
+    """(height, width) depth in a camera of the nearest point around each pixel, 0 without one.
 
     depth (H, W) metres, 0 where unknown, along rays (H W, 3) with z = 1, NaN for none. intrinsics: fx fy cx cy. lens: 8 coefficients,
-    radial-tangential, whose image folds back where x^2 + y^2 reaches `reach`; or 4, equidistant.
+    radial-tangential, whose image folds back at x^2 + y^2 = `reach`; or 4, equidistant.
     """
 
 def spare_keyframes(
@@ -257,9 +257,9 @@ def spare_keyframes(
     share: float,
     least: int,
 ) -> _Flags:
-    """(K,) keyframes of whose tracks a share, and `least`, are seen on so many other visits; visits are `gap` keyframes apart.
+    """(K,) keyframes of whose tracks a share, and at least `least`, are seen on other visits; visits are `gap` keyframes apart.
 
-    Members (M,) of tracks by rising keyframe: tracks, keyframes, octaves; starts (G + 1,) delimits each track's, row_starts (K + 1,)
+    Members (M,) of tracks by ascending keyframe: tracks, keyframes, octaves; starts (G + 1,) delimits each track's, row_starts (K + 1,)
     each keyframe's in rows (M,).
     """
 
@@ -272,7 +272,7 @@ def duplicate_landmarks(
     descriptors: _Descriptors,
     most_bits: int,
 ) -> _Flags:
-    """(N,) the less observed landmark of every near pair (P, 2), in their order, that could be one landmark.
+    """(N,) the less observed landmark of every near pair (P, 2), in order, whose two could be one landmark.
 
     starts (N + 1,) delimits each landmark's obs_keyframe (M,); descriptors of their first observations.
     """
@@ -288,7 +288,7 @@ def redundant_keyframes(
     observers: int,
     share: float,
 ) -> _Flags:
-    """(K,) keyframes, looked at in `order`, of whose observations a share is repeated by so many that are left.
+    """(K,) keyframes, checked in `order`, of whose observations a share is repeated by enough remaining keyframes.
 
     row_starts (K + 1,) delimits each keyframe's observations in rows, starts (N + 1,) each landmark's.
     """
@@ -309,7 +309,7 @@ def choose_landmarks(
     needs: _Indices,
     bins_per_view: int,
 ) -> int:
-    """Number of candidates chosen, at most `limit`; marks them in chosen (N,).
+    """Choose at most `limit` candidates, mark them in chosen (N,) and return their number.
 
     Landmark n is seen in bins[starts[n]:starts[n + 1]]. counts of the bins, room of the cells (N,) and needs of the views are carried on.
     """
@@ -317,14 +317,14 @@ def choose_landmarks(
 def twins(
     descriptors: _Descriptors, points_map: _Reals, reach: int, most: int, max_bits: int, height_m: float, own_m: float
 ) -> _Flags:
-    """(N,) which landmarks at points_map (N, 3), by rising z, look like one that stands as high and further off than own_m."""
+    """(N,) True for landmarks at points_map (N, 3), by ascending z, with a look-alike at equal height farther away than own_m."""
 
 def spread_corners(
     image: _Grey, count: int, distance_px: float, threshold: int, border_px: int, taken: _Pixels
 ) -> tuple[_Pixels, _Reals]:
     """Up to `count` whole-pixel corners (N, 2), best first, none within distance_px of another or of `taken` (M, 2); their scores (N,).
 
-    The threshold is halved where the image is too plain to give them.
+    The threshold is halved if the image has too little texture for them.
     """
 
 def select_spread(
@@ -352,7 +352,7 @@ def match_rows(
     narrow_half: int,
     agreement_px: float,
 ) -> _Reals:
-    """(N, 2) disparity and standard deviation of left pixels (N, 2), NaN where unknown; prior_px (N,) NaN where there is none."""
+    """(N, 2) disparity and standard deviation of left pixels (N, 2), NaN where unknown; prior_px (N,) NaN for none."""
 
 # --- inertial samples: stamps_ns (N,), gyro_radps and accel_mps2 (N, 3) ---
 
@@ -377,28 +377,28 @@ def preintegrate(
     """
 
 class BlockCholesky:
-    """The pattern of sparse matrices of N nodes with sizes (N,) unknowns each, of which pairs (B, 2) are coupled.
+    """Pattern of sparse matrices: N nodes with sizes (N,) unknowns each, coupled in pairs (B, 2).
 
-    order (N,): the nodes in an order that fills in little.
+    order (N,): elimination order of the nodes with little fill-in.
     """
 
     def __init__(self, sizes: _Indices, pairs: _Indices, order: _Indices) -> None: ...
     @property
     def size(self) -> int:
-        """How many values a factor has."""
+        """Number of values of a factor."""
 
     def order(self) -> _Indices:
-        """(U,) the unknowns as they are eliminated."""
+        """(U,) the unknowns in elimination order."""
 
     def places(self, rows: _Indices, cols: _Indices) -> _Indices:
-        """(B, 3) where blocks of nodes (row, col), which are coupled, stand among the values.
+        """(B, 3) positions of the blocks of coupled nodes (row, col) among the values.
 
         Number (a, b) of a block belongs at first + a * down + b * right of its row here. A block is added once; its mirror image must
         not be. Of blocks on the diagonal the lower triangle counts.
         """
 
     def factorise(self, values: _Reals) -> bool:
-        """Values (size,) of a matrix become those of its factor; False where it is not positive definite."""
+        """Replace values (size,) of a matrix by those of its factor; False if it is not positive definite."""
 
     def solve(self, values: _Reals, rhs: _Reals) -> _Reals:
         """x (U,) of A x = rhs (U,), by the values of the factor."""
@@ -411,17 +411,17 @@ SURFEL_RANGE_M: tuple[float, float]
 SPLAT_LEAST_ALPHA: float
 
 def voxel_keys(points_map: _Floats, levels: _Grey) -> _Indices:
-    """(N,) voxels of points at these levels."""
+    """(N,) voxel keys of points at these levels."""
 
 class VoxelTable:
-    """Voxels of one recording, which grow view by view."""
+    """Voxels of one recording, extended view by view."""
 
     def __init__(self) -> None: ...
     def add(self, disparity_px: _Floats, sigma_px: float, lens: _Reals, map_from_cam: _Reals) -> None:
-        """Merges the points of a view (H, W) into voxels; NaN is unknown."""
+        """Merge the points of a view (H, W) into voxels; NaN is unknown."""
 
     def surfels(self) -> tuple[_Floats, _Floats, _Grey, _Indices]:
-        """Points, normals, levels of the voxels, and of how many views each is."""
+        """Points, normals and levels of the voxels, and the number of views of each."""
 
 def look_at(
     points_map: _Floats,
@@ -434,7 +434,7 @@ def look_at(
     clear_sigmas: float,
     clear_m: float,
 ) -> tuple[_Grey, _Floats, _Pixels]:
-    """Marks (N,), 1 seen, 2 seen through, 0 neither; for how many views the view counts; where the points are."""
+    """Marks (N,), 1 seen, 2 seen through, 0 neither; the weight of the view in views; pixels of the points."""
 
 def discs_before(
     points_map: _Floats,
@@ -466,7 +466,7 @@ def draw_discs(
 def blend(
     pixels: _Reals, conics: _Reals, reaches_px: _Reals, peaks: _Reals, greys: _Reals, width: int, height: int
 ) -> tuple[_Reals, _Reals]:
-    """The share of light that passes all Gaussians, and their picture (H, W)."""
+    """Share of light that passes all Gaussians, and their image (H, W)."""
 
 def blend_backward(
     pixels: _Reals,
@@ -482,7 +482,7 @@ def blend_backward(
     """Gradients (M, 3) of a loss by grey, logarithm of the size and logit of the opacity."""
 
 def allocations() -> int:
-    """How often this thread's calls have allocated memory while they computed; results are not counted."""
+    """Number of allocations by this thread's calls during computation; results are not counted."""
 
 def halvings(image: _Grey, count: int) -> list[_Grey]:
     """The image halved once, twice and so on, smoothed: pixel (x, y) is (2x, 2y) in the one before."""
@@ -497,10 +497,10 @@ def follow_pixels(
     within_px: float,
     margin_px: float,
 ) -> tuple[_Reals, _Flags]:
-    """Places (N, 2) of the windows around pixels (N, 2) in the next image, by pyramids, and which were found and lead back (N,)."""
+    """Track windows around pixels (N, 2) to the next image, by pyramids: pixels (N, 2), and flags (N,) of the backward check."""
 
 class Tracker:
-    """Points followed through the frames of a rectified camera; ids ascend and never repeat."""
+    """Tracks points through the frames of a rectified camera; ids ascend and never repeat."""
 
     def __init__(
         self,
@@ -511,9 +511,9 @@ class Tracker:
         refinement: tuple[float, float, tuple[int, int]],
     ) -> None: ...
     def begin(self, left: _Grey) -> None:
-        """Forgets the points; those that are added next are of this frame. Comes before the first `track`."""
+        """Forget all points; those added next belong to this frame. Call it before the first `track`."""
     def add(self, pixels: _Reals) -> int:
-        """Adds points (N, 3) and returns the first of their ids."""
+        """Add points (N, 3) and return the first of their ids."""
     def track(
         self,
         left: _Grey,
@@ -523,16 +523,16 @@ class Tracker:
         is_predicted: bool,
         points_cam: _Reals | None,
     ) -> tuple[tuple[_Reals, _Reals] | None, float]:
-        """Follows the points into a frame from where a motion takes them (None: they are of it), measures disparities, adds corners.
+        """Track the points into a frame, predicted by a motion (None: they belong to the frame), measure disparities, add corners.
 
-        pair: right, and both at half size. points_cam (N, 3): where the points are, by disparities where it is None. Returns the motion
-        (4, 4) and its information (6, 6), None where too few points agree, and the share of the followed points that moved so.
+        pair: right, and both at half size. points_cam (N, 3): the points, by disparities if None. Returns the motion
+        (4, 4) and its information (6, 6), None if too few points agree, and the share of the tracked points that follow it.
         """
     ids: _Indices
     pixels: _Reals
 
 def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
-    """How far the pixels (N, 3) of ids in both, ascending, lists have moved."""
+    """Distances moved by the pixels (N, 3) of ids in both lists, which ascend."""
 
 def align_patches(
     reference: _Pyramid,
@@ -546,7 +546,7 @@ def align_patches(
     max_shift_px: float,
     min_correlation: float,
 ) -> _Reals:
-    """(N, 3) x, y, sigma_px of pixels (N, 2) where patches, warped (N, 2, 2), lie on the reference's; NaN where they do not agree."""
+    """(N, 3) x, y, sigma_px at which patches, warped (N, 2, 2), from pixels (N, 2) on match the reference's; NaN without agreement."""
 
 def align_observations(
     reference: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
@@ -557,7 +557,7 @@ def align_observations(
     max_shift_px: float,
     min_correlation: float,
 ) -> _Reals:
-    """As align_patches, of chosen features (N,) of pyramid, pixels, octaves, angles, with warps from the motion where it gives them."""
+    """As align_patches, of chosen features (N,) of pyramid, pixels, octaves, angles, with warps from the motion if available."""
 
 def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) -> _Reals:
     """(N, 2, 2) reference_from_current of pixel offsets, NaN where degenerate."""
@@ -575,16 +575,16 @@ def match_guided(
     least_inliers: int,
     least_share: float,
 ) -> tuple[int, _Numbers, _Reals, _Reals]:
-    """How often matches of a keyframe into another near a motion gave the motion, once for each radius; the matches (P, 2) both ways
-    where they always did, the motion b_from_a (4, 4), its information (6, 6)."""
+    """Number of radii at which matches of a keyframe with another near a motion gave the motion; the matches (P, 2) both ways
+    if all did, the motion b_from_a (4, 4), its information (6, 6)."""
 
 def share_in_view(
     b_from_a: _Reals, points_a: _Reals, disparities_a: _Reals, lens: _Reals, size_px: tuple[float, float]
 ) -> float:
-    """Share of a's points (N, 3) with a disparity (N, 2) that b sees, at a similar distance."""
+    """Share of a's points (N, 3) with a disparity (N, 2) in view of b, at a similar distance."""
 
 def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
-    """(V,) root of each node after the links first-second, none of which puts a keyframe twice into a group."""
+    """(V,) root of each node after the links first-second, except links that would put a keyframe twice into a group."""
 
 # --- grid: windows and tiles of cells, with 8 voxels each (see grid.h) ---
 GRID_RAY_STRIDE_PX: int
@@ -599,7 +599,7 @@ def cast_view(
     camera: _Reals,
     was_free: _Grey,
 ) -> tuple[_Counts, _Grey, _Grey]:
-    """Pixels (R, C, 8) in voxels, which of them rays pass or would, and codes (R, C, 2) of the lowest and the highest point."""
+    """Pixels (R, C, 8) in voxels, voxels that rays pass or would pass, and codes (R, C, 2) of the lowest and the highest point."""
 
 def add_view(
     points: _Counts,
@@ -612,15 +612,15 @@ def add_view(
     hidden: _Grey,
     tile_heights: _Grey,
 ) -> None:
-    """Adds a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column)."""
+    """Add a window to the counts of a tile, whose cell (0, 0) is at the window's (row, column)."""
 
 def inertial_residual(
     map_from_body: _Reals, motions: _Reals, gravity: _Reals, increments: _Reals
 ) -> tuple[_Reals, _Reals]:
-    """(15,) rotation, velocity, position and biases of the later of two keyframes against what was preintegrated; (15, 30) its derivatives.
+    """(15,) rotation, velocity, position and biases of the later of two keyframes against the preintegration; (15, 30) its derivatives.
 
     map_from_body (2, 4, 4); motions (2, 9): velocity, gyro bias, accelerometer bias. increments (67,): dt, dR, dv, dp, the five
-    derivatives by the biases, and the biases that they were taken at.
+    derivatives by the biases, and their linearisation point.
     """
 
 class BundleSolver:
@@ -630,9 +630,9 @@ class BundleSolver:
     unknowns that move, of pose and motion. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
     obs_sigma_px (M, 2): of u and v, and of the disparity. Relative poses i_from_j (R, 4, 4), priors of poses (Q, 4, 4), each with its
     information (6, 6); inertial edges with increments (E, 67) and information (E, 15, 15); motion_mean (K, 9), motion_weight (K, 9)
-    1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: what moves besides, theta
-    (C,) with weight (C,) 1 / sigma^2 about zero; ways (R, 3), what theta[scale] adds to the translations of the relative poses; and what
-    says the whitened rows of the images in the place of the lens, called with map_from_body, motions, points_map, theta, and whether
+    1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: further unknowns, theta
+    (C,) with weight (C,) 1 / sigma^2 about zero; ways (R, 3), the effect of theta[scale] on the translations of the relative poses; and a
+    function of the whitened rows of the images instead of the lens, called with map_from_body, motions, points_map, theta, and True if
     derivatives are wanted: residuals (M, 4), derivatives by point (M, 4, 3) and theta (M, 4, C), positions (K, 3) of the exposed bodies.
     """
 
@@ -667,30 +667,30 @@ class BundleSolver:
     ) -> None: ...
     @property
     def unknowns(self) -> int:
-        """U, of the reduced system."""
+        """Number U of unknowns of the reduced system."""
 
     def nodes(self) -> tuple[_Indices, _Indices]:
         """Sizes (N,) and couplings (B, 2) of the reduced system's blocks."""
 
     def factorise_sparsely(self, order: _Indices) -> None:
-        """Sparse factorisation from now on; order (N,): the nodes in an order that fills in little."""
+        """Use sparse factorisation from now on; order (N,): elimination order of the nodes with little fill-in."""
 
     def cost(self) -> float:
-        """Half the robust sum of squares of everything."""
+        """Half the robust sum of squares of all residuals."""
 
     def optimize(
         self, lambda_start: float, max_iterations: int, relative_cost_tolerance: float
     ) -> tuple[_Reals, int, bool]:
-        """Costs at the start and after every accepted step, the number of iterations, and whether it converged."""
+        """Costs at the start and after every accepted step, the number of iterations, and True if it converged."""
 
     def reduced(self, damping: float) -> tuple[_Reals, _Reals]:
         """The reduced system at the current values: (U, U), of which the lower triangle counts, and its right-hand side (U,)."""
 
     def step(self, damping: float) -> _Reals | None:
-        """(U,) damped step from the current values; None where the system is not positive definite."""
+        """(U,) damped step from the current values; None if the system is not positive definite."""
 
     def log_determinant(self) -> float:
-        """Of the undamped normal equations of everything, landmarks included; NaN where they are not positive definite."""
+        """Log determinant of the undamped normal equations, landmarks included; NaN if they are not positive definite."""
 
     def map_from_body(self) -> _Reals:
         """(K, 4, 4)"""
@@ -702,26 +702,26 @@ class BundleSolver:
         """(N, 3)"""
 
     def calibration(self) -> _Reals:
-        """(C,), none where it is held"""
+        """(C,), empty if fixed"""
 
     def squared_sigmas(self) -> _Reals:
         """(M,) squared residuals in sigmas at the last cost, huge for points behind the camera."""
 
-# --- inertial samples before they are used; poses ---
+# --- checks of inertial samples; poses ---
 
 def drop_spikes(stamps_ns: _Indices, gyro_radps: _Reals, accel_mps2: _Reals, known: int) -> int:
-    """End of the samples once spikes are gone from the rows behind the known ones, in place: what is far from both neighbours.
+    """Remove spikes, samples far from both neighbours, in place from the rows after the known ones; return the new end.
 
-    The last sample is judged by one neighbour alone; the very first one has none and stays.
+    The last sample is compared with one neighbour alone; the very first one has none and stays.
     """
 
 def longest_gap_ns(stamps_ns: _Indices, start_ns: int, end_ns: int) -> int:
-    """The longest time between start and end, both included, without a sample."""
+    """Longest time without a sample between start and end, both included."""
 
 def is_steady(gyro_radps: _Reals, accel_mps2: _Reals, limits: tuple[float, float, float, float, float]) -> bool:
-    """Whether means of tenths of a window agree, and are those of a body at rest or rolling evenly.
+    """True if the means of tenths of a window agree, and are those of a body at rest or at constant speed.
 
-    limits: largest standard deviation of the means of gyro and of accel, largest mean of gyro, gravity and by how much it may be missed.
+    limits: largest standard deviation of the means of gyro and of accel, largest mean of gyro, gravity and its tolerance.
     """
 
 def latest_steady(
@@ -733,7 +733,7 @@ def latest_steady(
     window_ns: int,
     limits: tuple[float, float, float, float, float],
 ) -> int:
-    """End of the latest steady window that begins at first_ns or later; a stamp before first_ns where there is none."""
+    """End of the latest steady window that begins at first_ns or later; a stamp before first_ns if there is none."""
 
 def compose_pose(
     map_from_body: _Reals, covariance: _Reals, body_from_next: _Reals, cov_step: _Reals
@@ -768,9 +768,9 @@ def triangulate(
     disparity_weight: float,
     start: _Reals,
 ) -> _Reals:
-    """The point (3,) of one track by least squares from a start (3,); NaN where it does not settle in front of every camera.
+    """The point (3,) of one track by least squares from a start (3,); NaN unless it converges in front of every camera.
 
-    views (n,): which of the cameras odom_from_cam (V, 4, 4) with lenses (V, 4) saw the pixels (n, 3).
+    views (n,): the camera, among odom_from_cam (V, 4, 4) with lenses (V, 4), of each of the pixels (n, 3).
     """
 
 def linearise_track(
@@ -788,13 +788,13 @@ def linearise_track(
     """
 
 def share_that_passes(limit: float, mean_square: float) -> float:
-    """Of a normal error's variance, what is left among those whose square stays below the limit."""
+    """Remaining share of a normal error's variance if errors whose square exceeds the limit are rejected."""
 
 class Filter:
     """The right-invariant multi-state constraint filter. Errors: rotation, velocity, position, biases of gyro and accelerometer, time
     offset, then rotation and position of each clone; in true_error_cov four considered ones come first.
 
-    true = Exp(error) * estimate, in `odom` axes. A clone_id that is not held is a ValueError.
+    true = Exp(error) * estimate, in `odom` axes. ValueError for an unknown clone_id.
     """
 
     def __init__(
@@ -827,7 +827,7 @@ class Filter:
         noise: tuple[float, float, float, float],
         true_noise: tuple[float, float, float, float],
     ) -> _Reals:
-        """Moves the state through inertial samples; the last angular rate (3,), bias removed. noise weighs, true_noise is real."""
+        """Move the state through inertial samples; return the last angular rate (3,), bias removed. noise weighs, true_noise is real."""
 
     def predict_random_walk(
         self,
@@ -837,30 +837,30 @@ class Filter:
         duration_s: float = 0.0,
         measured_cov: _Reals | None = None,
     ) -> None:
-        """Moves the state by a relative transform that is known only to the sigmas.
+        """Move the state by a relative transform, uncertain by the sigmas.
 
-        measured_cov (6, 6), in the next body's axes, rotation first, is added information where it is given.
+        measured_cov (6, 6), in the next body's axes, rotation first, is added information if given.
         """
 
     def add_clone(self, clone_id: int, rate_body_radps: _Reals) -> None:
-        """Keeps the current body transform in the window; the rate ties it to the time offset."""
+        """Keep the current body transform in the window; the rate links it to the time offset."""
 
     def remove_clone(self, clone_id: int) -> None:
-        """Forgets a clone (marginalises it)."""
+        """Marginalise a clone."""
 
     def return_to_clone(self, clone_id: int) -> None:
-        """Takes rotation and position of the state back to a clone's, as certain as that is."""
+        """Reset rotation and position of the state to a clone's, with its covariance."""
 
     def begin_frame_anew(self) -> _Reals:
-        """new_odom_from_old_odom (4, 4): the frame now begins at the newest clone, and errors count from there.
+        """new_odom_from_old_odom (4, 4): move the frame's origin to the newest clone, from which errors count.
 
-        Motions between clones, and what is known of them, stay. Velocity and biases must be idle.
+        Motions between clones and their covariances stay. Velocity and biases must be unused.
         """
 
     def observe(self, frame_index: int, camera: int, ids: _Indices, pixels: _Reals) -> None:
-        """What one camera, counted from 0, saw in a frame: ids (N,), pixels (N, 3) u_left v u_right, NaN where that is unknown.
+        """Add the observations of one camera, counted from 0, in a frame: ids (N,), pixels (N, 3) u_left v u_right, NaN if unknown.
 
-        Of use once a clone has the frame's index.
+        Used once a clone has the frame's index.
         """
 
     def update(
@@ -872,15 +872,15 @@ class Filter:
         newest_odom_from_body: _Reals | None = None,
         sigma_scale: float = 1.0,
     ) -> NDArray[np.int8]:
-        """Uses each observation once, of tracks that ended, or are due, with two or more in the clones.
+        """Use each observation once, of ended and due tracks with two or more observations in the clones.
 
-        alive (N,): ids that the newest frame saw, due (N,): which of them are to be used now. What is due but seen once stays; what ended
-        so is forgotten. Returns for each track (T,), by rising ids: 1 taken, 0 not triangulated, -1 rejected by its gate.
+        alive (N,): ids in the newest frame, due (N,): those to use now. Due tracks with one observation stay, ended ones are
+        forgotten. Returns for each track (T,), by ascending ids: 1 used, 0 not triangulated, -1 rejected by its gate.
 
-        A point is looked for from its nearest view, by the disparity, or first_depth_m along the newest ray where no view has one.
-        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body (4, 4) is then where
-        the newest clone is linearised first, when vision knows it better than the prediction. It adds no information. sigma_scale
-        widens the measurement noise, for matches that are less exact than flow.
+        The search for a point starts at the nearest view's disparity, or at first_depth_m along the newest ray without any disparity.
+        More than one iteration relinearises (iterated Kalman filter), for large corrections; newest_odom_from_body (4, 4) is then
+        the first linearisation point of the newest clone, if vision is better than the prediction. It adds no information. sigma_scale
+        widens the measurement noise, for matches less accurate than flow.
         """
 
     def correct_by_wheels(
@@ -893,22 +893,22 @@ class Filter:
         base_from_body: _Reals,
         gate: float,
     ) -> float:
-        """Corrects by forward speed, none sideways and upwards, and yaw rate; squared Mahalanobis distance by true_error_cov.
+        """Correct by forward speed, zero sideways and upwards, and yaw rate; return the squared Mahalanobis distance by true_error_cov.
 
-        Nothing is changed where that exceeds the gate.
+        Changes nothing if that exceeds the gate.
         """
 
     def correct_by_rest(self, gyro_mean_radps: _Reals, gyro_sigma_radps: float, gate: float) -> float:
-        """Corrects by standing still: the gyro shows its bias alone. Otherwise as correct_by_wheels."""
+        """Correct by standstill, at which the gyro shows only its bias. Otherwise as correct_by_wheels."""
 
     def inflate(self, clone_id: int, seen_odom_from_body: _Reals, gap_s: float) -> bool:
-        """Inflates position and velocity where vision contradicts the prediction since a clone; True where it did.
+        """Inflate position and velocity if vision contradicts the prediction since a clone; True if it did.
 
-        To be called before the clone of this moment is added.
+        Call it before adding the clone of this time.
         """
 
     def inflate_velocity(self, sigma_mps: float) -> None:
-        """Adds the variance of an unknown change of velocity."""
+        """Add the variance of an unknown change of velocity."""
 
     def motion_between(self, earlier_id: int, later_id: int) -> _Reals:
         """earlier_from_later (4, 4) between two clones."""
@@ -940,21 +940,21 @@ class Filter:
 
     @property
     def covariance(self) -> _Reals:
-        """What weighs and gates measurements; a copy."""
+        """Covariance that weighs and gates measurements; a copy."""
 
     @property
     def true_error_cov(self) -> _Reals:
-        """That of the true error; a copy."""
+        """Covariance of the true error; a copy."""
 
     @property
     def offset_sigma_s(self) -> float:
         """Standard deviation of the time offset's true error."""
     imu_minus_cam_s: float
 
-# --- the simulator's pictures (render.h), and rays against boxes (rays.h) ---
+# --- rendering of the simulator (render.h), and rays against boxes (rays.h) ---
 
 class ScenePainter:
-    """Paints what one camera sees: plane (6,) fx fy cx cy width height, rays (H, W, 4) of a lens or none."""
+    """Paints the image of one camera: plane (6,) fx fy cx cy width height, rays (H, W, 4) of a lens or none."""
 
     def __init__(self, plane: _Reals, rays: _Floats) -> None: ...
     def add(
@@ -975,19 +975,19 @@ class ScenePainter:
         depth_m: _Floats,
         face_of: _Numbers,
     ) -> None:
-        """Adds an instant to a picture (H, W): faces as of `Faces` with light and strengths of groups; textures as of `Atlas`."""
+        """Add an instant to an image (H, W): faces as of `Faces` with light and strengths of groups; textures as of `Atlas`."""
 
 def develop(
     radiance: _Reals, gain: float, shot: float, read: float, normals: _Floats, key: int, vignetting: _Floats
 ) -> _Grey:
-    """A picture (H, W) of grey levels with shot noise (variance per grey level) and read noise (standard deviation)."""
+    """Image (H, W) of grey levels with shot noise (variance per grey level) and read noise (standard deviation)."""
 
 class BoxGrid:
     """Boxes (B, 8) as of `Faces` in a grid between two corners (3,)."""
 
     def __init__(self, boxes: _Reals, low: _Reals, high: _Reals, cell_m: float) -> None: ...
     def cast(self, origin: _Reals, directions: _Reals, farthest: _Reals) -> tuple[_Reals, _Indices]:
-        """(N,) parameters of the nearest hits, up to farthest (N,), and (N, 2) box and side, -1 for none."""
+        """Cast rays: (N,) parameters of the nearest hits, up to farthest (N,), and (N, 2) box and side, -1 for none."""
 
     def bake(
         self,
@@ -1000,4 +1000,4 @@ class BoxGrid:
         has_shadows: bool,
         light: _Floats,
     ) -> None:
-        """Adds the lamps' (L, 5) direct light to light (groups, samples) of faces; their own boxes come owner_shift later."""
+        """Add the lamps' (L, 5) direct light to light (groups, samples) of faces; their own boxes come owner_shift later."""
