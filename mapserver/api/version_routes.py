@@ -8,9 +8,9 @@ from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
 
 from mapserver import releases
+from mapserver.api import views
 from mapserver.api.guard import GuardSettings, actor_of
 from mapserver.api.parameters import Site, Version
-from mapserver.api.views import Act, CanaryAct, CanaryView, PublishAct, QualityView, VersionView, version_view
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
@@ -32,11 +32,11 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
     """Adds the endpoints; the guard lets those change something who may."""
 
     @app.get("/v1/sites/{site}/versions/{version}/quality")
-    def quality(site: Site, version: Version) -> QualityView:
+    def quality(site: Site, version: Version) -> views.QualityView:
         """What the gate said about a version, and the report of its build."""
         info = store.version(site, version)
         report = store.manifest(site, version).report
-        return QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
+        return views.QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
 
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
     def diff(site: Site, before: Version, after: Version) -> Difference:
@@ -44,28 +44,29 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         return releases.difference(store, site, before, after)
 
     @app.post("/v1/sites/{site}/versions/{version}/publish")
-    def publish(request: Request, site: Site, version: Version, act: PublishAct) -> VersionView:
+    def publish(request: Request, site: Site, version: Version, act: views.PublishAct) -> views.VersionView:
         """Takes a draft through the gate and makes it current."""
         actor = actor_of(request, act.actor, act.reason)
         if act.trust_calibration:
             releases.trust_calibration(store, store.version(site, version), actor)
         releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
-        return version_view(store, store.version(site, version))
+        return views.version_view(store, store.version(site, version))
 
     @app.post("/v1/sites/{site}/versions/{version}/promote")
-    def promote(request: Request, site: Site, version: Version, act: Act) -> VersionView:
+    def promote(request: Request, site: Site, version: Version, act: views.Act) -> views.VersionView:
         """Makes a version that was published before the current one."""
         releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
-        return version_view(store, store.version(site, version))
+        return views.version_view(store, store.version(site, version))
 
     @app.post("/v1/sites/{site}/rollback")
-    def rollback(request: Request, site: Site, act: Act) -> VersionView:
-        """Makes the version current that was so before; the current one retires."""
-        releases.roll_back(store, site, actor=actor_of(request, act.actor, act.reason))
-        return version_view(store, cast(VersionInfo, store.current(site)))
+    def rollback(request: Request, site: Site, act: views.RollbackAct) -> views.VersionView:
+        """Makes the version current that was so before; the current one retires. A version on trial is taken back instead."""
+        actor = actor_of(request, act.actor, act.reason)
+        releases.roll_back(store, site, to=act.to, canary=act.canary, actor=actor)
+        return views.version_view(store, cast(VersionInfo, store.current(site)))
 
     @app.get("/v1/sites/{site}/canary")
-    def canary(site: Site) -> CanaryView:
+    def canary(site: Site) -> views.CanaryView:
         """The version that some robots try, or tried last, beside the others' counts."""
         store.current(site)
         found = store.canaries(site)
@@ -78,7 +79,7 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         return _view(store, found[0], settings.canary)
 
     @app.post("/v1/sites/{site}/versions/{version}/canary")
-    def start_canary(request: Request, site: Site, version: Version, act: CanaryAct) -> CanaryView:
+    def start_canary(request: Request, site: Site, version: Version, act: views.CanaryAct) -> views.CanaryView:
         """Lets a share of the robots run a version before the others; a draft goes through the gate first.
 
         `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
@@ -89,8 +90,8 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
         return _view(store, store.canaries(site)[0], settings.canary)
 
 
-def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> CanaryView:
+def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> views.CanaryView:
     members = [
         robot.robot for robot in store.robots(row.site) if number_of(row.site, row.version, robot.robot) < row.threshold
     ]
-    return CanaryView(row, find(store, row, settings, time.time_ns()), members)
+    return views.CanaryView(row, find(store, row, settings, time.time_ns()), members)

@@ -194,6 +194,17 @@ class PublishAct(Act):
         return self
 
 
+class RollbackAct(Act):
+    """Who takes the last release back, and why.
+
+    With `to` only where that version becomes current again, with `canary` only where it ends the trial of that `id`: else it is 409.
+    """
+
+    model_config = _body(actor="ada", reason="robots lose themselves in aisle 3", to=2)
+    to: int | None = None
+    canary: int | None = None
+
+
 class CanaryAct(Act):
     """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
 

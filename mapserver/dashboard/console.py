@@ -17,7 +17,7 @@ from fastapi.staticfiles import StaticFiles
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, UsageError
 from mapserver.api.guard import SIGN_IN
 from mapserver.api.moments import zone_of
 from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
@@ -47,6 +47,17 @@ class Console:
     def files(self) -> None:
         """Adds what all pages load."""
         self.app.mount("/static", StaticFiles(directory=_HERE / "static"))
+
+    def nothing_else(self) -> None:
+        """Adds the page for addresses that no page has."""
+
+        def no_page(context: PageContext) -> dict[str, object]:
+            raise UsageError("There is no such page here.")
+
+        @self.app.exception_handler(404)
+        async def missing(request: Request, _: Exception) -> HTMLResponse:
+            """Within the frame, with a way back."""
+            return await self._shown(request, "none", "", no_page, tuple(request.query_params), list)
 
     def page(
         self,
@@ -127,6 +138,7 @@ class Console:
             found = {"context": context} | await load(lambda: fill(context, **request.path_params))
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
+            site = site if site in sites else None  # links lead somewhere
         files = {name: f"{root}/static/vendor/{file}" for name, file in _MODULES.items()}
         imports = to_json({"imports": files}).decode()
         look, who = request.cookies.get(LOOK_COOKIE, ""), getattr(request.state, "operator", None)
@@ -157,11 +169,13 @@ def scene_of(
     over: Sequence[Layer],
     *,
     places_m: Sequence[tuple[float, float]] = (),
+    shows_coverage: bool = False,
 ) -> dict[str, object]:
     """A version's map with layers over it, for `site_map` of templates. places_m: what is in sight first, everything without them."""
     plan = services.maps.plan(context.site, version)
     below = services.maps.underlays(context.site, version, context.root)
-    layers = [*ground(plan, context.plan_picture(version), services.maps.areas(context.site), below), *over]
+    picture, areas = context.plan_picture(version), services.maps.areas(context.site)
+    layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]
     box = box_around(places_m, box_of(plan))
     return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}
 

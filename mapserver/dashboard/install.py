@@ -12,13 +12,22 @@ from starlette.middleware.gzip import GZipMiddleware
 from fleetmap.errors import FleetmapError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
-from mapserver.dashboard import failure, failures, live_page, overview, robot, sign_in_page, space_page, survey_jobs
+from mapserver.dashboard import (
+    failure,
+    failures,
+    live_page,
+    map_page,
+    overview,
+    robot,
+    sign_in_page,
+    space_page,
+    survey_jobs,
+)
 from mapserver.dashboard.console import PATH, Console
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.layout import Services
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.pages import map_page
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
@@ -33,12 +42,12 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         settings.guard,
         surveys,
     )
-    map_page.install(services)
     sign_in_page.install(app, settings.guard)
     console = Console(pages, services)
     console.files()
-    for module in (overview, failures, failure, space_page, live_page, robot, survey_jobs):
+    for module in (overview, map_page, failures, failure, space_page, live_page, robot, survey_jobs):
         module.install(console)
+    console.nothing_else()
     _install_pictures(services)
 
     @app.get("/", include_in_schema=False)

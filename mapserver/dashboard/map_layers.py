@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from fleetmap.geometry import Array
-from mapserver.dashboard.plan import Plan
+from mapserver.dashboard.plan import Plan, inked, png
 from mapserver.floor_plan.areas import Areas
 
 _WEAK = 0.5  # of the tracked points agree: below, a person should look
@@ -123,11 +123,13 @@ def box_around(places_m: Sequence[tuple[float, float]], box: Box) -> Box:
     return (x0, y0, x1, y1)
 
 
-def ground(plan: Plan, picture_address: str, areas: Areas, below: Sequence[Layer] = ()) -> list[Layer]:
+def ground(
+    plan: Plan, picture_address: str, areas: Areas, below: Sequence[Layer] = (), *, shows_coverage: bool = False
+) -> list[Layer]:
     """What every map has: pictures of the building below, then landmarks and places, names of areas, coverage and directions."""
     return [
         *below,
-        Layer("Coverage", coverage(plan), shown=False),
+        Layer("Coverage", coverage(plan), shown=shows_coverage),
         Layer("Landmarks and places", [Picture(picture_address, box_of(plan))]),
         Layer("Areas", outlines(areas)),
         Layer("Directions surveyed", directions(plan), shown=False),
@@ -206,14 +208,6 @@ def heat(places_m: Iterable[tuple[float, float]], box: Box) -> list[Picture]:
     if not counts.any():
         return []
     counts = cv2.GaussianBlur(counts, (0, 0), _HEAT_SIGMA_M / cell_m, borderType=cv2.BORDER_CONSTANT)
-    picture = np.empty((height, width, 4), np.uint8)
-    picture[..., :3] = _HEAT_BGR
-    picture[..., 3] = (220 * np.sqrt(counts / counts.max())).astype(np.uint8)
-    return [Picture(data_address(picture), (box[0], box[3] - height * cell_m, box[0] + width * cell_m, box[3]), "heat")]
-
-
-def data_address(picture: np.ndarray) -> str:
-    """A picture as a PNG within an address."""
-    done, data = cv2.imencode(".png", picture)
-    assert done
-    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}"
+    picture = inked(220 * np.sqrt(counts / counts.max()), _HEAT_BGR)
+    url = f"data:image/png;base64,{base64.b64encode(png(picture)).decode()}"
+    return [Picture(url, (box[0], box[3] - height * cell_m, box[0] + width * cell_m, box[3]), "heat")]

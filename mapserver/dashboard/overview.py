@@ -26,9 +26,10 @@ def install(console: Console) -> None:
     services = console.services
 
     def overview(context: PageContext) -> dict[str, object]:
-        return {"data": {"scene": _scene(services, context), "now": _now(services, context)}}
+        data = {"scene": _scene(services, context), "now": _now(services, context)}
+        return {"data": data, "find": context.query.get("find", "")}
 
-    console.page("", "overview.html", overview)
+    console.page("", "overview.html", overview, knows=("find",))
     console.page("trends", "trends.html", lambda context: _trends(services, context), knows=("since", "until"))
     console.stream("now", lambda context: _now(services, context))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,15 +74,24 @@ def _picture(landmarks: Array, places: Array, low: Array, high: Array) -> bytes:
     """A PNG: darker where more landmarks are above each other, with a dot for each place."""
     scale_m = max(_FINEST_M, float((high - low).max()) / _LONG_SIDE_PX)
     width, height = np.maximum(np.ceil((high - low) / scale_m).astype(int), 1)
-    picture = np.zeros((height, width, 4), np.uint8)
     counts = np.zeros((height, width), np.float32)
     np.add.at(counts, _pixels(landmarks, low, high, scale_m, height), 1)
     counts = cv2.dilate(counts, np.ones((3, 3), np.uint8))  # pages show it smaller than it is
-    picture[..., :3] = _LANDMARK_BGR
-    picture[..., 3] = np.where(counts > 0, np.clip(110 + 70 * np.log1p(counts), 0, 255), 0).astype(np.uint8)
+    opaque = np.where(counts > 0, np.clip(110 + 70 * np.log1p(counts), 0, 255), 0)
+    picture = inked(opaque, _LANDMARK_BGR)
     radius = max(1, round(0.12 / scale_m))
     for y, x in zip(*_pixels(places, low, high, scale_m, height), strict=True):
         cv2.circle(picture, (int(x), int(y)), radius, (*_PLACE_BGR, 255), -1)
+    return png(picture)
+
+
+def inked(opaque: NDArray[Any], ink_bgr: tuple[int, int, int]) -> NDArray[np.uint8]:
+    """A picture (H, W, 4) of one ink, which is as opaque as (H, W) says, from 0 to 255."""
+    return np.dstack([np.full((*opaque.shape, 3), ink_bgr, np.uint8), opaque.astype(np.uint8)])
+
+
+def png(picture: NDArray[np.uint8]) -> bytes:
+    """A picture as a PNG."""
     done, data = cv2.imencode(".png", picture)
     assert done
     return data.tobytes()

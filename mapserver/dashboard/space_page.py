@@ -22,7 +22,7 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
         version = maps.current_version(site)
     if version is None:
         raise StateError(f"site {site} has no published version; publish one, or name a draft")
-    camera = maps.quality(site, version).manifest.camera  # a version that is not there is named here
+    camera = maps.store.manifest(site, version).camera  # a version that is not there is named here
     lacks, loops, views = maps.lacks_surfels(site, version), maps.loops(site, version), services.health.cameras(site)
     cameras = {name: [*view.tangents, *view.base_from_cam] for name, view in robot_views(views).items()}
     return {

@@ -2,10 +2,10 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver.dashboard.map_layers import Box
+from mapserver.dashboard.plan import inked, png
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.plan_file import decode_plan
 
@@ -27,26 +27,14 @@ def floor_picture(data: bytes, alignment: Alignment, box: Box) -> bytes:
     source = np.array([[1, 0], [0, -1]]) @ drawing_from_pixel - np.array([[0, 0, 0.5], [0, 0, 0.5]])
     flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
     grey = cv2.warpAffine(plan.grey, source, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=255)
-    return _png(255 - grey.astype(np.uint8), _INK_BGR)
+    return png(inked(255 - grey.astype(np.uint8), _INK_BGR))
 
 
 def grid_picture(grid: OccupancyGrid) -> tuple[bytes, Box]:
     """A PNG of what is occupied and free, and where it lies; what is not known is left out."""
     occupied, free = grid.cells >= 50, (grid.cells >= 0) & (grid.cells < 50)
-    picture = np.zeros((*grid.cells.shape, 4), np.uint8)
-    picture[occupied] = (*_INK_BGR, 255)
+    picture = inked(255 * occupied, _INK_BGR)
     picture[free] = (*_FREE_BGR, _FREE)
-    done, data = cv2.imencode(".png", picture[::-1])
-    assert done
     x, y = grid.map_from_grid[:2, 3].tolist()
     height, width = grid.cells.shape
-    return data.tobytes(), (x, y, x + width * grid.resolution_m, y + height * grid.resolution_m)
-
-
-def _png(opaque: NDArray[np.uint8], ink_bgr: tuple[int, int, int]) -> bytes:
-    picture = np.empty((*opaque.shape, 4), np.uint8)
-    picture[..., :3] = ink_bgr
-    picture[..., 3] = opaque
-    done, data = cv2.imencode(".png", picture)
-    assert done
-    return data.tobytes()
+    return png(picture[::-1]), (x, y, x + width * grid.resolution_m, y + height * grid.resolution_m)

@@ -9,7 +9,7 @@ import msgspec
 from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Compared, Evidence, trusted_calibrations
+from mapserver.quality.figures import Aliasing, Compared, Evidence, TrajectoryBreaks, trusted_calibrations
 
 _JOINED = "joined"  # the verdict of survey.merge.membership on a recording that belongs to the site
 Share = Annotated[float, msgspec.Meta(ge=0)]
@@ -37,8 +37,8 @@ class GateSettings(Section, frozen=True):
 class GateVerdict:
     """The gate's answer. reasons: against publishing, none if accepted; hard ones stand even against --force.
 
-    unjudged: the reasons that a person's trust in the calibration takes away.
-    report: the figures that were looked at, and under `not_judged` those for which evidence is missing.
+    unjudged: the reasons that a person's trust in the calibration takes away. report: the figures that were looked at; under `passed` the
+    names of the checks without a reason against the draft, under `not_judged` what evidence is missing for; `unjudged`, too.
     """
 
     reasons: tuple[str, ...]
@@ -62,8 +62,9 @@ def judge(
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
-    reasons: list[str] = []
-    not_judged = [] if "joins" in draft.report else ["joining"]
+    checked: dict[str, list[str]] = {}  # reasons by what was judged
+    strangers = _strangers(draft)
+    passed, not_judged = (["joining"] if strangers == [] else []), (["joining"] if strangers is None else [])
     for name, compared in (
         ("held_out_frames", examined.held_out),
         ("yesterdays_recordings", examined.replayed),
@@ -73,29 +74,38 @@ def judge(
             not_judged.append(name)
         else:
             over = f"over {compared.draft.frames} frames"
-            reasons += [f"{name}: {words}, {over}" for words in _frame_reasons(compared, settings)]
+            checked[name] = [f"{name}: {words}, {over}" for words in _frame_reasons(compared, settings)]
     if examined.aliasing is None or examined.aliasing.offered < settings.min_frames:
         not_judged.append("aliasing_probes")
     else:
-        reasons += _aliasing_reasons(examined.aliasing, examined.aliasing_before, settings)
+        checked["aliasing_probes"] = _aliasing_reasons(examined.aliasing, examined.aliasing_before, settings)
     doubts, unjudged, unknown = _calibration_reasons(draft, examined, is_first=current is None)
-    reasons += [*doubts, *unjudged]
+    if not unknown or doubts or unjudged:
+        checked["calibration"] = [*doubts, *unjudged]
     not_judged += unknown
     if examined.motion is None:
         not_judged.append("motion")
-    elif examined.motion.breaks > settings.max_breaks:
-        reasons.append(
-            f"its trajectory is torn in {examined.motion.breaks} places, by up to {examined.motion.worst_m:.2f} m against "
-            f"odometry; max_breaks is {settings.max_breaks}"
-        )
+    else:
+        checked["motion"] = _motion_reasons(examined.motion, settings)
     if current is None:
         not_judged.append("size_against_last_version")
     else:
         shares = _shares(draft, current)
         report |= {"compared_with": current.version, **shares}
-        reasons += _size_reasons(shares, current.version, settings)
-    report |= {"evidence": to_plain(examined), "not_judged": not_judged}
-    return GateVerdict(tuple(reasons), _hard_reasons(draft), report, tuple(unjudged))
+        checked["size_against_last_version"] = list(_size_reasons(shares, current.version, settings))
+    passed += [name for name, reasons in checked.items() if not reasons]
+    report |= {"evidence": to_plain(examined), "passed": passed, "not_judged": not_judged, "unjudged": unjudged}
+    reasons = tuple(words for found in checked.values() for words in found)
+    return GateVerdict(reasons, _hard_reasons(draft, strangers), report, tuple(unjudged))
+
+
+def _motion_reasons(motion: TrajectoryBreaks, settings: GateSettings) -> list[str]:
+    if motion.breaks <= settings.max_breaks:
+        return []
+    return [
+        f"its trajectory is torn in {motion.breaks} places, by up to {motion.worst_m:.2f} m against "
+        f"odometry; max_breaks is {settings.max_breaks}"
+    ]
 
 
 def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
@@ -119,8 +129,7 @@ def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
                 yield f"{figure} {value:.3f} is {word} {name} ({limit:.3f})"
     share = compared.inliers_share
     if before is not None and share is not None and share < settings.min_inliers_share:
-        limits = f"min_inliers_share ({settings.min_inliers_share:.3f})"
-        yield f"inliers_share {share:.3f} is of the current version below {limits}"
+        yield f"inliers_share {share:.3f} of the current version's is below min_inliers_share ({settings.min_inliers_share:.3f})"
 
 
 def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: GateSettings) -> list[str]:
@@ -178,20 +187,27 @@ def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings
         yield f"bytes_share {shares['bytes_share']:.2f} of version {version} is above {settings.max_bytes_share:g}"
 
 
-def _hard_reasons(draft: Manifest) -> tuple[str, ...]:
+def _strangers(draft: Manifest) -> list[str] | None:
+    """Reasons against recordings that are not shown to belong to the site; None for drafts of older servers, which do not say."""
+    joins = draft.report.get("joins")
+    if joins is None:
+        return None
+    verdicts = {entry.name: joins.get(entry.name, "none") for entry in draft.recordings}
+    return [
+        f"it holds recording {name}, whose join verdict is {verdict!r}: it is not shown to belong to the site; build without it"
+        for name, verdict in verdicts.items()
+        if verdict != _JOINED
+    ]
+
+
+def _hard_reasons(draft: Manifest, strangers: list[str] | None) -> tuple[str, ...]:
     reasons = []
     if not draft.tiles or draft.landmarks == 0:
         reasons.append(
             f"it has {len(draft.tiles)} tiles and {draft.landmarks} landmarks: no robot could localise in it; look at "
             "the build's report and at `mapserver doctor` for its recordings"
         )
-    joins = draft.report.get("joins")  # drafts of older servers do not say
-    verdicts = {} if joins is None else {entry.name: joins.get(entry.name, "none") for entry in draft.recordings}
-    reasons += [
-        f"it holds recording {name}, whose join verdict is {verdict!r}: it is not shown to belong to the site; build without it"
-        for name, verdict in verdicts.items()
-        if verdict != _JOINED
-    ]
+    reasons += strangers or ()
     if draft.report.get("scale") == "unknown":
         reasons.append(
             "it has a scale of its own: one camera without IMU saw no dock or tag that could tell the metres; record with an IMU, a "

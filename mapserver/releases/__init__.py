@@ -3,6 +3,7 @@
 from mapserver.releases.release import (
     difference,
     end_canary,
+    judge_draft,
     promote,
     publish,
     roll_back,
@@ -11,5 +12,5 @@ from mapserver.releases.release import (
 )
 from mapserver.releases.version_diff import Difference
 
-__all__ = ["Difference", "difference", "end_canary", "promote", "publish", "roll_back", "start_canary"]
+__all__ = ["Difference", "difference", "end_canary", "judge_draft", "promote", "publish", "roll_back", "start_canary"]
 __all__ += ["trust_calibration"]

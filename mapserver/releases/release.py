@@ -6,7 +6,7 @@ from dataclasses import replace
 import msgspec
 
 from fleetmap.encoding import to_plain
-from fleetmap.errors import UsageError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import decode_manifest, decode_tile
 from mapserver.fleet_statistics.canary_decision import threshold_for
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND
@@ -94,21 +94,27 @@ def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) 
     _change(store, site, lambda rows: rules.promotion(rows, version, actor))
 
 
-def roll_back(store: MapStore, site: str, *, actor: Actor = NOBODY) -> int:
+def roll_back(
+    store: MapStore, site: str, *, to: int | None = None, canary: int | None = None, actor: Actor = NOBODY
+) -> int:
     """Makes the version current that was so before and returns its number; the one that is retires.
 
-    While some robots try another version, that is taken back instead, and the current one stays.
+    While some robots try another version, that is taken back instead, and the current one stays. to: the version that is to become
+    current; canary: the trial that is to end, by its `id`; None: whichever it is.
 
-    Raises StateError where none was current before, StoreError or MapFormatError if its bytes are not all there.
+    Raises StateError where none was current before or it is another one than was named, StoreError or MapFormatError if its bytes are not
+    all there.
     """
     rows = store.releases(site)
-    if rows.canary is not None:
+    if canary is not None and (rows.canary is None or rows.canary.id != canary):
+        raise StateError(f"trial {canary} of site {site} has ended already; look at `versions`")
+    if rows.canary is not None and to is None:
         outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
         end_canary(store, rows.canary, promote=False, outcome=outcome, actor=actor)
         return rows.canary.base_version
     if rows.rollback_target is not None:
         store.check_bytes(rows.versions[rows.rollback_target])
-    changes = _change(store, site, lambda rows: rules.rollback(rows, actor))
+    changes = _change(store, site, lambda rows: rules.rollback(rows, actor, to))
     return next(version for version, state in changes.states if state == "current")
 
 

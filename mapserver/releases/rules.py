@@ -85,9 +85,11 @@ def promotion(rows: SiteReleases, version: int, actor: Actor) -> ReleaseChanges:
     return _becomes_current(rows, version, LogEntry("promoted", f"version {version}, replacing {left}", version, actor))
 
 
-def rollback(rows: SiteReleases, actor: Actor) -> ReleaseChanges:
-    """Makes the version current that was so before and retires the one that is; StateError where none was."""
+def rollback(rows: SiteReleases, actor: Actor, to: int | None = None) -> ReleaseChanges:
+    """Makes the version current that was so before and retires the one that is; StateError where none was, or where it is not `to`."""
     current, target = rows.current, rows.rollback_target
+    if to is not None and (to != target or rows.canary is not None):
+        raise StateError(f"a rollback of site {rows.site} no longer leads to version {to}; look at `versions`")
     if current is None or target is None:
         raise StateError(f"site {rows.site} has no version that was current before; `versions` shows what to promote")
     detail = f"from version {current.version} to {target}"

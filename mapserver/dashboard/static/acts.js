@@ -1,11 +1,11 @@
 // Acts: a button names a request to the HTTP API; a dialog explains it and asks for the reason and, without sign-in, the name.
 // data-act: the address; data-body: more of the request's body, which a page may set; data-explains: what would change.
-// data-lacks: set by a page while something is missing; the dialog then says that instead.
+// data-needs-reason: without a reason nothing is sent. data-lacks: set by a page while something is missing; the dialog then says that instead.
 const dialog = document.createElement("dialog");
 dialog.className = "ask-box";
 dialog.innerHTML = `<form><h2></h2><p></p>
-<label class="name">Your name <input name="actor" maxlength="200" required autocomplete="name"></label>
-<label>Reason (kept in the history) <input name="reason" maxlength="2000"></label>
+<label class="name">Your name <input name="actor" maxlength="200" required pattern=".*\\S.*" autocomplete="name"></label>
+<label>Reason (kept in the history) <input name="reason" maxlength="2000" pattern=".*\\S.*"></label>
 <p class="notice bad" role="alert" hidden></p>
 <div class="actions"><button class="plain confirm"></button> <button class="plain" type="button">No, change nothing</button></div></form>`;
 document.body.append(dialog);
@@ -22,10 +22,12 @@ document.addEventListener("click", ({ target }) => {
   if (!button) return;
   asked = button;
   const words = button.textContent.trim();
-  const { lacks } = button.dataset;
+  const { lacks, needsReason } = button.dataset;
   [title.textContent, explanation.textContent] = [`${words}?`, lacks || button.dataset.explains];
   confirm.textContent = `Yes: ${words}`;
-  confirm.hidden = Boolean(lacks);
+  confirm.hidden = confirm.disabled = Boolean(lacks);
+  form.reason.value = "";
+  form.reason.required = needsReason !== undefined;
   form.actor.parentElement.hidden = form.actor.disabled = isNamed;
   refused("");
   dialog.showModal();

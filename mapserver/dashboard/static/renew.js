@@ -3,23 +3,33 @@
 const EVERY_MS = 1000 * (document.querySelector("[data-renew]")?.dataset.renew || 5);
 const shown = new Map([...document.querySelectorAll("[data-renew]")].map((part) => [part, part.innerHTML]));
 
+const namesOf = ({ label, layers }) => JSON.stringify([label, ...layers.map(({ name }) => name)]);
+
+function renewMap(element, scene) {
+  const [before, after] = [element.dataset.scene, scene].map((text) => JSON.parse(text));
+  if (namesOf(before) !== namesOf(after)) return location.reload(); // another map
+  element.dataset.scene = scene;
+  after.layers.forEach(({ name, items }, n) => {
+    if (JSON.stringify(items) !== JSON.stringify(before.layers[n].items)) element.map?.show(name, items);
+  });
+}
+
 export async function renew() {
   const answer = await fetch(location.href).catch(() => undefined);
+  if (document.querySelector("dialog[open]")) return; // somebody acts
+  if (answer?.redirected || answer?.status === 401) return location.reload(); // to sign in
   if (!answer?.ok) return;
-  if (answer.redirected) location.reload(); // to sign in
   const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
   for (const [part, before] of shown) {
     const other = fresh.getElementById(part.id);
-    if (!other || other.innerHTML === before || part.contains(document.activeElement)) continue;
+    const writes = part.contains(document.activeElement) && document.activeElement.matches("input, select, textarea");
+    if (!other || writes || other.innerHTML === before) continue;
     shown.set(part, other.innerHTML); // not as it stands on the page, where somebody opened a part of it
     part.replaceChildren(...other.childNodes);
   }
   for (const element of document.querySelectorAll("[data-scene]")) {
     const scene = fresh.getElementById(element.id)?.dataset.scene;
-    if (!scene || scene === element.dataset.scene) continue;
-    const before = JSON.parse(element.dataset.scene).layers.map(({ items }) => JSON.stringify(items));
-    element.dataset.scene = scene;
-    JSON.parse(scene).layers.forEach(({ name, items }, n) => JSON.stringify(items) === before[n] || element.map?.show(name, items));
+    if (scene && scene !== element.dataset.scene) renewMap(element, scene);
   }
 }
 

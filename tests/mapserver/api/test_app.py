@@ -252,6 +252,7 @@ def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
     check_problem(post("/v1/sites/lab/versions/1/publish", json=ADA), 409, "only a draft")
     check_problem(post("/v1/sites/lab/versions/9/promote", json=ADA), 404, "no version 9")
     check_problem(post("/v1/sites/lab/rollback", json={}), 422, "actor")
+    check_problem(post("/v1/sites/lab/rollback", json=ADA | {"to": 2}), 409, "no longer leads to version 2")
     check_problem(post("/v1/sites/lab/rollback", json=ADA | {"also": 1}), 422, "also")
 
 

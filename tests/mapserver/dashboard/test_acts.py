@@ -10,8 +10,10 @@ from playwright.sync_api import Page, expect
 from fleetmap.bus import Bus
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from mapserver import releases
-from mapserver.store import MapStore
-from support.fleet.dashboard_scene import SITE, Served, change, fill_store, marks, opened, serving, talking
+from mapserver.fleet.survey_requests import ask_for_survey, end_request
+from mapserver.store import Actor, DraftContent, MapStore
+from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
+from support.storage.map_samples import draft_details
 
 
 def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
@@ -41,16 +43,27 @@ def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
 
 def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Served) -> None:
     seen = opened(page, served, "map")
-    drawing = page.locator(".site-map").first
-    page.get_by_text("Draw on the map").click()
+    page.get_by_role("button", name="Ask for a survey of it").click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("click at least three corners into the map first")
+    dialog.get_by_role("button", name="No, change nothing").click()
+    drawing = page.locator(".site-map")
+    page.get_by_label("Draw on the map").check()
     for place in ((250, 200), (300, 200), (300, 260), (100, 100)):
         drawing.click(position=dict(zip("xy", place, strict=True)))
-    page.wait_for_function("document.querySelector('.site-map').marks().length === 4")
+    assert len(marks(page, 4)) == 4
     page.get_by_role("button", name="Take back the last corner").click()
-    page.wait_for_function("document.querySelector('.site-map').marks().length === 3")
+    assert len(marks(page, 3)) == 3
+    asked = page.get_by_text(re.compile("asked by .* at "))
+    with MapStore.open(served.folder) as store:  # somebody else asks: it comes by itself, and what is drawn stays
+        other = ask_for_survey(store, SITE, [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)], Actor("bob"))
+        expect(asked).to_contain_text("asked by bob")
+        expect(page.locator(".site-map path.area")).to_have_count(1)
+        assert len(marks(page, 3)) == 3
+        end_request(store, SITE, other.id, Actor("bob"))
+        expect(asked).to_have_count(0)
     change(page, "Ask for a survey of it")
-    asked = page.get_by_text(re.compile("asked by ada at .*robots lose themselves in aisle 3"))
-    expect(asked).to_have_count(1)
+    expect(asked).to_contain_text(re.compile("asked by ada at .*robots lose themselves in aisle 3"))
     expect(page.locator(".site-map path.area")).to_have_count(1)
     opened(page, served, "trends")
     expect(page.get_by_role("table", name="Tiles to survey again")).to_contain_text("ada asked for it", timeout=15_000)
@@ -60,47 +73,63 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     assert seen.faults == []
 
 
-def current(served: Served) -> int:
-    with MapStore.open(served.folder) as store:
-        return store.current(SITE).version
-
-
 def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> None:
     fill_store(tmp_path)
     with serving(tmp_path) as served:
         seen = opened(page, served, "map")
+        used, dialog = page.get_by_role("status"), page.get_by_role("dialog")
         page.get_by_role("button", name="Roll back to version 1").click()
-        page.get_by_role("button", name="No, change nothing").click()
-        expect(page.locator(".q-dialog")).to_have_count(0)
-        assert current(served) == 2
-
-        change(page, "Roll back to version 1", name=" ")
-        expect(page.locator(".q-dialog .notice")).to_contain_text("your name")
-        page.keyboard.press("Escape")
-        opened(page, served, "map")
-        change(page, "Roll back to version 1")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 1.")
-        assert current(served) == 1
-        history = page.get_by_role("region", name="History")
-        expect(history).to_contain_text("robots lose themselves in aisle 3")
-        change(page, "Promote version 2")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.")
+        for name, reason, lacks in ((" ", "why", "actor"), ("ada", "", "reason"), ("ada", " ", "reason")):
+            dialog.get_by_label("Your name").fill(name)
+            dialog.get_by_label("Reason").fill(reason)
+            dialog.get_by_role("button", name=re.compile("^Yes")).click()
+            expect(dialog.locator("input:invalid")).to_have_attribute("name", lacks)
+        dialog.get_by_role("button", name="No, change nothing").click()
+        expect(used).to_have_text("Robots should use version 2.")
         change(page, "Publish draft 3")
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 3.")
-        assert current(served) == 3
-        assert seen.faults == []
+        expect(used).to_have_text("Robots should use version 3.")
+        expect(page.get_by_role("region", name="History")).to_contain_text("robots lose themselves in aisle 3")
 
-        # Somebody else acts: the page follows.
+        # Somebody else acts: the page follows, and what it still offered before is refused.
+        page.get_by_role("button", name="Roll back to version 2").click()
         with MapStore.open(served.folder) as store:
             releases.roll_back(store, SITE)
-        expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.", timeout=10_000)
+            dialog.get_by_label("Your name").fill("ada")
+            dialog.get_by_label("Reason").fill("worse")
+            dialog.get_by_role("button", name=re.compile("^Yes")).click()
+            expect(dialog.get_by_role("alert")).to_contain_text("no longer leads to version 2")
+            dialog.get_by_role("button", name="No, change nothing").click()
+            expect(used).to_have_text("Robots should use version 2.")
+        assert seen.faults[1:] == ["Failed to load resource: the server responded with a status of 409 (Conflict)"]
+
+
+def test_what_the_gate_refuses_is_told_and_can_be_forced(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        thin = [tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0)]
+        store.save(SITE, DraftContent(tiles=thin, vocabulary=b"words" * 50, details=draft_details()))
+    with serving(tmp_path) as served:
+        opened(page, served, "map", version=4)
+        gate, card = page.locator("#gate"), page.locator("#versions li", has_text="Version 4")
+        expect(gate).to_contain_text("The gate would refuse it.")
+        expect(gate).to_contain_text("Share of the landmarks 0.")
+        expect(gate.locator(".not_judged")).to_contain_text("Frames that the build left out: too few of them")
+        assert "_" not in gate.inner_text(), "no key of the code"
+        change(page, "Publish draft 4")
+        dialog = page.get_by_role("dialog")
+        expect(dialog.get_by_role("alert")).to_contain_text("draft 4 of hall is refused")
+        dialog.get_by_role("button", name="No, change nothing").click()
+        expect(card).to_contain_text("The gate refused it: share of the landmarks")
+        change(page, "Publish draft 4 by force")
+        expect(page.get_by_role("status")).to_have_text("Robots should use version 4.")
+        expect(card).to_contain_text("Published by force, although: share of the landmarks")
 
 
 def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:
     with MapStore.open(served.folder) as store:
         canary = releases.start_canary(store, SITE, 1, 0.05)
         seen = opened(page, served, "map")
-        expect(page.locator(".nicegui-content")).to_contain_text("Version 1 is tried by 5.0 % of them")
+        expect(page.get_by_role("status")).to_contain_text("Version 1 is tried by 5.0 % of them")
         expect(page.get_by_role("button", name="Stop trying version 1")).to_be_visible()
         expect(page.get_by_role("button", name="Roll back")).to_have_count(0)
         opened(page, served, "")

@@ -204,8 +204,8 @@ def test_versions_are_compared(page: Page, served: Served) -> None:
     seen = opened(page, served, "map", before=1, after=3)
     expect(page.locator("path.cell.added")).to_have_count(2)
     assert page.locator("path.cell.changed").count() == 6
-    content = page.locator(".nicegui-content")
-    for words in ("2 added, 6 changed, 0 removed", "211.0 m before, 213.0 m after", "accepted"):
+    content = page.locator("main")
+    for words in ("2 added, 6 changed, 0 removed", "211.0 m before, 213.0 m after", "The gate would accept it."):
         expect(content).to_contain_text(words)
     assert seen.faults == []
 
@@ -226,8 +226,12 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("trends?since=soon", "is no time; write"),
         ("trends?sinc=2026-01-01", "this page knows site, since, until"),
         ("?site=nowhere", "no site nowhere"),
+        ("nowhere?at=all", "There is no such page here"),
+        ("map/nowhere?site=nowhere", "no site nowhere"),
     ):
-        assert words in httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text, path
+        text = httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text
+        assert words in text, path
+        assert 'href="/dashboard/?site=nowhere"' not in text, "a way back"
     for path in ("plans/hall/99.png", "underlays/hall/2/floor.png", "underlays/hall/99/grid.png"):
         assert httpx.get(f"{served.http}/dashboard/{path}").status_code == 404
 

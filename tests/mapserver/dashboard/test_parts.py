@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from fleetmap.errors import StateError, UsageError
+from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
@@ -21,8 +21,8 @@ from mapserver.dashboard import fleet_parts, map_layers
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
+from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.markup import address, age, choices, facts, link, size, table
-from mapserver.dashboard.pages.map_page import one_way
 from mapserver.dashboard.plan import make_plan
 from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.dashboard.underlays import grid_picture
@@ -34,7 +34,7 @@ from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
-from mapserver.store import Actor, MapStore, TraceRow
+from mapserver.store import MapStore, TraceRow
 from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
 
 EVIL = "<script>alert(1)</script>\"'&"
@@ -93,13 +93,13 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
 
 def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
     plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
-    made = one_way(plan, Areas())
     assert {tuple(found.missing) for found in plan.directions} == {("W",)}
-    for found in plan.directions:
-        assert f"<td>tile {found.tile[0]},{found.tile[1]}</td><td>E</td><td>W</td>" in made
+    told = one_way(plan, Areas())
+    assert [words.partition(", surveyed facing E: ")[0] for words in told] == [
+        f"tile {found.tile[0]},{found.tile[1]}" for found in plan.directions
+    ]
     both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
-    assert "<td>" not in one_way(both, Areas())
-    assert "surveyed in both directions" in one_way(both, Areas())
+    assert one_way(both, Areas()) == []
 
 
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
@@ -179,30 +179,8 @@ def test_changes_of_tiles_and_sites(store: MapStore) -> None:
     kinds = data.changed_tiles(SITE, 1, 3)
     assert sorted(kinds.values()) == ["added"] * 2 + ["changed"] * 6
     assert set(data.changed_tiles(SITE, 3, 1).values()) == {"removed", "changed"}
-    assert data.history(SITE).before == 1
-    before = data.history(SITE).fingerprint
-    with pytest.raises(StateError, match="reload the page"):
-        data.roll_back(SITE, 2, Actor("ada"))
-    data.roll_back(SITE, 1, Actor("ada"))
-    assert data.history(SITE).fingerprint != before
-    assert data.history(SITE).before is None
     with pytest.raises(UsageError, match="no site nowhere"):
         data.chosen_site("nowhere")
-
-
-def test_a_trial_is_started_and_stopped(store: MapStore) -> None:
-    data = MapData(store, GateSettings(), 0.05)
-    before = data.history(SITE).fingerprint
-    data.start_trial(SITE, 3, Actor("ada"))
-    trial = data.history(SITE).trial
-    assert trial is not None
-    assert (trial.version, trial.base_version, data.current_version(SITE)) == (3, 2, 2)
-    assert data.history(SITE).fingerprint != before
-    data.stop_trial(SITE, trial, Actor("ada", "it was for a look"))
-    assert data.history(SITE).trial is None
-    assert store.canaries(SITE)[0].outcome == "taken back by hand: it was for a look"
-    with pytest.raises(StateError):
-        data.stop_trial(SITE, trial, Actor("ada"))
 
 
 def status(**changed: object) -> RobotStatus:

@@ -147,14 +147,14 @@ def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
     page = operator.page
     operator.click(page.get_by_role("link", name="Map", exact=True))
     operator.click(page.get_by_role("button", name="Publish draft 3", exact=True))
-    dialog = page.locator(".q-dialog")
+    dialog, used = page.get_by_role("dialog"), page.get_by_role("status")
     expect(dialog).to_contain_text(
         re.compile("Draft 3 goes through the gate. If the gate accepts it, all 20 robots of hall get it.")
     )
     assert operator.clicks <= MOST_CLICKS
     dialog.get_by_label("Your name").fill("ada")
     dialog.get_by_role("button", name=re.compile("^Yes")).click()
-    expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 3.")
+    expect(used).to_have_text("Robots should use version 3.")
 
     operator.begin()
     operator.click(page.get_by_role("link", name="Map", exact=True))
@@ -162,7 +162,8 @@ def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
     expect(dialog).to_contain_text("All 20 robots of hall go from version 3 back to version 2.")
     assert operator.clicks <= MOST_CLICKS
     dialog.get_by_label("Your name").fill("ada")
+    dialog.get_by_label("Reason").fill("it got worse")
     dialog.get_by_role("button", name=re.compile("^Yes")).click()
-    expect(page.locator(".nicegui-content")).to_contain_text("Robots should use version 2.")
+    expect(used).to_have_text("Robots should use version 2.")
     with MapStore.open(operator.served.folder) as store:
         assert store.current(SITE).version == 2

@@ -140,6 +140,7 @@ def test_a_sound_draft_passes_alone_and_beside_the_same_version() -> None:
         assert evidence.held_out.draft.median_error_m < 0.01
         assert ("size_against_last_version" in said.report["not_judged"]) is not has_current
         assert "yesterdays_recordings" in said.report["not_judged"]
+        assert {"held_out_frames", "motion"} <= set(said.report["passed"])
 
 
 @pytest.mark.parametrize("has_current", [False, True])
@@ -401,3 +402,4 @@ def test_a_recording_that_was_not_shown_to_belong_to_the_site_stops_a_draft(
     assert said.accepted is passes
     assert bool(said.hard_reasons) is not passes
     assert ("joining" in said.report["not_judged"]) is (joins is None)
+    assert ("joining" in said.report["passed"]) is (joins == {"a": "joined"})

@@ -137,8 +137,12 @@ def test_a_robot_fetches_what_it_is_told(world: World, tmp_path: Path) -> None:
 
 
 def test_people_may_end_it_in_both_ways(world: World) -> None:
-    releases.start_canary(world.store, "lab", 2, 0.1)
-    assert releases.roll_back(world.store, "lab", actor=Actor("ada", "complaints")) == 1
+    trial = releases.start_canary(world.store, "lab", 2, 0.1)
+    with pytest.raises(StateError, match="no longer leads to version 1"):
+        releases.roll_back(world.store, "lab", to=1)
+    assert releases.roll_back(world.store, "lab", canary=trial.id, actor=Actor("ada", "complaints")) == 1
+    with pytest.raises(StateError, match="has ended already"):
+        releases.roll_back(world.store, "lab", canary=trial.id)
     assert world.store.version("lab", 2).state == "retired"
     assert "complaints" in world.store.canaries("lab")[0].outcome
     releases.start_canary(world.store, "lab", 2, 0.1)  # a second try

@@ -1,0 +1,311 @@
+"""The page of maps: what runs where (versions with state, the gate's word and robots), and what another version would change."""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.errors import UsageError
+from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.data import EVER, MapData
+from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.map_layers import Layer, Outline, box_of, heat, squares
+from mapserver.dashboard.markup import share, size
+from mapserver.dashboard.plan import Plan
+from mapserver.floor_plan.areas import Areas
+from mapserver.quality.directions import missing_words
+from mapserver.quality.figures import trusted_calibrations
+from mapserver.releases import Difference
+from mapserver.store import Event, VerdictRow, VersionInfo
+from mapserver.store.rows import SiteReleases
+
+_EVENTS_SHOWN = 50
+_STATES = {
+    "current": ("good", "current"),
+    "draft": ("warn", "draft"),
+    "published": ("quiet", "used before"),
+    "retired": ("quiet", "retired"),
+}
+# What was done to a version, by the kind of an event.
+_DONE = {
+    "published": "published",
+    "promoted": "promoted",
+    "rolled_back": "gone back to",
+    "canary_started": "tried",
+    "canary_promoted": "promoted after its trial",
+    "canary_rolled_back": "taken back",
+    "canary_stopped": "trial ended",
+}
+# Figures of a build's report with their labels.
+_FIGURES = {
+    "path_m": ("Driven", "{:.1f} m"),
+    "duration_s": ("Recorded", "{:.0f} s"),
+    "keyframes": ("Keyframes", "{:.0f}"),
+    "landmarks": ("Landmarks surveyed", "{:.0f}"),
+    "ate_rmse_m": ("Error against ground truth", "{:.3f} m"),
+    "seconds": ("Time to build", "{:.0f} s"),
+}
+# What the gate judges, and why it does not.
+_CHECKS = {
+    "joining": ("Recordings belong to the site", "the build does not say how they were joined"),
+    "held_out_frames": ("Frames that the build left out", "too few of them"),
+    "yesterdays_recordings": ("Earlier recordings", "too few frames of them were played against it"),
+    "last_versions_places": ("Places of the version before", "too few of them could be tried"),
+    "aliasing_probes": ("Places that look alike", "too few frames could be tried"),
+    "calibration": ("Calibration", "no recording was examined for it"),
+    "motion": ("Trajectory in one piece", "nothing to compare it with"),
+    "size_against_last_version": ("Size against the current version", "there was none"),
+}
+_FRAMES = {"held_out_frames": "held_out", "yesterdays_recordings": "replayed", "last_versions_places": "last_version"}
+_KEY = re.compile(r"[a-z]+(_[a-z]+)+")
+_KEYS = {name: words for name, (words, _) in _CHECKS.items()} | {
+    "localised_share": "share of frames localised",
+    "wrong_share": "share of frames put in a wrong place",
+    "median_error_m": "median error in metres",
+    "residual_px": "residual in pixels",
+    "inliers_share": "share of the matches",
+    "landmarks_share": "share of the landmarks",
+    "coverage_share": "share of the area",
+    "bytes_share": "share of the size",
+}
+
+
+def install(console: Console) -> None:
+    """Adds the page."""
+    services = console.services
+    knows = ("version", "before", "after", "since", "until")
+    console.page("map", "map.html", lambda context: _page(services, context), knows=knows)
+
+
+def _page(services: Services, context: PageContext) -> dict[str, object]:
+    maps, site, span_ns = services.maps, context.site, context.time_range()
+    rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
+    robots = [robot.version for robot in services.robots.look(site).robots]
+    asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
+    shown = asked or after or maps.current_version(site) or max(rows.versions, default=None)
+    if shown is None:
+        raise UsageError(f"site {site} has no version yet; `mapserver build` makes one from a recording")
+    info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
+    changes, compares = _changes(maps, rows, before, after or shown), "after" in context.query
+    asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in requests]
+    over = [
+        Layer("Failures", heat(services.health.places(site, *span_ns), box_of(plan)), shown=False),
+        Layer("Changed tiles", squares(plan, changes["tiles"]), shown=compares),
+        Layer("Surveys asked for", asked_for),
+        Layer("Survey that you draw"),
+    ]
+    return {
+        "used": _used(rows),
+        "versions": [_card(maps, rows, events, info, robots, shown) for info in reversed(rows.versions.values())],
+        "shown": shown,
+        "scene": scene_of(services, context, shown, over, shows_coverage=not compares),
+        "gate": _gate(maps, info),
+        "version_facts": _facts(maps, info, plan),
+        "one_way": one_way(plan, maps.areas(site)),
+        "changes": changes,
+        "requests": requests,
+        "range": context.range_form("map", usual="Last 14 days", chosen={"version": asked}),
+        "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
+        "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
+    }
+
+
+def _used(rows: SiteReleases) -> str:
+    if rows.current is None:
+        return "No version is published yet."
+    tried = f" Version {rows.canary.version} is tried by {share(rows.canary.share)} of them." if rows.canary else ""
+    return f"Robots should use version {rows.current.version}.{tried}"
+
+
+def _card(
+    maps: MapData, rows: SiteReleases, events: list[Event], info: VersionInfo, robots: list[int | None], shown: int
+) -> dict[str, object]:
+    """A version in the list. Acts on old ones are there once they are chosen: the list stays short."""
+    version, trial, verdict = info.version, rows.canary, maps.last_verdict(info.site, info.version)
+    on_trial = trial is not None and trial.version == version
+    tone, state = _STATES[info.state]
+    if trial is not None and on_trial:
+        tone, state = "warn", f"on trial, {share(trial.share)} of the robots"
+    event = next((e for e in events if e.version == version and e.kind in _DONE), None)
+    stamp_ns = event.stamp_ns if event else info.published_ns or info.saved_ns
+    done = _DONE[event.kind] if event else "published" if info.published_ns else "built"
+    by = f" by {event.actor or 'the server'}" if event else ""
+    runs = robots.count(version)
+    is_old = rows.current is not None and version < rows.current.version and not on_trial
+    return {
+        "version": version,
+        "tone": tone,
+        "state": state,
+        "gate": verdict_words(verdict, info.state == "draft"),
+        "done": f"{_begun(done)}{by}",
+        "stamp_ns": stamp_ns,
+        "why": event.reason if event else "",
+        "robots": f"{runs} of {len(robots)} robots" if runs else "",
+        "acts": [] if is_old and version != shown else list(_acts(maps, rows, info, verdict, len(robots))),
+    }
+
+
+def _acts(
+    maps: MapData, rows: SiteReleases, info: VersionInfo, verdict: VerdictRow | None, robots: int
+) -> Iterator[tuple[object, ...]]:
+    """What can be done to a version, as the macro `act` takes it: give it to all robots, to some of them first, or take it back."""
+    site, version, trial, before = info.site, info.version, rows.canary, rows.rollback_target
+    current = None if rows.current is None else rows.current.version
+    to, back = f"sites/{site}/versions/{version}", f"sites/{site}/rollback"
+    everybody = f"all {robots} robots of {site}" if robots != 1 else f"the robot of {site}"
+    retires = f"Version {version} is retired; it can be made current again later."
+    if trial is not None and trial.version == version:
+        told = f"The robots with version {version} ({share(trial.share)} of all) go back to version {trial.base_version}. {retires}"
+        yield f"Stop trying version {version}", back, told, {"canary": trial.id}, "back", True
+    if info.state == "current":
+        if trial is None and before is not None:
+            told = f"{_begun(everybody)} go from version {version} back to version {before}. {retires}"
+            yield f"Roll back to version {before}", back, told, {"to": before}, "back", True
+        return
+    through = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
+    if info.state == "draft":
+        told = f"{_begun(f'{through}{everybody}')} get it."
+        yield f"Publish draft {version}", f"{to}/publish", told, {}, "forward", False
+        if verdict is not None and verdict.reasons and set(verdict.reasons) <= set(verdict.report.get("unjudged", ())):
+            told = (
+                f"You say that the calibration of draft {version} is right although no recording judged it: all later versions keep "
+                f"its metres. {_begun(everybody)} get it."
+            )
+            trusts = {"trust_calibration": True}
+            yield f"Trust its calibration, publish draft {version}", f"{to}/publish", told, trusts, "back", True
+        elif verdict is not None and verdict.reasons:
+            told = f"The gate refused draft {version}. {_begun(everybody)} get it all the same, if they could use it at all."
+            yield f"Publish draft {version} by force", f"{to}/publish", told, {"force": True}, "back", True
+    elif version != before or trial is not None:
+        is_back = current is not None and version < current
+        ends = ", ending its trial" if trial is not None and trial.version == version else ""
+        told = (
+            f"{_begun(everybody)} go from version {current} to version {version}.{' The trial ends.' if trial else ''}"
+        )
+        words = f"{'Go back to' if is_back else 'Promote'} version {version}{ends}"
+        yield words, f"{to}/promote", told, {}, "back" if is_back else "forward", is_back
+    if current is not None and trial is None and version > current:
+        some = f"{maps.trial_share:.0%} of the robots"
+        told = (
+            f"{through}{some} get version {version}. If they fail more often than the others, it is rolled back automatically; "
+            "otherwise all robots get it."
+        )
+        yield f"Try version {version} on {some}", f"{to}/canary", told, {}, "forward", False
+
+
+def verdict_words(verdict: VerdictRow | None, is_draft: bool) -> tuple[str, str]:
+    """Tone and sentence of what the gate said last about a version."""
+    if verdict is None:
+        return "quiet", "The gate judges it when it is published." if is_draft else "The gate never judged it."
+    if verdict.accepted:
+        return "good", "The gate accepted it."
+    tone, said = ("warn", "Published by force, although") if verdict.forced else ("bad", "The gate refused it")
+    more = f", and {len(verdict.reasons) - 1} more" if len(verdict.reasons) > 1 else ""
+    return tone, f"{said}: {_plain(verdict.reasons[0])}{more}."
+
+
+def _begun(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:]}"
+
+
+def _plain(words: str) -> str:
+    """Words of the gate without keys of the code."""
+
+    def named(found: re.Match[str]) -> str:
+        key = found.group()
+        return "the limit" if key.startswith(("min_", "max_")) else _KEYS.get(key, key.replace("_", " "))
+
+    return _KEY.sub(named, words)
+
+
+def _gate(maps: MapData, info: VersionInfo) -> dict[str, object] | None:
+    """What the gate found, or would find in a draft; None where it never looked."""
+    answers, verdict = ("accepted", "refused"), maps.last_verdict(info.site, info.version)
+    if verdict is None and info.state == "draft":
+        answers, verdict = ("would accept", "would refuse"), maps.foretold(info)
+    if verdict is None:
+        return None
+    report, evidence = verdict.report, verdict.report.get("evidence") or {}
+    passed = []
+    for name in report.get("passed", ()):
+        tried = (evidence.get(_FRAMES.get(name)) or {}).get("draft")
+        told = f": {tried['localised_share']:.0%} of {tried['frames']} localised" if tried else ""
+        passed.append(f"{_CHECKS[name][0]}{told}")
+    unknown = [": ".join(_CHECKS[name]) if name in _CHECKS else name for name in report.get("not_judged", ())]
+    return {
+        "tone": "good" if verdict.accepted else "bad",
+        "words": f"The gate {answers[not verdict.accepted]} it.",
+        "failed": [_begun(_plain(reason)) for reason in verdict.reasons],
+        "passed": passed,
+        "not_judged": unknown,
+    }
+
+
+def _facts(maps: MapData, info: VersionInfo, plan: Plan) -> list[tuple[str, object]]:
+    manifest = maps.store.manifest(info.site, info.version)
+    report = manifest.report
+    pairs: list[tuple[str, object]] = [
+        (words, pattern.format(report[name]))
+        for name, (words, pattern) in _FIGURES.items()
+        if isinstance(report.get(name), int | float)
+    ]
+    has_vocabulary = shipped_vocabulary(info.vocabulary_sha256) is not None
+    download = size(info.map_bytes + (0 if has_vocabulary else info.vocabulary_bytes))
+    words = "the vocabulary is on every robot" if has_vocabulary else f"{size(info.vocabulary_bytes)} of it vocabulary"
+    pairs += [
+        ("Built on", f"version {info.parent}" if info.parent else "nothing: it is the first"),
+        ("For robots", f"{info.landmarks} landmarks and {plan.places} places"),
+        ("Area with tiles", f"{len(plan.tiles) * plan.tile_size_m**2:.0f} m² in {info.tiles} tiles"),
+        ("Download for a robot", f"{download}; {words}"),
+    ]
+    loops, findings = report.get("loops"), report.get("findings")
+    if isinstance(loops, dict):
+        pairs.append(("Loops", f"{loops.get('accepted', 0)} accepted of {loops.get('candidates', 0)} candidates"))
+    recordings = ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in manifest.recordings)
+    pairs += [
+        ("Recordings", recordings),
+        *(("Calibration", choice.sentence) for choice in trusted_calibrations(manifest)),
+    ]
+    said = findings.items() if isinstance(findings, dict) else ()
+    return pairs + [(f"Doctor: {name}", "; ".join(words) or "no findings") for name, words in said]
+
+
+def one_way(plan: Plan, areas: Areas) -> list[str]:
+    """Tiles in which robots coming from the other side will not localize."""
+    return [
+        f"{areas.tile_words(found.tile, plan.tile_size_m)}, surveyed facing {', '.join(found.seen)}: {missing_words(found)}"
+        for found in plan.directions
+        if found.missing
+    ]
+
+
+def _changes(maps: MapData, rows: SiteReleases, before: int | None, after: int) -> dict[str, Any]:
+    """What version `after` changes; without `before`, from the current version, or from the one before where it is that."""
+    site, current = rows.site, rows.current
+    if before is None:
+        earlier = max((version for version in rows.versions if version < after), default=after)
+        before = current.version if current and current.version != after else rows.rollback_target or earlier
+    found, tiles = maps.difference(site, before, after), maps.changed_tiles(site, before, after)
+    lacks = filter(None, (maps.lacks_surfels(site, version) for version in (before, after)))
+    return {"before": before, "after": after, "tiles": tiles, "lack": next(lacks, ""), "facts": _changed(found)}
+
+
+def _changed(found: Difference) -> list[tuple[str, object]]:
+    moved = "none"
+    if found.landmarks_moved and found.moved_median_m is not None and found.moved_max_m is not None:
+        moved = f"{found.landmarks_moved}, by {found.moved_median_m:.3f} m (median), at most {found.moved_max_m:.3f} m"
+    tiles = f"{found.tiles_added} added, {found.tiles_changed} changed, {found.tiles_removed} removed, {found.tiles_kept} unchanged"
+    landmarks = f"{found.landmarks_added} new, {found.landmarks_removed} removed, {found.landmarks_kept} unchanged"
+    pairs: list[tuple[str, object]] = [
+        ("Tiles", tiles),
+        ("Landmarks", landmarks),
+        ("Landmarks that moved", moved),
+        ("A robot downloads", f"{size(found.fetch_bytes)} of {size(found.full_bytes)}"),
+        ("Vocabulary", "changed" if found.vocabulary_changed else "unchanged"),
+    ]
+    for name, (words, pattern) in _FIGURES.items():
+        both = found.quality.get(name)
+        if both is not None:
+            texts = [pattern.format(v) if isinstance(v, int | float) else "unknown" for v in (both.before, both.after)]
+            pairs.append((words, f"{texts[0]} before, {texts[1]} after"))
+    return pairs
