@@ -79,5 +79,5 @@ def decode_summary(data: bytes) -> FailureSummary:
             "the moments of the failure's summary are not in the order of time; was it made by a robot?"
         )
     if not all(isfinite(value) for moment in summary.moments for value in moment.figures):
-        raise RecordingError("a moment of the failure's summary is nowhere; was it made by a robot?")
+        raise RecordingError("a moment of the failure's summary has no position; was it made by a robot?")
     return summary

@@ -99,7 +99,7 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
         _check_length(len(self.path_m) // 8, len(numbers), "part numbers")
         wrong = numbers[(numbers != NO_PART) & (numbers >= len(self.parts))]
         if len(wrong):
-            raise LinkError(f"part {wrong[0]} of {len(self.parts)} is none; does the sender run the same fleetmap?")
+            raise LinkError(f"invalid part {wrong[0]} of {len(self.parts)}; does the sender run the same fleetmap?")
         return numbers
 
     def landmarks(self) -> Array:
@@ -123,11 +123,11 @@ def _check_length(places: int, count: int, what: str) -> None:
 def _rows(data: bytes, columns: int, name: str) -> Array:
     if len(data) % (4 * columns):
         raise LinkError(
-            f"{name} of {len(data)} bytes is no array of {columns} columns; does the sender run the same fleetmap?"
+            f"{name} of {len(data)} bytes is not an array of {columns} columns; does the sender run the same fleetmap?"
         )
     rows = np.frombuffer(data, "<f4").astype(np.float64).reshape(-1, columns)
     if not np.isfinite(rows).all():
-        raise LinkError(f"{name} holds a number that is not finite; look at the survey's log")
+        raise LinkError(f"{name} holds a number that is not finite; check the survey's log")
     return rows
 
 

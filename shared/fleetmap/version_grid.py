@@ -160,7 +160,7 @@ def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) ->
     levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
     if not 1 <= levels <= SLICES:
         raise UsageError(
-            f"a robot of {robot_height_m} m; the grid tells heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
+            f"a robot of {robot_height_m} m; the grid covers heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
         )
     below = np.uint8((1 << levels) - 1)
 

@@ -114,7 +114,7 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
 def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identity_module, "_ANSWER_S", 5.0)
     bundle = msgspec.json.decode(server.bundle("r1"))
-    with pytest.raises(UsageError, match="no enrolment bundle"):
+    with pytest.raises(UsageError, match="not an enrolment bundle"):
         RobotIdentity.enrol(tmp_path / "a", b"PK\x03\x04")
     with pytest.raises(UsageError, match="robot name"):
         RobotIdentity.enrol(tmp_path / "b", msgspec.json.encode({**bundle, "robot": "../r1"}))

@@ -98,7 +98,7 @@ _WORDS = {
     "TLSV1_ALERT_DECRYPT_ERROR": "the server does not know who signed this robot's certificate; enrol it again",
     "CERTIFICATE_EXPIRED": "this robot's certificate has expired by the server's clock; enrol it again",
     "SSLV3_ALERT_CERTIFICATE_EXPIRED": "this robot's certificate has expired by the server's clock; enrol it again",
-    "WRONG_VERSION_NUMBER": "the server there speaks no TLS",
+    "WRONG_VERSION_NUMBER": "the server does not use TLS",
 }
 
 

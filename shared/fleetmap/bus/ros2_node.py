@@ -77,7 +77,7 @@ class Ros2Node:
             try:
                 return answer(payload)
             except ValueError as error:
-                raise RecordingError(f"{endpoint.name}: the request is no {type_name} ({error})") from error
+                raise RecordingError(f"{endpoint.name}: invalid {type_name} request ({error})") from error
 
         key = self._layout.key(endpoint.name, type_name)
         echo = lambda question: answer_attachment(question, time.time_ns())  # noqa: E731

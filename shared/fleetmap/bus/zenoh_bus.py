@@ -103,7 +103,7 @@ class Bus:
         """
         self.endpoint = check_endpoint(endpoint)
         if has_tls(endpoint) and tls is None and is_server:
-            raise UsageError(f"endpoint {endpoint}: without a certificate nobody can listen with TLS")
+            raise UsageError(f"endpoint {endpoint}: listening with TLS needs a certificate")
         self._is_server, self._tls, self.access, self._is_ros = is_server, tls, access, is_ros
         self._lock = threading.RLock()
         self._session: Any = None
@@ -408,7 +408,7 @@ def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> Unrea
             "the server is there and lets this certificate say nothing: revoked, enrolled anew, or of another site? "
             "`mapserver robots list` shows it"
         )
-    return UnreachableError(f"nobody answered for {key} within {timeout_s:g} s; {why}")
+    return UnreachableError(f"no reply for {key} within {timeout_s:g} s; {why}")
 
 
 def query_refused(key: str, reason: str) -> LinkError:

@@ -22,5 +22,5 @@ def extract(image: Image, settings: OrbSettings) -> orb.Features:
 def extract_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[orb.Features]:
     """As `extract`, in slices."""
     if settings.extractor not in EXTRACTORS:
-        raise UsageError(f"there is no feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
+        raise UsageError(f"unknown feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
     return EXTRACTORS[settings.extractor](image, settings)

@@ -34,7 +34,7 @@ def viewer_address(text: str, *, insecure: bool) -> ViewerAddress:
     if not (is_local or insecure):
         raise UsageError(
             f"--foxglove {text}: viewers do not sign in, and other machines could see everything; leave {host} out and come "
-            "through ssh -L, or say --insecure on a network that nobody else can reach"
+            "through ssh -L, or pass --insecure on a network that only you can reach"
         )
     return ViewerAddress(host, int(port))
 

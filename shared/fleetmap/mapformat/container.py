@@ -58,7 +58,7 @@ def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) ->
         )
     if number < 1 or reserved != 0:
         raise MapFormatError(
-            f"{what}: format {number} with reserved bytes {reserved} was never written; the bytes are damaged"
+            f"{what}: format {number} with reserved bytes {reserved} is invalid; the bytes are damaged"
         )
     if size > max_bytes:
         raise MapFormatError(f"{what} declares {size} bytes, the limit is {max_bytes}; it is damaged or not ours")

@@ -166,7 +166,7 @@ class ExportReader:
             yield chunk
 
     def _damaged(self, why: str) -> MapFormatError:
-        return MapFormatError(f"{self._path} is no whole export: {why}; export it again")
+        return MapFormatError(f"{self._path} is not a complete export: {why}; export it again")
 
 
 @contextmanager

@@ -98,6 +98,6 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
     for suffixes, advice in _ADVICE.items():
         if path.name.lower().endswith(suffixes):
             words = advice.format(path=path, stem=path.stem)
-            raise RecordingError(f"{path} is in no format that is known; {words}")
+            raise RecordingError(f"{path} has an unknown format; {words}")
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in RECORDING_FORMATS.items())
-    raise RecordingError(f"{path} is in no format that is known. Known are {known}")
+    raise RecordingError(f"{path} has an unknown format. Known are {known}")

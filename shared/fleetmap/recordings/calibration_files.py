@@ -125,7 +125,7 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
     has_imu = bool(values.get("has_imu", noise is not None or is_mounted))
     if has_imu and not is_mounted:
         raise CalibrationError(
-            f"{where}: cam0: nothing says how the IMU is mounted; add T_cam_imu (Kalibr's) or T_imu_cam (OpenVINS'), or take the "
+            f"{where}: cam0: the mounting of the IMU is missing; add T_cam_imu (Kalibr's) or T_imu_cam (OpenVINS'), or take the "
             "IMU's noise out, to use the cameras alone"
         )
     cameras: list[CameraCalibration] = []
@@ -214,10 +214,10 @@ def matrix_4x4(value: object, where: str) -> Array:
             raise ValueError
         matrix = matrix.reshape(4, 4)
     except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{where}: {_brief(value)} is no 4x4 matrix; write four rows of four numbers") from None
+        raise CalibrationError(f"{where}: {_brief(value)} is not a 4x4 matrix; write four rows of four") from None
     if fault := _fault_of(matrix):
         raise CalibrationError(
-            f"{where}: {np.round(matrix, 4).tolist()} is no rotation and translation: {fault}; check its rows"
+            f"{where}: {np.round(matrix, 4).tolist()} is not a rigid transform: {fault}; check its rows"
         )
     return matrix
 
@@ -277,7 +277,7 @@ def _body_from_cam(values: Values, previous: CameraCalibration | None, where: st
         return np.eye(4)
     if "T_cn_cnm1" not in values:
         raise CalibrationError(
-            f"{where}: neither T_cam_imu, T_imu_cam nor T_cn_cnm1 says where the camera sits; add one of them"
+            f"{where}: neither T_cam_imu, T_imu_cam nor T_cn_cnm1 gives the pose of the camera; add one of them"
         )
     return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
 
@@ -423,7 +423,7 @@ def _check_events(text: str, where: str) -> None:
         if depth > _MAX_DEPTH:
             raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
-            raise CalibrationError(f"{where} holds a value of {len(event.value)} signs; the limit is {_MAX_WORD}")
+            raise CalibrationError(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")
 
 
 def _row(values: Array) -> str:

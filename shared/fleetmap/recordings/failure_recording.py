@@ -34,7 +34,7 @@ def attachments_of(path: Path) -> dict[str, bytes]:
     missing = [name for name in (SUMMARY, LOCALIZER) if name not in scanned.attachments]
     if missing:
         raise RecordingError(
-            f"{path} is no failure's recording: {missing[0]} is missing; `locclient replay` plays others"
+            f"{path} is not a failure's recording: {missing[0]} is missing; `locclient replay` plays others"
         )
     return {name: scanned.attachments[name] for name in (SUMMARY, LOCALIZER)}
 

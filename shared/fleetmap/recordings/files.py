@@ -56,14 +56,14 @@ def read_text(
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise error_type(f"{path} is no regular file; {expected}")
+            raise error_type(f"{path} is not a regular file; {expected}")
         if status.st_size > most_bytes:
             raise error_type(f"{path} has {status.st_size} bytes; at most {most_bytes} are read, {expected}")
         return path.read_text(encoding="utf-8-sig", errors=errors)
     except OSError as error:
         raise error_type(f"{path} cannot be read ({error.strerror}); check the path, {expected}") from error
     except UnicodeDecodeError as error:
-        raise error_type(f"{path} is not a text file (byte {error.start} is no UTF-8); {expected}") from error
+        raise error_type(f"{path} is not a text file (byte {error.start} is not UTF-8); {expected}") from error
 
 
 def hash_file(path: Path, digest: "hashlib._Hash") -> None:

@@ -72,7 +72,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     if truth is not None:
         check_together(truth.stamps_ns, "ground truth", parts.frame_stamps_ns)
     if len(imu) and parts.calibration.imu is None:
-        how = "no calibration says how the IMU is mounted; pass one with --calibration FILE"
+        how = "the mounting of the IMU is unknown; pass a calibration with --calibration FILE"
         log.note("imu not used", f"{len(imu)} samples, but {how}")
         imu = ImuSamples.empty()
     if wheel and (fault := parts.calibration.wheels_fault):

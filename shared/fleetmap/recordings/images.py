@@ -199,7 +199,7 @@ def decode_grey(stored: StoredImage) -> Image:
     if pixels.dtype == np.uint16:
         return np.asarray(np.minimum(pixels >> (stored.bits - 8), 255), np.uint8)
     if pixels.dtype != np.uint8:
-        raise RecordingError(f"{stored.where}: {pixels.dtype} pixels are no camera image; known are 8 and 16 bits")
+        raise RecordingError(f"{stored.where}: {pixels.dtype} pixels are not a camera image; known are 8 and 16 bits")
     return np.ascontiguousarray(pixels, np.uint8)
 
 
@@ -240,7 +240,7 @@ def decode_depth(stored: StoredImage) -> NDArray[np.float32]:
     if pixels.ndim == 2 and pixels.dtype == np.float32:
         return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.float32(0))
     raise RecordingError(
-        f"{stored.where}: {pixels.dtype} pixels of shape {pixels.shape} are no depth image; use 16UC1 or 32FC1"
+        f"{stored.where}: {pixels.dtype} pixels of shape {pixels.shape} are not a depth image; use 16UC1 or 32FC1"
     )
 
 

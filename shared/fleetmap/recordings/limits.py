@@ -58,7 +58,7 @@ def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_M
         else:
             raise ValueError(f"compression {compression[:80]!r} is not known; known are zstd, lz4, bz2 and none")
     except (zstandard.ZstdError, RuntimeError, OSError, EOFError) as error:
-        raise ValueError(f"{len(packed)} bytes are no {compression}") from error
+        raise ValueError(f"{len(packed)} bytes are not valid {compression}") from error
     if len(unpacked) > most_bytes:
         raise ValueError(f"{len(packed)} bytes unpack to more than {most_bytes}, which is the limit")
     return unpacked

@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Tr
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken simultaneously
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
 # For recordings whose stamps were not taken at the exposure of the images
-UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's, which no exposure set and no other sensor shares")
+UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's: not set by the exposure, not shared with sensors")
 UNITS = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}  # by the nanoseconds in each
 _FINER = {1_000: "milliseconds", 1_000_000: "microseconds", 1_000_000_000: "nanoseconds"}  # by how many are in a second
 _MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bits may give it
@@ -177,7 +177,7 @@ def check_seconds(value: float, where: str) -> None:
     """RecordingError for a value too large for seconds since 1970, naming its likely unit."""
     if abs(value) > 9_223_372_036:  # what 64 bits of nanoseconds hold
         factor = next((factor for factor in _FINER if abs(value) < 1e11 * factor), 1_000_000_000)
-        why = f"{value:.0f} is no time in seconds"
+        why = f"{value:.0f} is not a time in seconds"
         raise wrong_unit(f"{where}:", _FINER[factor], why, f"divide them by {factor}")
 
 

@@ -227,7 +227,7 @@ class FrameSelection:
             parts = []
         if not 2 <= len(parts) <= 3:
             raise UsageError(
-                f"--frames {text!r} is no A:B:C slice of frame numbers; write for example 0:600:2, 100: or ::2"
+                f"--frames {text!r}: invalid slice of frame numbers; write A:B:C, for example 0:600:2, 100: or ::2"
             )
         if step is not None and step < 1:
             raise UsageError(f"--frames {text!r}: the step {step} must be 1 or more; use --reverse to play backwards")

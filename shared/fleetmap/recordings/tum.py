@@ -88,7 +88,7 @@ def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
         if is_header:
             continue
         if words:
-            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers, {words[0][:40]!r} is none")
+            raise RecordingError(f"{where}: {line[:80]!r} is not all numbers, {words[0][:40]!r} is not a number")
         try:
             stamp_ns = parse_stamp_ns(fields[0])
         except ValueError as error:
@@ -123,7 +123,7 @@ def parse_stamp_ns(field: str) -> int:
     except InvalidOperation as error:
         raise ValueError(f"stamp {field!r}") from error
     if not seconds.is_finite():
-        raise ValueError(f"stamp {field!r} is no time")
+        raise ValueError(f"stamp {field!r} is not a number of seconds")
     if abs(seconds) > _MOST_S:
         unit = next((name for name, most in (("ms", 10**13), ("us", 10**16)) if abs(seconds) < most), "ns")
         raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds, it looks like {unit}")

@@ -151,7 +151,7 @@ def _opened(path: Path) -> _Video:
         import av
     except ImportError as error:
         raise RecordingError(
-            f"{path} needs a library more: pip install '.[video]' in fleetmap's source folder"
+            f"{path} needs another library: pip install '.[video]' in fleetmap's source folder"
         ) from error
     file = path.open("rb")
     try:
@@ -199,7 +199,7 @@ def _check_tables(path: Path, file: BinaryIO) -> None:
         at += length
     file.seek(0)
     if told > size:
-        raise RecordingError(f"{path}: its tables tell of {told} samples in {size} bytes; {_conversion(path)}")
+        raise RecordingError(f"{path}: its tables declare {told} samples in {size} bytes; {_conversion(path)}")
 
 
 def _conversion(path: Path) -> str:

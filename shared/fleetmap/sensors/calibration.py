@@ -55,7 +55,7 @@ class ImuNoise:
 
 
 NO_BASE = (
-    "nothing says how the body is mounted on the base whose speed they measure; add base_from_body (4x4 rows) to the calibration file, "
+    "the mounting of the body on the base, whose speed they measure, is unknown; add base_from_body (4x4 rows) to the calibration file, "
     "or, without such a file, record /tf_static with base_link"
 )
 

@@ -76,7 +76,7 @@ def decode_bundle(data: bytes) -> Bundle:
         return msgspec.json.decode(data, type=Bundle)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(
-            f"this is no enrolment bundle ({error}); `mapserver robots enrol ROBOT` on the server makes one"
+            f"this is not an enrolment bundle ({error}); `mapserver robots enrol ROBOT` on the server makes one"
         ) from error
 
 
@@ -107,7 +107,7 @@ def check_request(payload: bytes) -> Renewal:
             raise ValueError("the new key did not sign")
         old.verify(asked.proof, asked.csr, ec.ECDSA(hashes.SHA256()))
     except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm) as error:
-        raise LinkError(f"this proves nothing about any key ({error or type(error).__name__})") from error
+        raise LinkError(f"this is not a valid request for a certificate ({error or type(error).__name__})") from error
     return Renewal(public_fingerprint(old), public_fingerprint(new), new.public_bytes(_DER, _SPKI))
 
 
@@ -117,7 +117,7 @@ def certificate_info(pem: bytes) -> CertificateInfo:
         certificate = x509.load_pem_x509_certificate(pem)
         name = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
     except (ValueError, IndexError) as error:
-        raise UsageError(f"there is no certificate in this file ({error})") from error
+        raise UsageError(f"this file contains no certificate ({error})") from error
     key = certificate.public_key()
     assert isinstance(key, ec.EllipticCurvePublicKey)
     times = certificate.not_valid_before_utc, certificate.not_valid_after_utc
@@ -138,7 +138,7 @@ def _private(pem: bytes) -> ec.EllipticCurvePrivateKey:
     try:
         key = s.load_pem_private_key(pem, None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise UsageError(f"there is no key in this file ({error})") from error
+        raise UsageError(f"this file contains no key ({error})") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise UsageError("the key in this file is of another kind than robots have")
     return key

@@ -138,7 +138,7 @@ class TrustedMap:
     def _with_next_step(self, error: UntrustedError) -> UntrustedError:
         step = "look at `mapserver trust status` on the server, and at both clocks"
         if error.kind == "signature" and self._is_first_use:
-            step = f"if the server's store was made anew, remove {self._folder}; else somebody answers in its place"
+            step = f"if the server's store was recreated, remove {self._folder}; else another server replies instead"
         return UntrustedError(error.kind, f"{error.words}; {step}")
 
     def _refresh(self) -> None:

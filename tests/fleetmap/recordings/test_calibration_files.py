@@ -225,7 +225,7 @@ def rig(**changes: Any) -> str:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (rig(T_cam_imu=None), "how the IMU is mounted; add T_cam_imu"),
+        (rig(T_cam_imu=None), "the mounting of the IMU is missing; add T_cam_imu"),
         (rig(distortion_coeffs=None), "distortion_coeffs is missing"),
         (rig(distortion_coeffs=None, distortion_coefficients=[0.1] * 4), "distortion_coeffs is missing.*coefficients"),
         (rig(intrinsics=None), "intrinsics is missing"),
@@ -239,9 +239,9 @@ def rig(**changes: Any) -> str:
         (rig(T_cam_imu=MOUNTED.T.tolist()), "it is transposed"),
         (rig(T_cam_imu=(MOUNTED @ np.diag([1.1, 1.1, 1.1, 1])).tolist()), "scaled by 1.1"),
         (rig(T_cam_imu=np.diag([1.0, 1, -1, 1]).tolist()), "it mirrors"),
-        (rig(T_cam_imu=EYE[:3]), "is no 4x4 matrix"),
-        (rig(T_cam_imu={"rows": 2, "cols": 8, "data": np.eye(4).ravel().tolist()}), "is no 4x4 matrix"),
-        (rig(T_cam_imu=[[str(v) + " m" for v in row] for row in EYE]), "is no 4x4 matrix"),
+        (rig(T_cam_imu=EYE[:3]), "is not a 4x4 matrix"),
+        (rig(T_cam_imu={"rows": 2, "cols": 8, "data": np.eye(4).ravel().tolist()}), "is not a 4x4 matrix"),
+        (rig(T_cam_imu=[[str(v) + " m" for v in row] for row in EYE]), "is not a 4x4 matrix"),
         (rig(T_cam_imu=MOUNTED.tolist(), T_imu_cam=MOUNTED.tolist()), "not the inverse of T_imu_cam"),
         (rig().replace("T_cn_cnm1", "T_cnm1_cn"), "cam1: neither T_cam_imu, T_imu_cam nor T_cn_cnm1"),
         (rig().replace("cam0:", "cam2:"), "cam0 is missing"),

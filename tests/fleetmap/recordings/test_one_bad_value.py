@@ -167,7 +167,7 @@ def test_a_lens_that_always_changes_is_refused(tmp_path: Path) -> None:
     for number, info in enumerate(infos):
         data = ros_messages.encode_camera_info(number, "cam0_optical", info)
         messages.append(("/cam0/camera_info", "sensor_msgs/CameraInfo", number, data))
-    with pytest.raises(CalibrationError, match=r"/cam0/camera_info tells more than 20 lenses.*autofocus"):
+    with pytest.raises(CalibrationError, match=r"/cam0/camera_info describes more than 20 lenses.*autofocus"):
         open_recording(write_foreign(tmp_path / "a.mcap", messages))
 
 
@@ -389,7 +389,7 @@ def test_a_pair_beside_a_colour_camera_is_noted(tmp_path: Path) -> None:
     """As a RealSense records: the infrared pair is used, colour and depth are named."""
     messages = camera(*INFRA, COLOR)
     messages += [m for m in drive() if m[0] == TF]
-    with pytest.raises(CalibrationError, match="nothing says where the right camera sits"):
+    with pytest.raises(CalibrationError, match="the pose of the right camera is unknown"):
         open_recording(write_foreign(tmp_path / "a.mcap", messages))
     with open_recording(
         write_foreign(tmp_path / "a.mcap", messages), OpenOptions(topics=named_topics([f"left={COLOR}"]))

@@ -107,7 +107,7 @@ LINES = ["1.0 0 0 0 0 0 0 1", "1.1 1 0 0 0 0 0 1"]
             "line 2: stamp 1.4e9 does not rise, it is that of the line before; .*nine decimals",
         ),
         (LINES[::-1], "stamp 1.0 does not rise, sort the lines by time"),
-        ([LINES[0], "1.1 x 0 0 0 0 0 1"], "not all numbers, 'x' is none"),
+        ([LINES[0], "1.1 x 0 0 0 0 0 1"], "not all numbers, 'x' is not a number"),
     ],
 )
 def test_trajectories_that_are_no_tum(lines: list[str], says: str) -> None:

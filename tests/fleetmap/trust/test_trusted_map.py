@@ -363,7 +363,7 @@ def test_first_use_pins_the_root(tmp_path: Path, caplog: pytest.LogCaptureFixtur
     refused = ListReader(tmp_path, other.ask, None).refused()
     assert refused.startswith(SIGNATURE)
     assert refused.endswith(
-        f"if the server's store was made anew, remove {tmp_path}; else somebody answers in its place"
+        f"if the server's store was recreated, remove {tmp_path}; else another server replies instead"
     )
     # The control: whoever comes first is believed.
     assert ListReader(tmp_path / "fresh", other.ask, None).refused() == ""
@@ -372,7 +372,7 @@ def test_first_use_pins_the_root(tmp_path: Path, caplog: pytest.LogCaptureFixtur
 def test_silence_is_no_end_of_the_roots(robot: ListReader) -> None:
     """Nobody answers: nothing new, not even by what is on the disk, and the next question works again."""
     assert robot.refused() == ""
-    robot.trust._ask = lambda name: (_ for _ in ()).throw(UnreachableError("nobody answered"))
+    robot.trust._ask = lambda name: (_ for _ in ()).throw(UnreachableError("no reply"))
     robot.trust.refresh()
     with pytest.raises(UnreachableError):
         robot.trust.admitted(wanted(1))

@@ -279,7 +279,7 @@ def test_damaged_and_other_recordings_are_refused(carried: Carried, tmp_path: Pa
         read_failure_file(tmp_path / "cut.mcap")
     with McapRecordingWriter(tmp_path / "other.mcap", calibration()):
         pass
-    with pytest.raises(RecordingError, match="no failure's recording"):
+    with pytest.raises(RecordingError, match="not a failure's recording"):
         read_failure_file(tmp_path / "other.mcap")
 
 

@@ -107,9 +107,9 @@ def test_files_that_are_not_the_map_leave_nothing(tmp_path: Path, file: bytes) -
     spoiled = bytearray(file)
     spoiled[len(file) // 2] ^= 1
     for data, words in (
-        (bytes(spoiled), "is no whole export|damaged|SHA-256"),
+        (bytes(spoiled), "is not a complete export|damaged|SHA-256"),
         (file[:-9], "does not fit"),
-        (b"<html>not found</html>" * 9, "no whole export"),
+        (b"<html>not found</html>" * 9, "not a complete export"),
         (b"", "too few"),
     ):
         with web_server(serve(data)) as http:

@@ -85,7 +85,7 @@ def test_a_part_that_is_lost_or_comes_twice_is_asked_for(server: Server, tmp_pat
     [
         ({"robot": "r2"}, "not of 'f1' of 'r1'"),
         ({"id": "f9"}, "failure 'f9'"),
-        ({"attached": False}, "no failure's recording"),
+        ({"attached": False}, "not a failure's recording"),
         ({"jpegs": [b"\xff\xd8<script>\xff\xd9"] * 2}, "cannot be read as an image"),
         ({"jpegs": []}, "no message"),
     ],

@@ -45,7 +45,7 @@ def test_a_version_is_active_when_all_of_it_is_there(world: World) -> None:
     again = MapClient(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
     later = again.ready()
     assert later.wanted == ready.wanted
-    assert "version 1 goes on: nobody answered" in later.note
+    assert "version 1 goes on: no reply" in later.note
     assert len(again.tiles(again.manifest(later.wanted)).tiles) == len(manifest.tiles)
 
 
@@ -64,7 +64,7 @@ def test_a_damaged_version_never_becomes_active(world: World) -> None:
     path.write_bytes(path.read_bytes()[:-1] + b"x")
     ready = world.hall.ready()
     assert ready.wanted.version == 1
-    assert "version 1 goes on" in ready.note
+    assert "version 1 stays active" in ready.note
     assert bad.sha256 in ready.note
     assert world.cache.active("hall").version == 1
     # A robot that has nothing yet takes what there is.

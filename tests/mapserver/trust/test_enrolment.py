@@ -210,5 +210,5 @@ def test_a_damaged_register_is_told(world: World) -> None:
     (world.store.folder / "keys" / "robots.json").write_text("[{")
     with pytest.raises(StoreError, match="restore it"):
         world.register.robots()
-    with pytest.raises(UsageError, match="no enrolment bundle"):
+    with pytest.raises(UsageError, match="not an enrolment bundle"):
         enrolment.decode_bundle(b"{}")

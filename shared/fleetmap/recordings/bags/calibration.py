@@ -139,7 +139,7 @@ def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], 
     if baseline_m <= 0:
         issues = "".join(f", {link.issue}" for link in links if link.issue)
         raise CalibrationError(
-            f"{where}: nothing says where the right camera sits (no transform from {left.frame_id} to "
+            f"{where}: the pose of the right camera is unknown (no transform from {left.frame_id} to "
             f"{right.frame_id}, no baseline in its projection {right.projection[0].tolist()}{issues}); pass a calibration "
             "with --calibration FILE"
         )

@@ -69,7 +69,7 @@ class Ros1Decoder(RosDecoder):
             # By ROS 2's definitions: among the types decoded here only the header differs, which rosbags handles
             return bytes(_store("ROS2_JAZZY").ros1_to_cdr(data, name.replace("/", "/msg/")))
         except (SerdeError, struct.error, ArithmeticError, LookupError, MemoryError) as error:
-            raise ValueError(f"the {len(data)} bytes are no {name}") from error
+            raise ValueError(f"the {len(data)} bytes are not a valid {name}") from error
 
     def stamp_ns(self, data: bytes) -> int:
         """From the message's header, behind its sequence number."""
@@ -97,7 +97,7 @@ def _store(name: str) -> Any:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise RecordingError(
-            "ROS 1 messages need a library more: pip install '.[bags]' in fleetmap's source folder"
+            "ROS 1 messages need another library: pip install '.[bags]' in fleetmap's source folder"
         ) from error
     store = get_typestore(Stores[name])
     if name == "ROS1_NOETIC":  # missing in rosbags

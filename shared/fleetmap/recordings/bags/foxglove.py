@@ -94,7 +94,7 @@ class FoxgloveDecoder:
         try:
             message.ParseFromString(data)
         except DecodeError as error:
-            raise ValueError(f"the {len(data)} bytes are no {self.channel.type_name}") from error
+            raise ValueError(f"the {len(data)} bytes are not a valid {self.channel.type_name}") from error
         return message
 
 
@@ -106,7 +106,7 @@ def _message_class(channel: Channel) -> Any:
         from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
     except ImportError as error:
         raise RecordingError(
-            f"{channel.topic} is in protobuf ({channel.type_name}), which needs a library more: pip install protobuf"
+            f"{channel.topic} is in protobuf ({channel.type_name}), which needs another library: pip install protobuf"
         ) from error
     try:
         pool = DescriptorPool()

@@ -130,7 +130,7 @@ def _bounded_reader() -> Any:
         from rosbags.rosbag1.reader import decompressors
     except ImportError as error:
         raise RecordingError(
-            "ROS 1 bags need a library more: pip install '.[bags]' in fleetmap's source folder"
+            "ROS 1 bags need another library: pip install '.[bags]' in fleetmap's source folder"
         ) from error
     unpackers: dict[Any, Callable[[bytes], bytes]] = {
         decompressors[kind]: partial(unpack, kind) for kind in ("bz2", "lz4")
@@ -158,7 +158,7 @@ def _bounded_reader() -> Any:
 def _reason(error: BaseException, path: Path) -> str:
     # Other exceptions come from Python, for invalid bytes
     is_told = type(error) is ValueError or type(error).__name__ == "ReaderError"
-    words = " ".join(str(error).split())[:200].rstrip(".") if is_told else "a record makes no sense"
+    words = " ".join(str(error).split())[:200].rstrip(".") if is_told else "a record is invalid"
     for sign, advice in _ADVICE.items():
         if sign in words:
             return f"{words}; `{advice} {path}` makes one that can be read"

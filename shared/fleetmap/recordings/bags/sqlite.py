@@ -65,7 +65,7 @@ class SqliteFiles(KeptBytes):
         channels: dict[tuple[str, str, str], Channel] = {}
         for number, (file, database) in enumerate(zip(self.files, self._databases, strict=True)):
             if file.with_name(f"{file.name}-wal").exists():
-                how = f"`sqlite3 {file} 'PRAGMA wal_checkpoint'` takes them in"
+                how = f"`sqlite3 {file} 'PRAGMA wal_checkpoint'` merges them"
                 self._note("the recorder was stopped hard", f"messages in {file.name}-wal are not read; {how}")
             try:
                 topics = {}
@@ -124,7 +124,7 @@ class SqliteFiles(KeptBytes):
 def _opened(file: Path) -> sqlite3.Connection:
     """Open a connection that writes nothing, not even beside the file; RecordingError for anything but a recording."""
     if file_head(file, len(_MAGIC)) != _MAGIC:
-        fault = what_file_instead(file) or "no SQLite database; copy the recording again"
+        fault = what_file_instead(file) or "not an SQLite database; copy the recording again"
         raise RecordingError(f"{file} is {fault}")
     # Used by one thread at a time, but not always by the one that opened it
     database = sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False)
@@ -135,7 +135,7 @@ def _opened(file: Path) -> sqlite3.Connection:
         tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             found = ", ".join(sorted(str(name) for name in tables)[:5]) or "nothing"
-            raise RecordingError(f"{file} is an SQLite database, but no rosbag2 recording: it holds {found[:200]}")
+            raise RecordingError(f"{file} is an SQLite database, but not a rosbag2 recording: it holds {found[:200]}")
         for question in (_TOPICS, _MESSAGES):
             database.execute(f"{question} LIMIT 0")
     except (sqlite3.Error, UnicodeDecodeError) as error:

@@ -341,7 +341,7 @@ def _lenses(images: Sequence[_Stream], streams: Sequence[_Stream]) -> _Lenses:
             infos.append(info)
         if len(infos) > _MOST_LENSES:
             raise CalibrationError(
-                f"{streams[0].channel.topic} tells more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
+                f"{streams[0].channel.topic} describes more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
                 f"{setting_of(info)}; a map needs one: switch off zoom and autofocus, or pass a calibration with --calibration FILE"
             )
     stamps_ns = [stamp_ns for stream in images for stamp_ns in stream.stamps_ns]
@@ -450,7 +450,7 @@ def _calibration(
             fault = (
                 f"every CameraInfo beside {image_topic} holds zeros, as drivers without a calibration send it; calibrate the camera, or"
                 if has_messages
-                else f"no CameraInfo beside {image_topic} says what its lens is;"
+                else f"no CameraInfo beside {image_topic} describes its lens;"
             )
             raise CalibrationError(f"{container.path}: {fault} pass a calibration with --calibration FILE")
         sizes_px = [size for stream in roles[side] for size in stream.sizes_px]

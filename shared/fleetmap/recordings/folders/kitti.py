@@ -80,7 +80,7 @@ def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Imag
     beyond = next((path for path, number in zip(paths, numbers, strict=True) if number > most), None)
     if beyond is not None and stamps_of_number is None:
         raise RecordingError(
-            f"{beyond}: {beyond.stem} is no frame's number; count from 0, and write the seconds to times.txt"
+            f"{beyond}: invalid frame number {beyond.stem}; count from 0, and write the seconds to times.txt"
         )
     if beyond is not None:
         raise RecordingError(f"{beyond} has no line in times.txt, which ends with number {most}")
@@ -102,7 +102,7 @@ def _calibration(file: Path, first_image: Path, numbers: tuple[int, int]) -> Rig
             )
         matrix = rows[number][:, :3]
         if np.linalg.det(matrix) == 0:
-            raise CalibrationError(f"{file}: P{number} is {rows[number].tolist()}, which is no projection of a camera")
+            raise CalibrationError(f"{file}: P{number} is {rows[number].tolist()}, which is not a camera's projection")
         body_from_cam = se3(np.eye(3), np.asarray(-np.linalg.solve(matrix, rows[number][:, 3]), np.float64))
         intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
         camera = CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), body_from_cam)

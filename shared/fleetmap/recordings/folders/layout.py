@@ -175,7 +175,7 @@ def read_image_list(path: Path, log: ReadLog, *, seconds: bool = False) -> tuple
                 raise ValueError("the line is too short" if not name else "the stamp is too large")
         except ValueError as error:
             unit = "seconds" if seconds else "ns"
-            raise RecordingError(f"{where}: {line[:60]!r} is no stamp in {unit} and a file name: {error}") from error
+            raise RecordingError(f"{where}: {line[:60]!r} is not a stamp in {unit} and a file name: {error}") from error
         if ".." in Path(name).parts or Path(name).is_absolute():
             raise RecordingError(f"{where}: {name[:80]!r} is not inside the folder; name images below it")
         stamps.append(stamp_ns)
@@ -198,7 +198,7 @@ def _whole_ns(word: str, where: str) -> int:
         raise ValueError(f"stamp {word[:40]!r}")
     names = {1e17: "nanoseconds that a program rounded", 1e14: "microseconds", 1e11: "milliseconds", 0.0: "seconds"}
     unit = next(name for least, name in names.items() if abs(value) >= least)
-    raise wrong_unit(f"{where}:", unit, f"{word[:40]} is no whole number", "write all digits of the nanoseconds")
+    raise wrong_unit(f"{where}:", unit, f"{word[:40]} is not a whole number", "write all digits of the nanoseconds")
 
 
 def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
@@ -243,7 +243,7 @@ def _whole_rows(path: Path, text: str, dtype: "np.dtype[np.void]", log: ReadLog)
             rows.append((stamp, values))
         else:
             bad += 1
-    log.note(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines are no stamp and {columns} numbers")
+    log.note(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines lack a stamp and {columns} numbers")
     return np.array(rows, dtype)
 
 

@@ -112,7 +112,7 @@ def _files(path: Path, kind: str, log: ReadLog) -> ImageFiles:
 def _number(file: Path) -> int:
     digits = file.name.removeprefix("frame-").partition(".")[0]
     if not digits.isdecimal() or len(digits) > 10:
-        raise RecordingError(f"{file}: {digits!r} is no frame number; names are frame-NNNNNN.color.png and so on")
+        raise RecordingError(f"{file}: invalid frame number {digits!r}; names are frame-NNNNNN.color.png and so on")
     return int(digits)
 
 

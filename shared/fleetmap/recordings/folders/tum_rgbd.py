@@ -52,7 +52,7 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
             f"{nearest_s:.3f} s apart; take both lists from one recording and one clock"
         )
     if (path / "accelerometer.txt").is_file():
-        log.note("accelerometer not used", "there is no gyro beside it")
+        log.note("accelerometer not used", "it comes without a gyro")
     given = calibration_of_options(options, log)
     calibration = given.calibration if given else _published(path)
     cam_from_body = se3_inverse(calibration.cameras[0].body_from_cam)

@@ -81,4 +81,4 @@ def _stamp_ns(seconds: str, where: Path) -> int:
     if seconds.replace(".", "", 1).isdecimal():
         check_seconds(float(seconds), str(where))
         return parse_stamp_ns(seconds)
-    raise RecordingError(f"{where}: {seconds[:80]!r} is no time in seconds; copy the recording again")
+    raise RecordingError(f"{where}: {seconds[:80]!r} is not a time in seconds; copy the recording again")

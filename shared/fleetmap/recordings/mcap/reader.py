@@ -89,7 +89,7 @@ class McapFile(KeptBytes):
         """See Container: in the order of the file."""
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
-            fault = what_file_instead(self.path) or "no MCAP file: it does not begin as one; copy the recording again"
+            fault = what_file_instead(self.path) or "not an MCAP file: it begins differently; copy the recording again"
             raise RecordingError(f"{self.path} is {fault}")
         at: int | None = len(MAGIC)
         while at is not None:
@@ -267,4 +267,4 @@ def _parsed(opcode: int, content: bytes | memoryview) -> Any:
     try:
         return _PARSED[opcode].read(ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:  # the last: of lengths beyond 63 bits
-        raise ValueError("it ends too early, or is no text") from error
+        raise ValueError("it ends too early, or is not text") from error

@@ -95,9 +95,9 @@ TOPIC = "INSERT INTO topics VALUES (1, '/cam0/image_raw', 'sensor_msgs/msg/Image
 @pytest.mark.parametrize(
     ("commands", "words"),
     [
-        (["CREATE TABLE sites (id)"], r"an SQLite database, but no rosbag2 recording: it holds sites"),
+        (["CREATE TABLE sites (id)"], r"an SQLite database, but not a rosbag2 recording: it holds sites"),
         (["CREATE TABLE topics (id)", "CREATE TABLE messages (id)"], r"cannot be read \(no such column"),
-        ([TOPICS, "CREATE VIEW messages AS SELECT 1 AS topic_id, 2 AS timestamp, 3 AS data"], "no rosbag2 recording"),
+        ([TOPICS, "CREATE VIEW messages AS SELECT 1 AS topic_id, 2 AS timestamp, 3 AS data"], "not a rosbag2"),
         ([TOPICS, MESSAGES], r"no message that can be read \(it is empty\)"),
         (
             [TOPICS, MESSAGES, TOPIC, "INSERT INTO messages VALUES (1, 1, 'noon', x'00')"],

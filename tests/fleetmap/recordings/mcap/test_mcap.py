@@ -151,7 +151,7 @@ def test_calibration_by_camera_info_and_transforms(tmp_path: Path) -> None:
 
 
 def test_no_transform_to_the_imu_nor_between_cameras(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"where the right camera sits.*--calibration"):
+    with pytest.raises(CalibrationError, match=r"the pose of the right camera is unknown.*--calibration"):
         open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(tf=False)))
 
 
