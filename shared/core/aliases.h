@@ -1,4 +1,4 @@
-// Places that look alike: search for them in a map, and what tells them apart.
+// Places that look alike: search for them in a map, and tests to distinguish them.
 #pragma once
 
 #include <vector>
@@ -23,7 +23,7 @@ struct SquareLattice {
 };
 
 // Counts (columns, rows) the features that vote for a camera in a square of two cells' side that begins at the cell's corner.
-// offsets_m: (x, y) of each feature from the camera to what it shows, turned as the camera would be. All pairs of a feature come together.
+// offsets_m: (x, y) from the camera to each feature's point, in the rotation of the hypothesis. All pairs of a feature are consecutive.
 // Source: the generalised Hough transform, Ballard 1981.
 std::vector<int32_t> camera_votes(const Lookalike* pairs, size_t count, const double* offsets_m, const double* points_map,
                                   const SquareLattice& lattice);
@@ -34,11 +34,11 @@ struct PlaceLandmarks {
   Descriptors descriptors;
 };
 
-// Marks landmarks of two places that have one of the other within reach_m along each axis that looks the same.
+// Marks landmarks of two places that have a look-alike of the other place within reach_m along each axis.
 void mark_shared(const PlaceLandmarks& one, const PlaceLandmarks& other, double reach_m, int max_bits, uint8_t* one_shared,
                  uint8_t* other_shared);
 
-// Observations of the landmarks of one place, at points_odom (count, 3): scores (count, 2), log likelihoods of what was observed if the
+// Observations of the landmarks of one place, at points_odom (count, 3): scores (count, 2), log likelihoods of the observation if the
 // landmark is present, and if it is absent.
 struct PlaceEvidence {
   const double *points_odom, *scores;
@@ -46,8 +46,8 @@ struct PlaceEvidence {
   size_t count;
 };
 
-// Probabilities of what a cell may hold. The absence of fewer than `least` landmarks does not count. In a share of the cells what both
-// places have was taken away; in another only one of the two has it, and is the right one, but for an odd share. Log odds count beyond
+// Probabilities of a cell's states. The absence of fewer than `least` landmarks does not count. In a share of the cells the landmarks
+// of both places were removed; in another only the right one of the two has them, except for an odd share. Log odds count beyond
 // the threshold.
 struct CellModel {
   double least, taken_share, different_share, odd_share, threshold;
@@ -58,7 +58,7 @@ struct CellLattice {
 };
 
 // Log odds of the first place against the second, of each block of cells: those of the lattice that is strongest for either place.
-// At most `room` blocks, 0 where there are fewer: as many as ever stand around a robot; what is left out makes it no surer.
+// At most `room` blocks, 0 for missing ones: as many as ever surround a robot; omitted ones do not increase certainty.
 std::vector<double> block_log_odds(const PlaceEvidence& one, const PlaceEvidence& other, const CellLattice* lattices, size_t lattice_count,
                                    const CellModel& model, double block_m, size_t room);
 

@@ -1,14 +1,14 @@
-// How often steps of the core allocate memory: what robots repeat in every frame should not.
+// Counts of memory allocations by steps of the core: steps that robots repeat in every frame should not allocate.
 #pragma once
 
 #include <cstdint>
 
 namespace fleetmap {
 
-// Of this thread, by operator new, whatever for.
+// All allocations of this thread by operator new.
 uint64_t all_allocations();
 
-// Of this thread, within the steps that were counted.
+// Allocations of this thread within counted steps.
 uint64_t step_allocations();
 
 class CountedStep {

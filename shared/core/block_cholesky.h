@@ -1,6 +1,6 @@
 // Cholesky factorisation of large sparse symmetric matrices whose unknowns come in blocks, such as poses.
 //
-// Multifrontal and supernodal: what fills in, and in which order, is found once for each pattern, over blocks; the arithmetic is dense
+// Multifrontal and supernodal: fill-in and order are computed once for each pattern, over blocks; the arithmetic is dense
 // LAPACK on runs of columns with the same rows. Sources: Davis 2006, Direct methods for sparse linear systems, chapters 4 and 7;
 // Liu 1992, The multifrontal method for sparse matrix solution.
 #pragma once
@@ -12,22 +12,22 @@
 
 namespace fleetmap {
 
-// Where a block stands among the values of a factor: its number (a, b) at first + a * down + b * right.
+// Position of a block among the values of a factor: its number (a, b) at first + a * down + b * right.
 struct BlockPlace {
   int64_t first, down, right;
 };
 
 class BlockCholesky {
  public:
-  // The pattern of nodes with sizes[n] unknowns each, numbered one after the other, of which pairs are coupled. order: the nodes in an
-  // order that fills in little; every subtree of their elimination tree is then brought together.
+  // The pattern of nodes with sizes[n] unknowns each, numbered consecutively, coupled in pairs. order: elimination order of the nodes with
+  // little fill-in; every subtree of their elimination tree is then made contiguous.
   BlockCholesky(const std::vector<int64_t>& sizes, const std::vector<std::pair<int64_t, int64_t>>& pairs, std::vector<int64_t> order);
 
   size_t nodes() const { return position_.size(); }
   size_t unknowns() const { return order_.size(); }
-  // How many values a factor has.
+  // Number of values of a factor.
   size_t size() const { return size_; }
-  // The matrix's unknowns as they are eliminated.
+  // The matrix's unknowns in elimination order.
   const std::vector<int64_t>& order() const { return order_; }
 
   // The place of the block of nodes (row, col); first is negative where they are not coupled. A block is added once; its mirror image

@@ -1,11 +1,11 @@
-// Bundle adjustment: keyframes, landmarks, motion, biases, and where it is wanted the calibration, that explain all observations best.
+// Bundle adjustment: keyframes, landmarks, motion, biases, and optionally the calibration, that explain all observations best.
 //
-// Levenberg-Marquardt on the robust cost; landmarks are eliminated by the Schur complement, and what is left is solved in one piece, by
+// Levenberg-Marquardt on the robust cost; landmarks are eliminated by the Schur complement, the reduced system is solved in one piece, by
 // dense or by sparse factorisation. Sources: Triggs et al. 2000, Bundle adjustment, a modern synthesis, section 6.1; Lourakis and
 // Argyros 2009, SBA: a software package for generic sparse bundle adjustment.
 //
 // A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes. So with q = X - p an observation's derivative by the pose is
-// minus that by its point times L(q)^T, where L(q) = [skew(q); I] (6, 3). Everything that an observation n says therefore fits into
+// minus that by its point times L(q)^T, where L(q) = [skew(q); I] (6, 3). All information of an observation n therefore fits into
 // one symmetric A_n = w J^T J (3, 3), J = dr/dX, and no coupling is stored:
 //   poses             H_pp = sum L A L^T    b_p = sum L w J^T r
 //   points            H_ll = sum A          b_l = -sum w J^T r
@@ -31,7 +31,7 @@
 
 namespace fleetmap {
 
-// Everything that moves.
+// All unknowns.
 struct BundleState {
   std::vector<SE3> map_from_body;
   std::vector<double> motions;  // (K, 9) or none
@@ -39,14 +39,14 @@ struct BundleState {
   std::vector<double> calibration;  // (C,) or none
 };
 
-// Whitened rows of M observations in the problem's order; their derivatives only where they are asked for.
+// Whitened rows of M observations in the problem's order; their derivatives only on request.
 struct ImageRows {
   const double *residuals, *by_point, *by_calibration;  // (M, 4), (M, 4, 3), (M, 4, C)
   const Vec3* positions;                                // (K,) of the bodies when the images were taken
   std::shared_ptr<const void> owner;                    // of these numbers
 };
 
-// What is adjusted, and by which measurements: K keyframes, N landmarks, M observations. What is not named here is as in _core.pyi.
+// Unknowns and measurements: K keyframes, N landmarks, M observations. Fields without comment are as in _core.pyi.
 struct BundleProblem {
   struct Observation {
     int32_t keyframe, landmark;
@@ -80,7 +80,7 @@ struct BundleProblem {
   std::vector<Edge> edges;
   Vec3 gravity;
   std::vector<double> motion_mean, motion_weight;  // (K, 9) or none: 1 / sigma^2
-  // Where the calibration moves: 1 / sigma^2 of it (C,) about zero, which of it is the scale, and what says the images' rows.
+  // If the calibration is unknown: its 1 / sigma^2 (C,) about zero, the index of the scale, and the function of the images' rows.
   std::vector<double> calibration_weight;
   size_t scale;
   std::function<ImageRows(const BundleState&, bool derivatives)> rows;
@@ -108,19 +108,19 @@ class BundleSolver {
   // The reduced system's nodes, the pose of each slot and its motion where there is one, then the calibration, and which are coupled.
   std::vector<int64_t> node_sizes() const;
   std::vector<std::pair<int64_t, int64_t>> node_pairs() const;
-  // Systems are factorised as sparse ones from now on; order: nodes in an order that fills in little.
+  // Systems are factorised as sparse ones from now on; order: elimination order of the nodes with little fill-in.
   void factorise_sparsely(std::vector<int64_t> order);
 
-  // Half the robust sum of squares of everything.
+  // Half the robust sum of squares of all residuals.
   double cost() { return cost_of(state_); }
-  // Of each observation its squared residual in sigmas at the last cost; huge where the point is behind the camera.
+  // Squared residual of each observation in sigmas at the last cost; huge if the point is behind the camera.
   std::vector<double> squared_sigmas() const;
 
-  // S (U, U), its lower triangle, damped by `damping` times its diagonal, and b (U,). Unknowns that are held have a one on the diagonal.
+  // S (U, U), its lower triangle, damped by `damping` times its diagonal, and b (U,). Fixed unknowns have a one on the diagonal.
   void reduced(double damping, std::vector<double>& lower, std::vector<double>& b);
-  // The damped step (U,), by linearising where the state is; false where S is not positive definite.
+  // The damped step (U,), linearised at the current state; false if S is not positive definite.
   bool solve(double damping, std::vector<double>& step);
-  // log det of the undamped normal equations of everything; NaN where they are not positive definite.
+  // log det of the undamped normal equations, landmarks included; NaN if they are not positive definite.
   double log_determinant();
 
   // The optimum near the state, which becomes it. between: called before each iteration.

@@ -29,7 +29,7 @@ struct RadialTangential {
   double k1, k2, p1, p2, k3, k4, k5, k6;
 };
 
-// Fills the points (x, y) of the plane z = 1 that the lens brings to the goals: Newton's method with a numeric Jacobian, not checked.
+// Fills the points (x, y) of the plane z = 1 that the lens maps to the goals: Newton's method with a numeric Jacobian, not checked.
 void undistort(const RadialTangential& lens, const double* goal_x, const double* goal_y, size_t count, double* x, double* y);
 
 // Equidistant fisheye k1 k2 k3 k4. Source: Kannala and Brandt 2006.
@@ -44,7 +44,7 @@ struct LensCamera {
   ptrdiff_t width, height;
 };
 
-// Fills colour, an image of the camera, with the depth of the nearest point at each of its pixels, 0 where there is none. The points are
+// Fills colour, an image of the camera, with the depth of the nearest point at each of its pixels, 0 without one. The points are
 // depth (count) along rays (count, 3), which have z = 1 and are NaN for pixels without one. All four pixels around a point take it: with
 // the nearest alone the background would shine through the foreground.
 template <typename Lens>

@@ -1,4 +1,4 @@
-// Corners: candidates, how well they can be tracked, their spread over the image, their orientation.
+// Corners: candidates, their quality for tracking, their spread over the image, their orientation.
 #pragma once
 
 #include <cstddef>

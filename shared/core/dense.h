@@ -65,7 +65,7 @@ inline void symmetrise(Matrix& a) {
 }
 
 // Solves a x = b in place by Gaussian elimination with the largest pivot of each column; a (n, n) is destroyed, b (n, m) becomes x.
-// What is singular gives numbers that are not finite.
+// Singular matrices give numbers that are not finite.
 inline void solve_in_place(Matrix& a, Matrix& b) {
   const size_t n = a.rows, m = b.columns;
   for (size_t k = 0; k < n; ++k) {

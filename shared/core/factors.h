@@ -1,4 +1,4 @@
-// What pose priors, relative poses and the IMU say of keyframes: residuals, their derivatives, and quadratic forms of both.
+// Factors on keyframes from pose priors, relative poses and the IMU: residuals, their derivatives, and quadratic forms of both.
 //
 // A pose changes as R <- Exp(rot) R, p <- p + trans, both in map axes. The motion of a keyframe is its velocity in map axes, m/s, gyro
 // bias, rad/s, and accelerometer bias, m/s^2.

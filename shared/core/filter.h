@@ -55,8 +55,8 @@ class Filter {
   // Moves the state from start to end; the last angular rate, bias removed. noise weighs the prediction, true_noise is real.
   Vec3 propagate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, const ImuNoise& noise, const ImuNoise& true_noise);
 
-  // Moves the state by a relative transform that is known only to the sigmas. measured (6, 6), in the next body's axes, rotation first,
-  // is added information where it is given.
+  // Moves the state by a relative transform, uncertain by the sigmas. measured (6, 6), in the next body's axes, rotation first,
+  // is added information if given.
   void predict_random_walk(const SE3& body_from_next, double rotation_sigma, double translation_sigma, double duration_s,
                            const double* measured);
 
@@ -64,36 +64,36 @@ class Filter {
   void add_clone(int64_t id, Vec3 rate_body);
   // Forgets a clone: marginalises it.
   void remove_clone(size_t index);
-  // Takes rotation and position of the state back to a clone's, as certain as that is; what moved them since is forgotten.
+  // Resets rotation and position of the state to a clone's, with its covariance; the motion since is forgotten.
   void return_to_clone(size_t index);
-  // The frame now begins at the newest clone, and errors count from there; where it lies in the old one. Motions between clones, and
-  // what is known of them, stay as they are. Of the frame before only that is forgotten which none of them shows: how far it may be off
-  // altogether. With the distance from its origin that grows without bound, until the motion between two clones is a difference of
-  // numbers so large that rounding leaves no covariance. Velocity and biases must be idle.
+  // Moves the frame's origin to the newest clone, from which errors count; returns its pose in the old frame. Motions between clones, and
+  // their covariances, stay. Only the absolute error of the old frame is forgotten, which no motion shows.
+  // It grows without bound with the distance from the origin, until the motion between two clones is a difference of
+  // numbers so large that rounding leaves no covariance. Velocity and biases must be unused.
   Vec3 begin_frame_anew();
 
-  // What one camera saw in a frame: ids (count,), pixels (count, 3) u left, v, u right, NaN where that is unknown.
+  // Adds one camera's observations in a frame: ids (count,), pixels (count, 3) u left, v, u right, NaN if that is unknown.
   void observe(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count) {
     observations_.add(frame, camera, ids, pixels, count);
   }
-  // Uses what was observed of tracks that ended or are due, each observation once; used (T,) as of TrackConstraints, by rising ids, good
+  // Uses the observations of ended and due tracks, each once; used (T,) as of TrackConstraints, by ascending ids, valid
   // until the next. For first_depth_m see Observations. More than one iteration relinearises (iterated Kalman filter), for large
-  // corrections; newest_odom_from_body is then where the newest clone is linearised first, when vision knows it better than the
-  // prediction. It adds no information. sigma_scale widens the noise, for matches that are less exact than flow. Nothing is changed, and
-  // no track counts as taken, where the result would not be finite.
+  // corrections; newest_odom_from_body is then the first linearisation point of the newest clone, if vision is better than the
+  // prediction. It adds no information. sigma_scale widens the noise, for matches less accurate than flow. Nothing is changed, and
+  // no track counts as used, if the result would not be finite.
   const std::vector<int8_t>& update(const LivingPoints& living, double first_depth_m, int iterations,
                                     const std::optional<SE3>& newest_odom_from_body, double sigma_scale);
 
   // By the motion of `base` on its wheels: forward speed, no other, and yaw rate; gyro measured at the same time. Each returns the
-  // squared Mahalanobis distance by true_error_cov, infinity where it or the correction is no number; nothing is changed where that
+  // squared Mahalanobis distance by true_error_cov, infinity if it or the correction is not a number; nothing is changed if that
   // exceeds the gate.
   double correct_by_wheels(Vec3 velocity_base, double yaw_rate, double sigma_mps, double sigma_radps, Vec3 gyro, const SE3& base_from_body,
                            double gate);
-  // By standing still: neither speed nor turn, the gyro's mean shows its bias alone (ZUPT).
+  // By standstill: zero speed and rotation, the gyro's mean shows only its bias (ZUPT).
   double correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate);
 
-  // Inflates position and velocity where vision contradicts the prediction since a clone beyond its covariance; true where it did.
-  // What is not finite contradicts nothing.
+  // Inflates position and velocity if vision contradicts the prediction since a clone beyond its covariance; true if it did.
+  // Values that are not finite contradict nothing.
   // After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every image never recovers.
   bool inflate(size_t index, Vec3 seen_position, double gap_s);
   void inflate_velocity(double sigma_mps);
@@ -101,7 +101,7 @@ class Filter {
   // earlier_from_later between two clones.
   SE3 motion_between(size_t earlier, size_t later) const { return inverse(clones_[earlier]) * clones_[later]; }
   // Covariance (6, 6) of the motion from a clone to the newest one, of a left perturbation in axes of the earlier body: from the joint
-  // covariance of both, so that what they share cancels.
+  // covariance of both, so that common errors cancel.
   void motion_covariance(size_t index, double* out) const;
   // Covariance (6, 6) of odom_from_body: rotation error in odom axes, then position error.
   void body_covariance(double* out) const;

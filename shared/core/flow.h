@@ -1,4 +1,4 @@
-// Optical flow: small windows followed from image to image.
+// Optical flow: tracking of small windows from image to image.
 #pragma once
 
 #include <cstddef>
@@ -17,14 +17,14 @@ struct FlowSteps {
   double settled_px;  // a step that short is the last
 };
 
-// Moves places (N, 2), where windows around pixels (N, 2) of one image are thought to be in the other. Both images are `scale` times as
-// large as those that the coordinates are for. found (N,): others are left alone, and those without texture, or that leave the image, are
-// no longer.
+// Refines places (N, 2), guesses in the other image of the windows around pixels (N, 2) of one image. Both images are `scale` times as
+// large as those that the coordinates are for. found (N,): others stay unchanged, and those without texture, or that leave the image, are
+// cleared.
 //
 // Each step solves, over a window T of the first image with its slopes (Tx, Ty), for the shift that lets the second image I explain T:
 //   [sum Tx Tx  sum Tx Ty] [dx]     [sum Tx (I - T)]
 //   [sum Tx Ty  sum Ty Ty] [dy] = - [sum Ty (I - T)]
-// Sources: Lucas and Kanade 1981; slopes of the window that is looked for as in Baker and Matthews 2004, by the filter of Scharr 2000.
+// Sources: Lucas and Kanade 1981; slopes of the template as in Baker and Matthews 2004, by the filter of Scharr 2000.
 void follow(GreyImage before, GreyImage now, double scale, FlowSteps steps, const double* pixels, double* places, bool* found,
             size_t count);
 
@@ -47,8 +47,8 @@ class Pyramid {
   std::vector<uint16_t> line_;
 };
 
-// follow from so many levels above the images down: what a coarse level does not show, a finer one may. Places are where the windows are
-// looked for first; found (N,) tells of the images themselves.
+// Tracks windows from `levels` above the images downwards: a window lost on a coarse level may be found on a finer one. Places are initial
+// guesses; found (N,) is for the full-size images.
 void follow_down(Pyramid& before, Pyramid& now, size_t levels, int half, const double* pixels, double* places, bool* found, size_t count);
 
 // Of places (N, 2) that pixels (N, 2) were followed to, and that are held (N,), leaves those further than margin_px from the image's

@@ -1,4 +1,4 @@
-// The grid of a site: rays of one view through the cells of a window, and views summed to what a session saw.
+// The grid of a site: rays of one view through the cells of a window, and sums of views over a session.
 //
 // A cell is a square column of the map: below the floor margin it is floor, above it stand kSlices voxels. Within one view a voxel is
 // hit, passed or not seen, so that a view counts once, however many of its pixels fall into a voxel.
@@ -20,7 +20,7 @@ constexpr ptrdiff_t kHitStride = 2, kRayStride = 4;  // pixels
 constexpr double kClearSigmas = 3.0;                 // and a cell: so far before a point its ray no longer proves a voxel free
 constexpr uint8_t kPassed = 1, kBehind = 2;
 
-// What one view says of a window of cells (rows, columns): pixels in each voxel (R, C, kSlices); looks (R, C, kSlices), kPassed where a
+// Evidence of one view on a window of cells (rows, columns): pixels in each voxel (R, C, kSlices); looks (R, C, kSlices), kPassed where a
 // ray went through, up to a clear distance before its point, and to the floor itself, kBehind behind points where nothing was before;
 // heights (R, C, 2), codes of the lowest and the highest of the points in voxels that are hit and on the floor, 0 for none.
 struct Window {
@@ -37,7 +37,7 @@ void cast_view(Picture<const float> disparity, Picture<const float> nearest, dou
                Vec3 camera, const uint8_t* was_free, Window window);
 
 // A tile of `size` cells each way: views that hit, pass and would pass each voxel (N, N, kSlices), which stop at 255, and (N, N, 4) the
-// two lowest and the two highest codes of all views; the second of each is believed, as one view may err.
+// two lowest and the two highest codes of all views; the second of each is used, as one view may err.
 struct GridTile {
   ptrdiff_t size;
   uint8_t *hits, *passes, *hidden, *heights;

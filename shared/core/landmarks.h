@@ -1,4 +1,4 @@
-// What a finished survey keeps: keyframes that others repeat, landmarks that are one, landmarks that robots get.
+// Reduction of a finished survey: redundant keyframes, duplicate landmarks, landmarks chosen for robots.
 #pragma once
 
 #include <cstddef>
@@ -24,7 +24,7 @@ struct TrackMembers {
   const int8_t* octave;
 };
 
-// A keyframe is spare where a share of its tracks, and at least `least`, are seen on so many other visits as finely. Members more than
+// A keyframe is spare if a share of its tracks, and at least `least`, are seen equally finely on enough other visits. Members more than
 // `gap` keyframes apart are of different visits.
 struct RevisitLimits {
   int64_t gap, visits;
@@ -32,7 +32,7 @@ struct RevisitLimits {
   int64_t least;
 };
 
-// Fills which keyframes are spare, looked at from the last to the second. rows: the members of each keyframe, as `keyframes` lists them.
+// Marks spare keyframes, checked from the last to the second. rows: the members of each keyframe, as `keyframes` lists them.
 void mark_spare(const int64_t* rows, const Lists& keyframes, const TrackMembers& members, const RevisitLimits& limits, uint8_t* spare);
 
 // Observations by landmark, as `landmarks` lists them.
@@ -46,7 +46,7 @@ struct Observations {
 void mark_duplicates(const std::pair<int64_t, int64_t>* near, size_t near_count, const double* points_map, const double* sigmas_m,
                      const Observations& seen, Descriptors descriptors, int most_bits, uint8_t* duplicate);
 
-// Marks keyframes, looked at in `order`, of whose observations a share is repeated by so many keyframes that are left, at the same or a
+// Marks keyframes, checked in `order`, of whose observations a share is repeated by enough remaining keyframes, at the same or a
 // finer scale. rows: the observations of each keyframe that count, as `keyframes` lists them. Source: Mur-Artal and Tardos 2015.
 void mark_redundant(const int64_t* order, size_t order_count, const int64_t* rows, const Lists& keyframes, const Observations& seen,
                     const int32_t* landmark, const int64_t* octave, int observers, double share, uint8_t* gone);
@@ -54,7 +54,7 @@ void mark_redundant(const int64_t* order, size_t order_count, const int64_t* row
 // Fills the row of descriptors nearest to all others of its landmark, ties to the first; 0 for one without any.
 void medoids(Descriptors descriptors, const Lists& landmarks, int64_t* chosen);
 
-// The bins in which each landmark is seen, and what it is worth. So many bins each make a view.
+// The bins in which each landmark is seen, and its weight. A fixed number of bins makes a view.
 struct BinnedLandmarks {
   Lists landmarks;
   const int64_t* bins;
@@ -63,19 +63,19 @@ struct BinnedLandmarks {
   int64_t bins_per_view;
 };
 
-// What was chosen so far: of the bins; how many more fit into cells, and how many more views need.
+// State of the choice: chosen landmarks per bin, remaining room of cells, remaining needs of views.
 struct Budget {
   int64_t *counts, *room, *needs;
 };
 
 // Number of candidates chosen, at most `limit`; marks them. A landmark is worth its weight times the sum, over its bins in views that need
 // more, of 1 / (1 + how many were chosen there): the gain of a sum of harmonic numbers, which is submodular, so that a value that was
-// computed earlier is an upper bound and only the best one has to be computed again. What is worth nothing is not taken. Equal values: the
+// computed earlier is an upper bound and only the best one has to be computed again. Worthless ones are not chosen. Equal values: the
 // smaller row first. Source: Minoux 1978.
 size_t choose_landmarks(const int64_t* candidates, size_t candidate_count, const BinnedLandmarks& seen, size_t limit, const Budget& budget,
                         uint8_t* chosen);
 
-// How much twins look alike: in bits; they stand equally high, and further off than what may be the same thing mapped twice.
+// Limits of twins: difference in bits and height, and a distance beyond that of one object mapped twice.
 struct TwinLimits {
   int max_bits;
   double height_m, own_m;

@@ -1,4 +1,4 @@
-// Bundle adjustment of a small window of one camera's views: dense, for some ten views and some hundred points.
+// Bundle adjustment of a small window of one camera's views: dense, for about ten views and a few hundred points.
 #pragma once
 
 #include <cstddef>

@@ -9,7 +9,7 @@
 
 namespace fleetmap {
 
-// Points that the newest frame saw, and which of them are to be used now.
+// Points in the newest frame, and those of them to use now.
 struct LivingPoints {
   const int64_t* ids;
   const bool* due;
@@ -20,9 +20,9 @@ class Observations {
  public:
   void add(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count);
 
-  // Removes the tracks that ended, or are due, with two observations or more in the clones, frames in the window's order. What is due but
-  // seen once stays; what ended so is forgotten. View clone * C + camera is one of C cameras. The first guess of a point is the stereo
-  // point of the nearest view, or first_depth_m along the last ray where no view has a disparity. The result is good until the next.
+  // Removes the tracks that ended, or are due, with two observations or more in the clones, frames in the window's order. Due tracks with
+  // one observation stay, ended ones are forgotten. View clone * C + camera is one of C cameras. The first guess of a point is the stereo
+  // point of the nearest view, or first_depth_m along the last ray if no view has a disparity. The result is valid until the next call.
   const Tracks& take(const LivingPoints& living, const std::vector<int64_t>& clones, const std::vector<RigCamera>& cameras,
                      double first_depth_m);
 

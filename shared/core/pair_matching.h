@@ -1,4 +1,4 @@
-// Matching of two keyframes near a motion: where the features of one should appear in the other, and the motion that fits them.
+// Matching of two keyframes near a motion: prediction of one's features in the other, and the motion that fits them.
 #pragma once
 
 #include <cstddef>
@@ -19,8 +19,8 @@ struct KeyframeFeatures {
   const int8_t* octaves;
   Descriptors descriptors;
   const double* disparities;  // (N, 2) with their standard deviations, NaN unknown
-  const double* points_cam;   // (N, 3), what those give
-  bool is_measured;           // whether the keyframe measured the disparities itself
+  const double* points_cam;   // (N, 3), by the disparities
+  bool is_measured;           // true if the keyframe measured the disparities itself
 
   size_t count() const { return descriptors.count; }
 };
@@ -40,8 +40,8 @@ struct PairStart {
 };
 
 struct GuidedPair {
-  size_t good = 0;                                 // how often it went well
-  std::vector<std::pair<int32_t, int32_t>> pairs;  // where it always did
+  size_t good = 0;                                 // number of successful radii
+  std::vector<std::pair<int32_t, int32_t>> pairs;  // if all succeeded
   SE3 b_from_a = {};
   double hessian[36] = {};
 };
@@ -51,7 +51,7 @@ struct GuidedPair {
 GuidedPair match_guided(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const SE3& b_from_a,
                         const PairStart& start);
 
-// Share of a's points with a disparity that b sees, at a similar distance.
+// Share of a's points with a disparity in view of b, at a similar distance.
 double share_in_view(const SE3& b_from_a, const double* points_a, const double* disparities_a, size_t count, const StereoLens& lens,
                      double width_px, double height_px);
 

@@ -12,7 +12,7 @@ namespace fleetmap {
 
 constexpr int kMostPatchHalf = 15;
 
-// Where the patch is in the current image: its standard deviation comes from the residual and the window's gradients in the weaker
+// Position of the patch in the current image: its standard deviation comes from the residual and the window's gradients in the weaker
 // direction. All NaN where alignment fails.
 struct Alignment {
   static constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();

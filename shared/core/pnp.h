@@ -32,7 +32,7 @@ struct ChosenSightings {
 };
 
 // The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared
-// normalised residual is under the gate. So many iterations on all points, and on the inliers.
+// normalised residual is under the gate. Iterations: on all points, and on the inliers.
 struct Refinement {
   double width, gate_squared;
   int iterations, inlier_iterations;
@@ -40,7 +40,7 @@ struct Refinement {
 
 // Robust least squares from a start, cam_from_source, in place: Levenberg-Marquardt on all points, and once more on the inliers alone, so
 // that no outlier biases the result. False where the points do not determine the camera.
-// The step is rotation first, applied from the left in camera axes; prior (6, 6): information that holds the start (no pointer: none).
+// The step is rotation first, applied from the left in camera axes; prior (6, 6): information on the start (no pointer: none).
 // Fills the last Hessian (6, 6), without the prior, and the squared normalised residuals (count,) of all points; inliers are memory to
 // reuse.
 // Source: Geman and McClure 1987 for the weight, Marquardt 1963 for the damping.

@@ -1,12 +1,12 @@
-// The pose of one camera without a start, among wrong matches.
+// The pose of one camera without an initial pose, among wrong matches.
 #pragma once
 
 #include "pnp.h"
 
 namespace fleetmap {
 
-// A proposed camera has to see so many points at less than so many pixels from where they were measured, and to keep as many inliers
-// after its refinement, which is by the points that it sees there and then by all.
+// A proposed camera must see a minimum of points within a limit in pixels of their measurements, and keep as many inliers
+// after its refinement, by those points and then by all.
 struct Agreement {
   double threshold_px;
   size_t min_inliers;

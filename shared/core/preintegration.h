@@ -1,4 +1,4 @@
-// Inertial samples between two moments: cut, and summed up once to a relative motion with its uncertainty.
+// Preintegration of inertial samples between two moments to a relative motion with its uncertainty.
 #pragma once
 
 #include <cstddef>
@@ -44,7 +44,7 @@ struct Preintegrated {
   double max_gap_s = 0.0;  // the longest time without a sample
 };
 
-// The biases are taken as constant. Where samples are missing the covariance grows by what an unseen motion can be. Rate and specific
+// The biases are taken as constant. If samples are missing the covariance grows by the largest plausible motion. Rate and specific
 // force change linearly between samples; rotation is right to fourth order of the step, velocity and position to second.
 // Source: Forster et al. 2017, with the exact derivatives of this rule in place of Euler's.
 Preintegrated preintegrate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, Vec3 gyro_bias, Vec3 accel_bias, const ImuNoise& noise);

@@ -15,7 +15,7 @@ struct YawedBox {
   double cosine, sine;
 };
 
-// Where a ray enters a box: the ray's parameter, the box or -1, and its side, 0 to 5 for xXyYzZ.
+// Entry of a ray into a box: the ray's parameter, the box or -1, and its side, 0 to 5 for xXyYzZ.
 struct Hit {
   double at;
   int64_t box, side;
@@ -24,7 +24,7 @@ struct Hit {
 // Boxes by the cells that they touch.
 class BoxGrid {
  public:
-  // The grid of boxes between two corners; what of them lies outside is left out.
+  // The grid of boxes between two corners; parts outside are ignored.
   BoxGrid(std::vector<YawedBox> boxes, Vec3 low, Vec3 high, double cell_m);
   // The nearest hit up to `farthest`, from an origin inside the grid and outside of the boxes, or any where that is enough (shadows).
   // Walks from cell to cell. Source: Amanatides and Woo 1987.

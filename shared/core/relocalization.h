@@ -1,4 +1,4 @@
-// Where in a map a frame may be: landmarks that a camera should see, and what of a map looks like a picture.
+// Relocalization of a frame in a map: landmarks expected in view, and similarity between a map and an image.
 #pragma once
 
 #include <optional>
@@ -22,7 +22,7 @@ struct ViewingCones {
   size_t count;
 };
 
-// Landmarks that a camera should see: rows of the map, pixels (V, 3) u_left v u_right, octaves that they should appear at.
+// Landmarks expected in a camera's view: rows of the map, pixels (V, 3) u_left v u_right, expected octaves.
 struct VisibleLandmarks {
   std::vector<int64_t> rows;
   std::vector<double> pixels, octaves;
@@ -34,7 +34,7 @@ struct VisibleLandmarks {
 VisibleLandmarks visible_landmarks(const ViewingCones& cones, const SE3& map_from_cam, const StereoImage& camera, float distance_scale,
                                    double margin_px, double max_view_angle_rad, double octave_scale);
 
-// What a robot holds of a map: landmarks, and the K places from which the survey saw them.
+// A robot's part of a map: landmarks, and the K places from which the survey saw them.
 struct MapLandmarks {
   ViewingCones cones;
   const float* sigmas_m;  // (count,) along the directions from which they were mapped
@@ -44,8 +44,8 @@ struct MapLandmarks {
   size_t places;
 };
 
-// Features of a frame, pixels (N, 3) u_left v u_right. Where there is a pair of images depth is measured for those that match something
-// and are not tried yet, and kept.
+// Features of a frame, pixels (N, 3) u_left v u_right. With a pair of images, depth is measured for matched ones
+// that were not tried yet, and kept.
 struct QueryFrame {
   SeenFeatures features;  // pixels are those of the left image
   const double* pixels;
@@ -83,25 +83,25 @@ struct MapFix {
   std::vector<int64_t> features, rows;                // matched at the end: features and landmarks
   std::vector<uint8_t> inliers;                       // of them
   std::vector<double> points_map, pixels, sigmas_px;  // (P, 3), (P, 3), (P, 2) of them
-  std::vector<int64_t> covisible;                     // landmarks that should be seen
-  std::vector<uint8_t> is_found;                      // which of them are inliers
+  std::vector<int64_t> covisible;                     // expected landmarks
+  std::vector<uint8_t> is_found;                      // true for inliers among them
   bool is_passed;                                     // by the survey; else all that may be visible are covisible
 };
 
-// The fix by guided matching of all landmarks visible from a place, twice: wide, then narrow around the first answer.
+// The fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result.
 std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera,
                                         const FixLimits& limits, SE3 map_from_cam, double radius_px);
 
-// The median distance of the landmarks that should be visible, or nearly so; NaN without any.
+// The median distance of the landmarks expected in view, or nearly so; NaN without any.
 double median_distance(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const SE3& map_from_cam);
 
 // Fills, for each descriptor, `wanted` numbers of the centres nearest to it, the nearest first, -1 where there are fewer. Ties go to the
 // lower number.
 void nearest_cells(Descriptors descriptors, Descriptors centres, size_t wanted, int32_t* cells);
 
-// Marks what is held within max_bits of any of the descriptors, as far as it lies in one of the `asked` cells that are nearest to that.
+// Marks indexed descriptors within max_bits of any query, if they lie in one of the `asked` cells nearest to the query.
 // Those of cell c are held[starts[c]] to held[starts[c + 1]].
-// Sources: Sivic and Zisserman 2003 on inverted files; Jegou, Douze and Schmid 2008 on asking several cells and comparing bits.
+// Sources: Sivic and Zisserman 2003 on inverted files; Jegou, Douze and Schmid 2008 on querying several cells and comparing bits.
 void mark_near(Descriptors descriptors, Descriptors centres, size_t asked, Descriptors held, const int64_t* starts, int max_bits,
                uint8_t* is_near);
 

@@ -66,7 +66,7 @@ struct Canvas {
   int32_t* faces;
 };
 
-// Paints what one camera sees. Holds that camera's buffers.
+// Paints the image of one camera. Holds that camera's buffers.
 class ScenePainter {
  public:
   // rays (H, W, 4): a lens' x/z, y/z and their change per pixel, whose samples are looked up in the plane; no rows for a pinhole.

@@ -15,7 +15,7 @@ struct StereoPair {
 };
 
 struct StereoLimits {
-  double max_disparity_px;  // searched where there is no prior
+  double max_disparity_px;  // searched without a prior
   double min_correlation;
   double uniqueness;           // the rival's correlation is at most this share of the best
   int wide_half, narrow_half;  // windows of 2 half + 1 pixels

@@ -1,4 +1,4 @@
-// Surfels: points of views merged in voxels, voxels judged by what views see through, discs drawn into a picture for any lens, and
+// Surfels: points of views merged in voxels, checks of voxels against free space in views, discs drawn into a picture for any lens, and
 // Gaussians blended into one. Lengths are metres; cam_from_map (4, 4) row by row; pictures row by row.
 #pragma once
 
@@ -13,23 +13,23 @@
 
 namespace fleetmap {
 
-// A voxel's edge is a power of two times kEdgeM, as fine as the pixel that falls into it: what a view shows from afar is kept coarsely.
+// A voxel's edge is a power of two times kEdgeM, as fine as the pixel that falls into it: distant points are kept coarsely.
 constexpr double kEdgeM = 0.01;
 constexpr int kLevels = 5;
 constexpr int kStridePx = 2;  // of the pixels that are merged
 constexpr double kMinRangeM = 0.3, kMaxRangeM = 12.0;
 
-// The voxel of a point at a level, in 63 bits: 5 km each way at the finest level. What lies farther out is at that border.
+// The voxel of a point at a level, in 63 bits: 5 km each way at the finest level. Points farther out are clamped to that border.
 int64_t voxel_key(double x, double y, double z, int level);
 
-// Voxels of one recording, which grow view by view.
+// Voxels of one recording, extended view by view.
 class VoxelTable {
  public:
   // Adds the points of a view, disparities in px, NaN unknown, of standard deviation sigma_px. Points and normals are means by the
   // inverse variance of the depth.
   void add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam);
-  // Fills mean points (N, 3) in map, unit normals (N, 3), levels (N,), and of how many views each is, of those voxels whose normals do
-  // not cancel out; returns how many.
+  // Fills mean points (N, 3) in map, unit normals (N, 3), levels (N,), and numbers of views, of those voxels whose normals do
+  // not cancel out; returns their number.
   size_t surfels(float* points, float* normals, uint8_t* levels, int64_t* views) const;
   size_t size() const { return voxels_.size(); }
 
@@ -49,10 +49,10 @@ class VoxelTable {
 
 enum Mark : uint8_t { kUnseen, kSeen, kSeenThrough };
 
-// What a view shows of `count` points (N, 3) in map of voxels of these levels (N,): marks (N,). nearest_px: of every step_px-th pixel the
+// Evidence of a view on `count` points (N, 3) in map of voxels of these levels (N,): marks (N,). nearest_px: of every step_px-th pixel the
 // largest disparity around it, 0 where its own is unknown. A point must lie clear_sigmas standard deviations of the depth, and clear_m,
-// before what the pixel shows to be seen through. weights (N,): how many views a view counts for that sees more finely than the voxel
-// was seen, 0 where nothing is shown; pixels (N, 2) of points in range, else 0.
+// before the pixel's depth to be seen through. weights (N,): weight, in views, of a view that sees more finely than the voxel
+// was seen, 0 without evidence; pixels (N, 2) of points in range, else 0.
 void look_at(const float* points, const uint8_t* levels, size_t count, Picture<const float> nearest_px, double step_px, double sigma_px,
              StereoLens lens, const double* cam_from_map, double clear_sigmas, double clear_m, uint8_t* marks, float* weights,
              float* pixels);
@@ -89,7 +89,7 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
                 const float* normals_map, const uint8_t* levels, const uint8_t* colours, double far_m, double radius_edges, Rays rays,
                 float* weight, float* colour, float* depth);
 
-constexpr double kLeastAlpha = 1.0 / 255.0;  // what covers less of a pixel is not drawn there
+constexpr double kLeastAlpha = 1.0 / 255.0;  // smaller coverage of a pixel is not drawn
 
 // `count` Gaussians in a picture, front to back: pixels (M, 2) of their centres, conics (M, 3) xx, xy, yy of the inverse covariances,
 // reaches (M, 2) in px beyond which the least alpha is not reached, peaks (M,) of alpha and greys (M,).

@@ -1,4 +1,4 @@
-// What tracks of points say about the clones of the filter that saw them, the points themselves projected out.
+// Constraints of point tracks on the filter's clones that observed them, with the points projected out.
 //
 // Error convention: true = Exp(error) * estimate, in `odom` axes. For a rotation R, a velocity v and a position p and the error
 // (r, nu, rho): R = Exp(r) R^, v = Exp(r) v^ + nu, p = Exp(r) p^ + rho, to first order. Source: Barrau and Bonnabel 2017.
@@ -33,24 +33,24 @@ struct PixelWeights {
   double pixel, disparity;
 };
 
-// The point (in place, `odom`) of one track, by least squares; false where it does not settle in front of every camera. point must
+// The point (in place, `odom`) of one track, by least squares; false unless it converges in front of every camera. point must
 // hold a start.
 bool triangulate(const PlacedCamera* cameras, const Sighting* track, size_t count, const PixelWeights& weights, Vec3& point);
 
-// Of a normal error's variance, what is left among those whose square stays below the limit: of a truncated normal.
+// Remaining share of a normal error's variance if squares beyond the limit are rejected: of a truncated normal.
 double share_that_passes(double limit, double mean_square);
 
-// How large errors of pixels are. The weights are wide and treat all as white noise; the rest says what the errors really are.
+// Model of pixel errors. The weights are wide and treat all as white noise; the rest describes the true errors.
 struct PixelModel {
   PixelWeights weights;
-  double noise_variance;           // that the weighted rows really have
-  double slip_along, slip_across;  // sigmas of what one track keeps for itself: the shares of its way by which it slips along it
+  double noise_variance;           // true one of the weighted rows
+  double slip_along, slip_across;  // sigmas of one track's own errors: shares of its way by which it slips along it
   double track_disparity;          // and across it, and its disparity's offset in pixels
   double gate_quantile;            // of the normal distribution, at the share of right tracks that pass the gate
 };
 
 // The rows of one track and their derivatives: by the point, the clones' errors (rotation and position each, in the track's order), the
-// rig's disparity offset and depth scale, what the track keeps for itself (slips along and across, disparity's offset); last the residual.
+// rig's disparity offset and depth scale, the track's own errors (slips along and across, disparity's offset); last the residual.
 struct TrackRows {
   Matrix values;
   size_t rows, clone_columns;
@@ -82,7 +82,7 @@ struct NormalEquations {
 class TrackConstraints {
  public:
   // From the tracks and the cameras of M clones; covariance (6 M, 6 M) of the clones' errors, rotation then position. moved (6 M,): how far
-  // the clones stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track that was taken, 0 for one
+  // the clones stand from the prior mean, when an iterated filter relinearises. used (T,) becomes 1 for a track that was used, 0 for one
   // that could not be triangulated and -1 for one that failed its gate. Source: Mourikis and Roumeliotis 2007, equations 23 to 26 (null
   // space of the point).
   void accumulate(const std::vector<PlacedCamera>& cameras, const Tracks& tracks, const PixelModel& model, const Matrix& covariance,

@@ -22,7 +22,7 @@ constexpr double kFewPoints = 0.15;     // share of them that must be missing be
 
 bool is_known(Vec3 point) { return std::isfinite(point[0]) && std::isfinite(point[1]) && std::isfinite(point[2]); }
 
-// Not finite where there is no disparity.
+// Not finite without a disparity.
 Vec3 stereo_point(const double* pixel, const StereoLens& lens) {
   const double z = lens.focal_baseline / (pixel[0] - pixel[2]);
   return {(pixel[0] - lens.cx) * z / lens.focal, (pixel[1] - lens.cy) * z / lens.focal, z};

@@ -1,4 +1,4 @@
-// Points followed from one stereo frame to the next: where a motion takes them, by optical flow, and the motion that they agree with.
+// Tracking of points from one stereo frame to the next: predicted by a motion, by optical flow, and the motion with which they agree.
 // Pixels (N, 3) are u left, v, u right, NaN where the disparity is unknown; points_cam (N, 3) are in metres in the camera's axes.
 #pragma once
 
@@ -29,34 +29,34 @@ struct TrackerModel {
   double min_disparity_px;
 };
 
-// The images of a frame, all of one size: those of a pair at half size as well; a depth sensor's disparities in place of a right one.
-// What a rig does not have is empty.
+// The images of a frame, all of one size: those of a pair at half size as well; a depth sensor's disparities instead of a right one.
+// Images that a rig lacks are empty.
 struct TrackerFrame {
   StereoPair whole, halved;
   Grey<const float> disparity_px;
 };
 
-// What the points in both frames say of the motion between them.
+// Motion between two frames, by the points in both.
 struct TrackedMotion {
   bool is_known = false;
   SE3 cam_from_previous = {};
   double information[36] = {};  // of a left perturbation in camera axes
-  double kept_share = 0.0;      // of the points that flow found: they moved as the motion says
+  double kept_share = 0.0;      // of the points found by flow: they agree with the motion
 };
 
-// Feeds on frames in order; ids ascend and never repeat. It keeps its memory.
+// Processes frames in order; ids ascend and never repeat. It keeps its memory.
 class Tracker {
  public:
   explicit Tracker(const TrackerModel& model);
 
-  // Follows the points into the next frame, by flow there and back from where the motion takes them: those without depth move as if they
+  // Tracks the points into the next frame, by flow there and back from their predicted pixels: those without depth move as if they
   // were far away, those that would come to lie behind the camera stay. The motion is refined by the points with depth, which must agree
-  // with it then. points_cam (N, 3): where the points are, where not the disparities say it (no pointer: they do). is_predicted: the motion
-  // is no mere guess. Then one level above the image is enough, coarser ones cost as much again and mix near and far points; where
-  // too few points hold, the prediction was wrong, and all levels are used.
+  // with it then. points_cam (N, 3): the points, if not given by the disparities (no pointer: by these). is_predicted: the motion
+  // is not a mere guess. Then one level above the image is enough, coarser ones cost as much again and mix near and far points; where
+  // too few points are found, the prediction was wrong, and all levels are used.
   TrackedMotion follow(GreyImage image, const SE3& cam_from_previous, bool is_predicted, const double* points_cam);
 
-  // A frame whose points are others: those of before are forgotten, and added ones are of this frame.
+  // Starts at a frame with new points: earlier points are forgotten, added ones belong to this frame.
   void begin(GreyImage image);
   int64_t add(const double* pixels, size_t count);  // returns the first id
   bool has_begun() const { return !now_.is_empty(); }
@@ -82,7 +82,7 @@ class Tracker {
   Pyramid before_, now_;
   CornerFinder corners_;
   StereoMatcher stereo_;
-  // Of the points in work: where they start and where they are found, on the way there and back; which of them hold.
+  // Of the points in work: start and found pixels, there and back; flags of successful ones.
   std::vector<double> points_cam_, starts_, places_, back_;
   std::vector<uint8_t> kept_;
   ChosenSightings seen_, inliers_;
@@ -90,7 +90,7 @@ class Tracker {
   std::vector<Pixel> taken_;
 };
 
-// How far the pixels of each id in both, ascending, lists have moved.
+// Distances moved by the pixels of each id in both lists, which ascend.
 std::vector<double> common_ways_px(const int64_t* old_ids, const double* old_pixels, size_t old_count, const int64_t* ids,
                                    const double* pixels, size_t count);
 

@@ -20,14 +20,14 @@ void descend(Descriptors descriptors, const Tree& tree, int32_t* words);
 // Ties go to the lower number.
 void two_nearest(Descriptors descriptors, Descriptors centres, int32_t* found);
 
-// Places by the words that they show: an inverted file. Source: Sivic and Zisserman 2003.
+// Places by their words: an inverted file. Source: Sivic and Zisserman 2003.
 class InvertedFile {
  public:
   explicit InvertedFile(size_t words) : postings_(words) {}
 
   size_t words() const { return postings_.size(); }
   size_t places() const { return places_; }
-  // The next place, by its words, which rise, and their weights.
+  // Adds the next place, by its words, which ascend, and their weights.
   void add(const int32_t* words, const float* weights, size_t count);
   // Fills, for each place, the sum of the smaller weight of every word that both have: 1 - |a - b|_1 / 2 where weights sum to 1, as DBoW2.
   void score(const int32_t* words, const float* weights, size_t count, double* scores) const;

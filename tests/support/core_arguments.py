@@ -21,7 +21,7 @@ SETTINGS = SimpleNamespace(**asdict(FilterSettings()), **asdict(TrackerSettings(
 
 
 class Arguments:
-    """What nanobind's signatures ask for, made from a seed: now plain and of one size, now anything but that."""
+    """Arguments for nanobind's signatures, generated from a seed: valid and of one size, or arbitrary."""
 
     def __init__(self, seed: int, plain_size: int | None = None) -> None:
         """plain_size: that of plain ones, in place of any."""
@@ -74,7 +74,7 @@ class Arguments:
         return np.ascontiguousarray(values)
 
     def rows(self) -> Callable[..., tuple[Array, ...]]:
-        """What a bundle adjustment asks for the rows of its images."""
+        """Image rows of a bundle adjustment."""
         answer = tuple(self.array("float64", sides) for sides in ("*, 4", "*, 4, 3", "*, 4, *", "*, 3"))
         return lambda *_: answer
 

@@ -1,4 +1,4 @@
-// numpy arrays in and out of the core. Arguments are views that nobody converts; results own what they hold.
+// numpy arrays in and out of the core. Arguments are unconverted views; results own their data.
 #pragma once
 
 #include <nanobind/nanobind.h>

@@ -59,7 +59,7 @@ def flow_noise(
 def detect(
     keys: Words, exact: Array, exact_octaves: Array, directions: Array, frame: int, seed: int, model: FeatureStatistics, table: Array
 ) -> Features:  # fmt: skip
-    """What a detector finds at exact pixels (N, 3).
+    """Detections at exact pixels (N, 3).
 
     directions (N, 2): azimuth and elevation of the view. A descriptor follows from the look, with bits changed by the
     dirt, by the direction of view (in steps), by noise.

@@ -29,7 +29,7 @@ def text(path: str) -> str:
 
 
 def section(path: str, words: str) -> str:
-    """What stands under the only heading that holds `words`, up to the next heading; empty where there is none."""
+    """Text under the only heading that contains `words`, up to the next heading; empty if absent."""
     document = text(path)
     headings = list(_HEADING.finditer(document))
     found = [n for n, heading in enumerate(headings) if words in heading[0]]

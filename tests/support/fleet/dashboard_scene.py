@@ -118,7 +118,7 @@ def fill_store(folder: Path) -> None:
 
 
 def build_report() -> dict[str, object]:
-    """What a build notes of itself, as far as the page shows it."""
+    """A build's report, as far as the page shows it."""
     places = [
         {"recording": "monday", "from_map_m": [10.0, 6.0], "to_map_m": [12.0, 6.5], "verdict": "accepted", "reason": "", "score": 0.4},
         {"recording": "monday", "from_map_m": [30.0, 6.0], "to_map_m": [30.0, 14.0], "verdict": "rejected",
@@ -190,7 +190,7 @@ def failure(
 
 
 def place_of(number: int) -> tuple[float, float]:
-    """Where robot `number` stands: in an aisle."""
+    """Position of robot `number`: in an aisle."""
     return 4.0 + (number * 7.3) % (LENGTH_M - 8), 6.0 + AISLE_M * (number % 3)
 
 
@@ -295,7 +295,7 @@ def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[
 
 @dataclass
 class Seen:
-    """What a browser loaded and said."""
+    """Requests and console messages of a browser."""
 
     requests: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -307,7 +307,7 @@ class Seen:
 
 
 def is_fault(kind: str, text: str) -> bool:
-    """Whether a page said something that nobody should find on its console; graphics in software tell how slow they are."""
+    """True for an unexpected console message of a page; performance warnings of software graphics are expected."""
     return kind in {"error", "warning"} and "GL Driver Message (OpenGL, Performance" not in text
 
 
@@ -340,7 +340,7 @@ def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
 
 
 def marks(page: Page, count: int = 1) -> list[dict[str, object]]:
-    """What the map of a page paints, once it is `count` marks: a canvas has no elements to look at."""
+    """Marks painted on a page's map, once there are `count`: a canvas has no elements to inspect."""
     wait_until(page, "count => document.querySelector('.site-map')?.marks?.().length >= count", count)
     return page.evaluate("document.querySelector('.site-map').marks()")
 

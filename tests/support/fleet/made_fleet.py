@@ -18,7 +18,7 @@ Message = RobotHealth | PoseMessage | FailureReport
 
 @dataclass
 class Known:
-    """What was made, to compare with what was counted."""
+    """Generated events, to compare with the counted ones."""
 
     failures: Counter[tuple[str, str]] = field(default_factory=Counter)
     suspected: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -58,7 +58,7 @@ class MadeRobot:
 
     @property
     def x_m(self) -> float:
-        """Where it is."""
+        """Its position."""
         way_m = self._way_m % (2 * self._length_m)
         return min(max(1e-3, way_m if way_m < self._length_m else 2 * self._length_m - way_m), self._length_m - 1e-3)
 
@@ -68,7 +68,7 @@ class MadeRobot:
         return int(self.x_m // self._tile_m), 0
 
     def second(self, now_ns: int) -> list[Message]:
-        """What it says within a second that ends now: two poses, one health, and a report where a failure is over."""
+        """Messages of the last second: two poses, one health, and a report if a failure is over."""
         said: list[Message] = [self._estimate(now_ns - NS // 2, 0.5), self._estimate(now_ns, 0.5)]
         status = self._fail(now_ns)
         if self._step > 0:
@@ -138,7 +138,7 @@ class MadeRobot:
 
 
 def drive(robots: list[MadeRobot], seconds: int, start_ns: int) -> Iterator[tuple[int, MadeRobot, Message]]:
-    """What the robots say, second by second: when, who, what."""
+    """Messages of the robots, second by second: time, robot, message."""
     for step in range(1, seconds + 1):
         now_ns = start_ns + step * NS
         for robot in robots:

@@ -22,7 +22,7 @@ from fleetmap.errors import LinkError
 
 
 class MemoryHub:
-    """What MemoryBus participants share. `reachable` False plays a network that is away.
+    """Shared state of MemoryBus participants. `reachable` False simulates a network outage.
 
     access: rules for participants with a certificate, as a server's session has them; may be replaced at any time.
     """
@@ -37,7 +37,7 @@ class MemoryHub:
         self.certificates: list[str | None] = []  # of everybody who is there, None for the server
 
     def passes(self, certificate: str | None, flow: Direction, act: Act, key_expr: str) -> bool:
-        """Whether a message of or for a participant passes; the server itself (None) is asked nothing."""
+        """True if a message of or for a participant passes; the server itself (None) is not restricted."""
         if self.access is None or certificate is None:
             return True
         return permits(self.access, certificate, flow, act, key_expr)
@@ -46,7 +46,7 @@ class MemoryHub:
 class MemoryBus(Bus):
     """A participant of a MemoryHub; callbacks run on the caller's thread.
 
-    As on the network, what the rules deny is silence: nothing is raised, and nobody hears it.
+    As on the network, denied messages are dropped silently: no error, no delivery.
     """
 
     def __init__(self, hub: MemoryHub, certificate: str | None = None) -> None:
@@ -96,7 +96,7 @@ class MemoryBus(Bus):
                 deliver(listen, key, payload)
 
     def latched_publisher(self, key: str) -> LatchedPublisher:
-        """See Bus; nobody here asks for what was published before."""
+        """See Bus; earlier publications are not queried here."""
 
         def put(payload: bytes, attachment: bytes) -> None:
             self.publish(key, payload, may_drop=True, attachment=attachment)
@@ -158,7 +158,7 @@ class MemoryBus(Bus):
 
 
 def permits(access: Access, certificate: str, flow: Direction, act: Act, key_expr: str) -> bool:
-    """Whether a message from (IN) or to (OUT) the holder of a certificate passes; `key_expr` may hold wildcards itself."""
+    """True if a message from (IN) or to (OUT) the holder of a certificate passes; `key_expr` may contain wildcards."""
     holder = access.holder(certificate)
     return holder is not None and any(
         flow is rule.flow and act in rule.acts and any(key_includes(key, key_expr) for key in rule.keys)
@@ -167,7 +167,7 @@ def permits(access: Access, certificate: str, flow: Direction, act: Act, key_exp
 
 
 def key_includes(key_expr: str, other: str) -> bool:
-    """Whether a key expression covers every key that `other`, a key or key expression, stands for."""
+    """True if a key expression includes every key that `other`, a key or key expression, matches."""
     return _includes(key_expr.split("/"), other.split("/"))
 
 

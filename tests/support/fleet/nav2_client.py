@@ -130,7 +130,7 @@ class RosProgram:
         self.session.put(self.endpoint("MS", topic)[0], payload, attachment=self._attachment())
 
     def call(self, service: str, type_name: str, *values: Any, raw: bytes | None = None) -> Any:
-        """The response; None where the service refuses, whose reason is then in `errors`."""
+        """The response; None if the service refuses, with the reason in `errors`."""
         request_type = message_name(type_name, "Request")
         request = self.store.types[request_type](*(values or (0,)))
         payload = raw if raw is not None else bytes(self.store.serialize_cdr(request, request_type))
@@ -180,7 +180,7 @@ class LifecycleManager(RosProgram):
 
     @property
     def beats(self) -> list[Any]:
-        """What the robot has said on the bond: a subscriber hears itself too."""
+        """Messages of the robot on the bond: a subscriber receives its own too."""
         return [beat for beat in self._bond if beat.id == self.node and beat.instance_id != self.instance]
 
     def tell_bond(self, *, active: bool) -> None:

@@ -140,7 +140,7 @@ class Robot:
         return Fix(moved @ BODY_FROM_CAM, covariance, self.inliers, 20, **about)
 
     def knows(self, estimate: Estimate) -> bool:
-        """Whether it is tracking, and where it truly is."""
+        """True if it is tracking, and its true position."""
         return estimate.status is Status.TRACKING and self.error_m(estimate) < 1e-6
 
     def told(

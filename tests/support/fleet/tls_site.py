@@ -112,7 +112,7 @@ class TlsSite:
         return self.folder / f"{robot}.log"
 
     def robot(self, name: str) -> dict[str, Any]:
-        """What the server knows of a robot; empty where it knows none, or does not answer."""
+        """The server's entry of a robot; empty if unknown or without a reply."""
         try:
             told = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10).json()["robots"]
         except httpx.HTTPError:

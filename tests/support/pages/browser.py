@@ -69,7 +69,7 @@ def running_chromium(*arguments: str) -> Iterator[Chromium]:
 
 
 def box_of(thing: Locator) -> FloatRect:
-    """Where an element stands, in CSS pixels. Asked again while there is no box: a live page replaces its elements."""
+    """Box of an element, in CSS pixels. Repeats while there is no box: a live page replaces its elements."""
     for _ in range(50):
         if (box := thing.bounding_box()) is not None:
             return box

@@ -1,4 +1,4 @@
-"""A ride in which somebody covers the cameras, carries the robot across the room, turns it round, and sets it down again."""
+"""A ride during which the cameras are covered, and the robot is carried across the room, turned round and set down again."""
 
 from functools import lru_cache
 

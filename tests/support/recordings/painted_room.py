@@ -66,7 +66,7 @@ def rig(sensors: SensorSet) -> RigCalibration:
 
 
 def frame_at(ride: Ride, stamp_ns: int, sensors: SensorSet) -> CameraFrame:
-    """What the rig sees so many nanoseconds after the start."""
+    """Images of the rig at a time in nanoseconds after the start."""
     map_from_cam = ride.map_from_body(stamp_ns * 1e-9) @ _BODY_FROM_CAM
     left, depth_m = _view(map_from_cam)
     right = _view(map_from_cam @ _RIGHT)[0] if len(rig(sensors).cameras) > 1 else None

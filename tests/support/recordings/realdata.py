@@ -1,4 +1,4 @@
-"""Where the real recordings are, for tests that need them."""
+"""Paths of real recordings, for tests that need them."""
 
 from pathlib import Path
 

@@ -46,7 +46,7 @@ def world_from_cam0(stamp_ns: int) -> Array:
 
 @dataclass
 class Sample:
-    """What was written."""
+    """The written content."""
 
     stamps_ns: NDArray[np.int64]
     left: list[NDArray[np.uint8]]

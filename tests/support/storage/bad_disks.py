@@ -26,7 +26,7 @@ def open_folder() -> Iterator[Path]:
 
 
 def on_bad_disk(kind: str, folder: Path, action: Callable[[], Any]) -> Any:
-    """The result of `action` in a process to which `folder` is read-only, of another account, or of one that lets nobody read its files.
+    """The result of `action` in a process to which `folder` is read-only, of another account, or of another account with unreadable files.
 
     Skips where this process may not arrange that.
     """

@@ -22,7 +22,7 @@ _KILLED = 9
 _WRITING = {"create", "write", "truncate", "sync", "sync_folder", "rename", "unlink", "mkdir", "map"}
 
 Call = tuple[Any, ...]
-"""What was done: its kind, then a path (two for rename), offset and data of writes, size of truncations."""
+"""A disk operation: its kind, then a path (two for rename), offset and data of writes, size of truncations."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class Disk:
     journal: list[Call] = field(default_factory=list)
 
     def holds(self, path: str) -> bool:
-        """Whether a path is on this disk."""
+        """True if a path is on this disk."""
         return path.startswith(self.root)
 
     def begin(self, kind: str) -> int:

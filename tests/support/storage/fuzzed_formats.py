@@ -25,7 +25,7 @@ MAX_GROWTH_BYTES = 256 << 20
 _NUMBERS = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1]
 
 Edit = tuple[str, float, Any]
-"""What to do, where (as a share of the bytes), with what."""
+"""A mutation: kind, position (as a share of the bytes), value."""
 
 edits = st.lists(
     st.one_of(

@@ -1,4 +1,4 @@
-"""What is on a disk after a power cut: of the calls that a journal tells, what was synced, and some or none of the rest."""
+"""Content of a disk after a power cut: of the calls in a journal, the synced ones, and some or none of the rest."""
 
 import random
 import shutil

@@ -56,7 +56,7 @@ def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: in
     map_from_body[:, 0, 3] = np.linspace(-20, 25, keyframes)
     map_from_body[:, 1, 3] = rng.uniform(-1, 1, keyframes)
     seen = rng.random((keyframes, landmarks)) < 0.5
-    seen[:, 5] = False  # nobody sees this one
+    seen[:, 5] = False  # not visible from any place
     obs_keyframe, obs_landmark = np.nonzero(seen)
     count = len(obs_keyframe)
     stamps = np.arange(keyframes, dtype=np.int64) * 100_000_000
@@ -81,7 +81,7 @@ def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: in
 
 
 def draft_details(**report: object) -> DraftDetails:
-    """What a build says about a draft."""
+    """A build's report on a draft."""
     return DraftDetails(
         created="2026-01-02T03:04:05Z",
         tile_size_m=16.0,

@@ -1,4 +1,4 @@
-"""What surveys of the box room hand on, without surveying it."""
+"""Results of surveys of the box room, without surveying it."""
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -23,7 +23,7 @@ class Seen:
 
 
 def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth: bool = False) -> GridSession:
-    """What a survey hands on of keyframes at these map_from_body."""
+    """Results of a survey with keyframes at these map_from_body."""
     keyframes = []
     for number, map_from_body in enumerate(places):
         pair, disparity = stereo_pair(map_from_body, number), None

@@ -1,4 +1,4 @@
-"""What a store looks like after its process was killed, its disk failed, or the power went, at any file-system call.
+"""State of a store after a kill of its process, a disk failure or a power cut at any file-system call.
 
 `python tests/support/storage/store_faults.py [--every N] [--modes kill,tear,...]` prints what was tried and what was wrong, as JSON.
 Each try is a forked process on a copy of a small store, and afterwards: the store opens, `verify` is clean, the versions are in the
@@ -153,7 +153,7 @@ def _be_child(folder: Path, act: Act, disk: Disk, told: Path) -> None:
 
 
 def faults_after(folder: Path, scenario: Scenario, is_done: bool) -> list[str]:
-    """What is wrong with the store in `folder` after a fault in the scenario's operation; repairs and repeats it."""
+    """Find faults of the store in `folder` after a fault in the scenario's operation; repairs and repeats it."""
     try:
         with MapStore.open(folder, clock_ns=clock_ns) as store:
             found = list(store.verify().faults)
@@ -227,7 +227,7 @@ def hash_of(*words: str) -> int:
 def run(
     modes: list[str], every: int, names: list[str] | None = None, within_s: float = float("inf")
 ) -> dict[str, object]:
-    """What was tried: counts by scenario and mode, and what was wrong; `is_complete` unless time was short.
+    """Tried faults: counts by scenario and mode, and errors; `is_complete` unless time was short.
 
     Scenarios and modes take turns, so that none is left out where time is short.
     """

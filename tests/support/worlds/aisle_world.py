@@ -88,7 +88,7 @@ def relocalizer(seen: Aisle, map_from_body: Array) -> tuple[Relocalizer, NDArray
 
 
 def frame(seen: Aisle, map_from_body: Array, rng: np.random.Generator) -> FrameFeatures:
-    """What a picture from there shows: most corners, half a pixel and a dozen bits off."""
+    """Features of an image from there: most corners, with errors of half a pixel and a dozen bits."""
     rows, pixels, octaves = seen.look(map_from_body @ BODY_FROM_CAM)
     found = rng.random(len(rows)) < 0.8
     rows, pixels, octaves = (

@@ -40,7 +40,7 @@ def out_and_back(
 
 
 def ride_sample(ride: Ride, frames: int, frame_s: float, *, seed: int = 0, begin_s: float = 0.0) -> Sample:
-    """What the rig of recording_samples records from `begin_s` on: pairs, and an IMU at 200 Hz from 1 s before."""
+    """Recording of the rig of recording_samples from `begin_s` on: pairs, and an IMU at 200 Hz from 1 s before."""
     shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
     times = begin_s + frame_s * np.arange(frames)
     stamps = START_NS + np.rint(times * 1e9).astype(np.int64)
@@ -116,7 +116,7 @@ def points_seen(map_from_cam: Array, pixels: Array) -> Array:
 
 
 def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:
-    """What the rig sees from one place."""
+    """Images of the rig from one place."""
     map_from_cam = map_from_body @ BODY_FROM_CAM0
     shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
     return CameraFrame(stamp_ns, _render(map_from_cam), _render(map_from_cam @ shift))

@@ -18,7 +18,7 @@ SIGMAS_PX = np.array([0.25, 0.12, 0.15])  # of the left pixel, the disparity, th
 
 @dataclass(frozen=True)
 class Stretch:
-    """What is seen on one stretch of a drive, exactly: K keyframes, sorted observations of landmarks, raw pixels (M, 2) of each camera."""
+    """Exact observations on one stretch of a drive: K keyframes, sorted observations of landmarks, raw pixels (M, 2) of each camera."""
 
     session: Session
     stamps_ns: Array

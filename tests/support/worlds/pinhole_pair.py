@@ -1,4 +1,4 @@
-"""What a stereo rig sees whose true parameters differ from its calibration, by a pinhole model without linearization."""
+"""Observations of a stereo rig whose true parameters differ from its calibration, by a pinhole model without linearization."""
 
 import numpy as np
 

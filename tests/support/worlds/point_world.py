@@ -117,7 +117,7 @@ def use(
 
 @dataclass(frozen=True)
 class Run:
-    """What one run ended with."""
+    """Result of one run."""
 
     filter: InvariantFilter
     truth: NavState

@@ -25,7 +25,7 @@ class SessionScene:
     visible: list[NDArray[np.int64]]
 
     def sightings(self, points_map: Array, seed: int) -> list[Sighting | None]:
-        """What the later survey sees of landmarks that stand at points_map (N, 3) by now, with noise."""
+        """Noisy observations by the later survey of landmarks now at points_map (N, 3)."""
         rng = np.random.default_rng(seed)
         found: list[Sighting | None] = []
         for place, rows in zip(self.map_from_cam, self.visible, strict=True):

@@ -40,7 +40,7 @@ def _walls(seed: int) -> NDArray[np.uint8]:
 
 
 def view(map_from_cam: Array, seed: int = 1) -> NDArray[np.uint8]:
-    """What one camera sees of the room from inside."""
+    """Image of the room by one camera inside."""
     u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
     rays_cam = np.stack(
         [(u - CAMERA.cx_px) / CAMERA.focal_px, (v - CAMERA.cy_px) / CAMERA.focal_px, np.ones(u.shape)], -1

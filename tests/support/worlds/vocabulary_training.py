@@ -89,7 +89,7 @@ def seed_centres(bits: Packed, branching: int, uniforms: Array) -> Packed:
 def cluster(bits: Packed, centres: Packed, iterations: int) -> Indices:
     """Label (M,) of the nearest centre of descriptors (M, 4) after refining `centres` in place. Source: Grana 2013 (k-majority).
 
-    A centre is the bit-wise majority of its members (ties: 0). One that nobody belongs to stays where it is.
+    A centre is the bit-wise majority of its members (ties: 0). One without members stays unchanged.
     """
     labels, each = np.full(len(bits), -1), np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")
     for _ in range(iterations):
