@@ -96,7 +96,7 @@ Lists column_structures(const Lists& after, const Indices& parent) {
   return columns;
 }
 
-// The share of zeros that a front of so many columns may hold: arithmetic on zeros is cheaper than many calls. Limits as CHOLMOD's
+// Largest share of zeros in a front, by its number of columns: arithmetic on zeros is cheaper than many calls. Limits as CHOLMOD's
 // (Chen, Davis, Hager and Rajamanickam 2008).
 double allowed_zeros(double columns) { return columns <= 24 ? 0.8 : columns <= 96 ? 0.1 : 0.05; }
 

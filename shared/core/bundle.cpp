@@ -11,7 +11,7 @@ namespace fleetmap {
 namespace {
 
 constexpr double kMinDepth = 0.02;        // m
-constexpr double kBehindSigmas = 1000.0;  // what an observation counts as whose point is behind the camera
+constexpr double kBehindSigmas = 1000.0;  // residual of an observation whose point is behind the camera
 constexpr double kLandmarkFloor = 1e-9;   // relative to the trace: a point seen once by one camera keeps its depth
 constexpr double kDampingFloor = 1e-9, kDampingMin = 1e-10, kDampingMax = 1e10;
 constexpr int kPose = 6, kMotion = 9, kBlock = kPose * kPose, kEdge = 30;
@@ -195,7 +195,7 @@ void BundleSolver::view(const BundleState& state) {
   for (size_t k = 0; k < cam_from_map_.size(); ++k) cam_from_map_[k] = cam_from_body_ * transposed(state.map_from_body[k].rotation);
 }
 
-// The residual of a point at q from the keyframe's body, in map axes; false where it is behind the camera.
+// The residual of a point at q from the keyframe's body, in map axes; false if it is behind the camera.
 bool BundleSolver::residual(const Seen& seen, const Mat3& cam_from_map, Vec3 q, Residual& out) const {
   const double z = dot(vec3(cam_from_map[2]), q) + body_in_cam_[2];
   if (z < kMinDepth) return false;
@@ -265,7 +265,7 @@ void BundleSolver::linearise() {
   }
 }
 
-// A and w J^T r of an observation of the camera whose point is at q from the body, in map axes; false where it has no weight.
+// A and w J^T r of an observation of the camera whose point is at q from the body, in map axes; false if it has no weight.
 bool BundleSolver::linearise(const Seen& seen, Vec3 q, Symmetric& info, Vec3& slope) const {
   const Mat3& rot = cam_from_map_[size_t(seen.keyframe)];
   Residual at;
@@ -304,7 +304,7 @@ bool BundleSolver::linearise(const ImageRows& rows, size_t observation, Symmetri
   return true;
 }
 
-// A of the observations; H_ll and b_l of the points; H_pp and b_p of the poses; what goes with the calibration.
+// A of the observations; H_ll and b_l of the points; H_pp and b_p of the poses; blocks of the calibration.
 void BundleSolver::linearise_images() {
   const size_t width = columns();
   ImageRows rows = {};
@@ -343,7 +343,7 @@ void BundleSolver::linearise_images() {
   }
 }
 
-// S and b before the landmarks are eliminated, and what damps S.
+// S and b before the landmarks are eliminated, and the damping of S.
 void BundleSolver::reduce(double damping) {
   const size_t size = size_t(problem_.unknowns), width = columns();
   blocks_.assign(cols_.size() * kBlock, 0.0);

@@ -19,7 +19,7 @@ std::pair<double, double> distorted(const RadialTangential& lens, double x, doub
   return {x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y};
 }
 
-// Whether the lens sees a point in front of it, and where it brings it in the plane z = 1.
+// True if the lens sees a point in front of it; its distorted position in the plane z = 1.
 bool is_seen(const RadialTangential& lens, double reach, Vec3 point, double* image) {
   const double x = point[0] / point[2], y = point[1] / point[2];
   std::tie(image[0], image[1]) = distorted(lens, x, y);

@@ -115,7 +115,7 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
   }
 }
 
-// Sets what is nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
+// Sets pixels nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
 void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius) {
   const double reach = std::min(radius, double(free.width + free.height)) - 0.75;  // from the nearest whole pixel
   const ptrdiff_t size = ptrdiff_t(reach);
@@ -194,7 +194,7 @@ const std::vector<int64_t>& Suppression::operator()(const Pixel* pixels, const i
   return chosen_;
 }
 
-// Candidates by falling score: all of the best `most`, and what is as good as the last of them. Of equals the first found comes first.
+// Candidates by falling score: the best `most`, and all equal to the last of them. Of equals the first found comes first.
 void CornerFinder::put_in_order(size_t most) {
   double least = 0.0;
   if (most < candidates_.size()) {

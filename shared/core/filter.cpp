@@ -189,7 +189,7 @@ void Filter::predict_random_walk(const SE3& body_from_next, double rotation_sigm
   store(state.rotation, shape[kPosition] + 3, 6);
   for (int k = 0; k < 6; ++k) spread[k][k] = k < 3 ? rotation_sigma * rotation_sigma : translation_sigma * translation_sigma;
   if (measured) {
-    // (free^-1 + measured^-1)^-1: the measured one where it is narrow, the free one where that is wider
+    // (free^-1 + measured^-1)^-1: the measured one if it is narrow, the free one if that is wider
     Matrix &sum = taken_, &solved = turned_;
     sum = spread, solved = spread;
     for (int k = 0; k < 36; ++k) sum.values[k] += measured[k];

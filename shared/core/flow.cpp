@@ -101,7 +101,7 @@ struct Gradients {
   double least() const { return 0.5 * (xx + yy - std::sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)); }
 };
 
-// Moves (x, y) to where the window is; whether it stayed in reach of the image on the way there.
+// Moves (x, y) to the window's position; true if it stayed in reach of the image on the way.
 bool find(GreyImage image, const Template& window, const Gradients& g, FlowSteps steps, double& x, double& y) {
   const int half = steps.half, size = 2 * half + 1;
   const double scale = 1.0 / (g.xx * g.yy - g.xy * g.xy);

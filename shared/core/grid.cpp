@@ -7,12 +7,12 @@
 namespace fleetmap {
 namespace {
 
-constexpr double kBelowM = 0.15;        // what lies deeper is a mirror image in the floor, or a wrong disparity
-constexpr double kMaxHitSigmaM = 0.08;  // of the depth: beyond, points say only what is free before them
+constexpr double kBelowM = 0.15;        // deeper points are mirror images in the floor, or wrong disparities
+constexpr double kMaxHitSigmaM = 0.08;  // of the depth: beyond, points only prove free space before them
 constexpr uint16_t kMinPoints = 6;      // of a view in a voxel that it hits
 constexpr uint8_t kMost = 255;
 
-// The voxel at a height over the floor margin, kSlices for what is higher.
+// The voxel at a height over the floor margin, kSlices above the top.
 inline int level_at(double height) {
   const double level = (height - kFloorM) / kSliceM;
   return level < kSlices ? int(level) : kSlices;
@@ -23,7 +23,7 @@ void walk(Vec3 camera, Vec3 end, double first, double until, uint8_t mark, const
   constexpr double kNever = std::numeric_limits<double>::infinity();
   if (!(camera[0] >= 0.0 && camera[0] < double(window.columns) && camera[1] >= 0.0 && camera[1] < double(window.rows))) return;
   const Vec3 along = end - camera;
-  // Along an axis: the cell, the share of the ray at which it ends, and how much of the ray a whole cell is.
+  // Along an axis: the cell, the share of the ray at which it ends, and the share of the ray per cell.
   struct Axis {
     ptrdiff_t cell, step;
     double next, each;

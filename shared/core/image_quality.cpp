@@ -17,7 +17,7 @@ Brightness thin(GreyImage image, ptrdiff_t every, int bright, uint8_t* thinned) 
 }
 
 Steps row_steps(GreyImage image, ptrdiff_t every) {
-  constexpr ptrdiff_t kNarrow = 1 << 14;  // so many steps fit into narrow sums, of which wide registers add many at once
+  constexpr ptrdiff_t kNarrow = 1 << 14;  // number of steps that fit into narrow sums, of which wide registers add many at once
   Steps sums{};
   for (ptrdiff_t y = 0; y < image.height; y += every)
     for (ptrdiff_t begin = 0; begin + 1 < image.width; begin += kNarrow) {

@@ -27,7 +27,7 @@ size_t drop_spikes(int64_t* stamps_ns, double* gyro, double* accel, size_t known
     return jumps(values, n - 1, limit) && (n == end - 1 || jumps(values, n, limit));
   };
   size_t to = known;
-  for (size_t n = known; n < end; ++n) {  // whose neighbours still stand where they were: what is kept moves to n at most
+  for (size_t n = known; n < end; ++n) {  // its neighbours are still in place: kept samples move to n at most
     if (n > 0 && (stands_out(gyro, n, kSpikeGyro) || stands_out(accel, n, kSpikeAccel))) continue;
     stamps_ns[to] = stamps_ns[n];
     store(vec3(gyro + 3 * n), gyro + 3 * to);

@@ -19,7 +19,7 @@ struct Columns {
   }
 };
 
-// Of each column, the row that is nearest to it so far; ties go to what came first.
+// For each column, the nearest row so far; ties go to the first.
 struct Claims {
   std::vector<int32_t> distance;
   std::vector<int64_t> row;

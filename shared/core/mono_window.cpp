@@ -53,9 +53,9 @@ struct Cross {
   double at[6][3];
 };
 
-// The normal equations of views that move and points, and what solving them needs.
+// Normal equations of points and free views, and memory for their solution.
 struct NormalSystem {
-  std::vector<int64_t> slots;  // of each view among those that move, -1 where it is held
+  std::vector<int64_t> slots;  // of each view among the free ones, -1 for a fixed one
   Matrix hessian, reduced;
   std::vector<double> gradient, step;
   std::vector<Mat3> point_hessian;

@@ -11,14 +11,14 @@ namespace fleetmap {
 namespace {
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-constexpr double kRatio = 0.95;  // of the nearest descriptor to its rival where the motion says where to look
+constexpr double kRatio = 0.95;  // of the nearest descriptor to its rival near a predicted pixel
 constexpr double kScale = 1.2;   // from octave to octave
 constexpr double kNearM = 1e-6;
 
 // By which pixels of an octave are coarser than the image's.
 double coarseness(double octave) { return std::pow(kScale, std::min(std::max(octave, 0.0), 4.0)); }
 
-// Where camera b sees a point of its own frame, none outside of its image.
+// Pixel of a point of camera b's frame, none outside of its image.
 std::optional<std::pair<double, double>> seen_by(Vec3 point, const StereoLens& lens, double width_px, double height_px) {
   if (!(point[2] > kNearM)) return {};
   const double u = lens.focal * point[0] / point[2] + lens.cx, v = lens.focal * point[1] / point[2] + lens.cy;

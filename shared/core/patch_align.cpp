@@ -37,7 +37,7 @@ double sample_upright(GreyImage image, double x, double y, int half, double* sam
   return total;
 }
 
-// The reference's window less its mean, its slopes, and what they add up to.
+// The reference's window less its mean, its slopes, and their sums.
 struct Template {
   double grey[kMostCount], right[kMostCount], down[kMostCount];
   double xx = 0.0, xy = 0.0, yy = 0.0, energy = 0.0;

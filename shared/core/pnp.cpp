@@ -10,7 +10,7 @@ namespace fleetmap {
 namespace {
 
 constexpr double kNearest = 0.05;  // metres before the camera
-constexpr double kUnseen = 1e12;   // the squared residual of what lies nearer, or behind
+constexpr double kUnseen = 1e12;   // squared residual of points nearer, or behind
 constexpr int kTrials = 5;         // of larger and larger damping in an iteration
 constexpr double kEnough = 1e-6;   // share of the cost by which an iteration must lower it to be followed by another
 constexpr size_t kLeastInliers = 4;
@@ -58,7 +58,7 @@ void linearize(const Sightings& seen, const StereoLens& lens, double width, cons
   }
 }
 
-// Levenberg-Marquardt in place; leaves the normal equations and squared residuals where it ends. False where those are singular.
+// Levenberg-Marquardt in place; leaves the final normal equations and squared residuals. False if those are singular.
 bool refine(const Sightings& seen, const StereoLens& lens, double width, const double* prior, int iterations, SE3& cam_from_source,
             Normal& normal, double* squared) {
   double moved[6] = {}, damping = 1e-4;

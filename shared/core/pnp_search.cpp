@@ -9,7 +9,7 @@ namespace {
 constexpr double kNearZero = 1e-9;
 constexpr double kNearest = 0.05;  // metres before the camera
 
-// Points and where they were measured by column, so that wide registers project several at once.
+// Points and their measured pixels by column, so that wide registers project several at once.
 struct Columns {
   std::vector<double> x, y, z, u, v;
 
@@ -93,7 +93,7 @@ int real_roots(double a, double b, double c, double d, double e, double (&roots)
   return count;
 }
 
-// The axes, in columns, that three points stand for; false where they lie in a line.
+// The axes, in columns, defined by three points; false if they are collinear.
 bool axes_of(const Vec3 (&points)[3], Mat3& axes) {
   const Vec3 along = points[1] - points[0], other = points[2] - points[0], normal = cross(along, other);
   const double length = norm(along), height = norm(normal);

@@ -9,7 +9,7 @@ namespace fleetmap {
 namespace {
 
 constexpr double kGapPeriods = 3.0;                   // a longer distance between samples counts as missing data
-constexpr double kGapGyro = 0.5, kGapAccel = 2.0;     // how far rate and force may be from the interpolated ones there
+constexpr double kGapGyro = 0.5, kGapAccel = 2.0;     // sigmas of rate and force about the interpolated ones there
 constexpr double kBlindGyro = 1.0, kBlindAccel = 20;  // the same with no sample at all
 constexpr double kDefaultPeriod = 0.01;
 
@@ -30,7 +30,7 @@ struct Cut {
   std::vector<double> times_s;    // since the first
   std::vector<Vec3> gyro, accel;  // without biases
   std::vector<double> holes_s;    // around each step: from the sample before it to the one after; beyond the data from its end
-  double period_s;                // of the samples there; NaN where it is unknown
+  double period_s;                // of the samples there; NaN if unknown
 };
 
 double median_period_s(const int64_t* stamps_ns, size_t count) {

@@ -10,7 +10,7 @@ namespace {
 
 constexpr double kCellPx = 24.0;
 constexpr double kMostCells = 512;     // per side, however wild the coordinates
-constexpr double kFarthestPx = 1e100;  // what is farther, or not finite, is in no image
+constexpr double kFarthestPx = 1e100;  // pixels farther away, or not finite, are in no image
 
 // Pixels sorted into square cells.
 class PixelGrid {

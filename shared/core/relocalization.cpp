@@ -13,14 +13,14 @@ namespace {
 
 constexpr double kNearestM = 0.2, kNearestDepthM = 1e-6;
 constexpr double kReachShare = 1.3;  // of the distance up to which a landmark was found: detection does not end sharply
-constexpr double kLeastScale = 0.5;  // of what appears smaller than at the finest octave
+constexpr double kLeastScale = 0.5;  // of landmarks that appear smaller than at the finest octave
 constexpr double kFirstDoubt = 3.0;  // of the sigmas, while the place that matches were looked for around is only a guess
 constexpr double kNarrower = 0.6;    // of the guided radius, around the first answer
 constexpr double kWidestOctave = 3.0, kCoarsestOctave = 5.0;  // up to which windows, and pixels' errors, grow
 constexpr double kOctavesApart = 2.0;                         // of a feature from the one that is expected
 constexpr double kMostAcrossPx = 10.0;                        // that a landmark's own sigma counts for
 constexpr double kNearlyPx = 50.0;                            // beside the image
-constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // from where the survey saw what is covisible
+constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // limits of the survey's cameras that define covisible landmarks
 constexpr double kColumns = 8.0, kRows = 6.0;                 // the parts of an image
 
 // Landmarks of the map that features of a frame show.
@@ -65,7 +65,7 @@ void add_sigmas(const MapLandmarks& map, size_t row, int8_t octave, const Stereo
   sigmas.push_back(doubt * std::hypot(limits.disparity_sigma_px, depth_px));
 }
 
-// The features that show what should be visible from a place; nothing where they are fewer than a pose needs.
+// The features that match landmarks expected from a pose; none if they are too few for a pose.
 std::optional<Matched> match_visible(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera, const FixLimits& limits,
                                      const SE3& map_from_cam, double radius_px, double doubt) {
   const VisibleLandmarks visible = visible_landmarks(map.cones, map_from_cam, camera, float(limits.distance_scale), radius_px,
@@ -129,7 +129,7 @@ int image_cell(const double* pixel, const StereoImage& camera) {
   return int(column) * int(kRows) + int(row);
 }
 
-// Landmarks in a camera's image that the survey saw from next to it, looking the same way: what racks hide is not among them. All that
+// Landmarks in a camera's image that the survey saw from nearby in the same direction, so without those hidden by racks. All that
 // may be visible where the survey did not pass.
 void add_covisible(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const Matched& matched, MapFix& fix) {
   const SE3& here = fix.map_from_cam;

@@ -19,7 +19,7 @@ struct Limits {
   double left, right, above, below;
 };
 
-// Whether all of so many corners lie outside one side of the view pyramid, and how many lie behind the near plane.
+// True if all corners lie outside one side of the view pyramid; the number of those behind the near plane.
 struct Outside {
   int behind = 0, left = 0, right = 0, above = 0, below = 0, count = 0;
   void add(Vec3 corner, const Limits& limits) {
@@ -178,7 +178,7 @@ ptrdiff_t ScenePainter::first_floor_row(const Surfaces& surfaces, int samples) c
   return plane_.height;
 }
 
-// The owner of each sample of the picture (H S, W S): that of the plane, through the lens where there is one.
+// The owner of each sample of the picture (H S, W S): that of the plane, through the lens if there is one.
 const int32_t* ScenePainter::through_lens(int samples) {
   if (rays_.empty()) return direct_.owner.data();
   std::vector<int32_t>& indices = indices_[size_t(samples)];
@@ -202,12 +202,12 @@ const int32_t* ScenePainter::through_lens(int samples) {
 
 namespace {
 
-// A pixel's footprint on a texture: how far its place moves per pixel to the right and down, in texels.
+// A pixel's footprint on a texture: shift in texels per pixel to the right and down.
 struct Footprint {
   double ax, ay, bx, by;
 };
 
-// Bilinear look-up with wrap-around in the level of so many texels that starts at `level`; x, y in its texels.
+// Bilinear look-up with wrap-around in the level of the given size that starts at `level`; x, y in its texels.
 [[gnu::always_inline]] inline double bilinear(const uint8_t* level, int log_width, int log_height, double x, double y) {
   x += kWrap, y += kWrap;
   const int64_t column = int64_t(x), row = int64_t(y);
@@ -310,7 +310,7 @@ struct Shade {
   double value, u, v, w;
 };
 
-// Of a face along the ray (xn, yn, 1): filtered texture times dirt times baked light. per_px: how far xn and yn move per pixel.
+// Of a face along the ray (xn, yn, 1): filtered texture times dirt times baked light. per_px: change of xn and yn per pixel.
 Shade shade(const Surfaces& surfaces, const Textures& textures, const double* h, int32_t face, double xn, double yn, double per_px_x,
             double per_px_y, int most_taps, double area) {
   const double* values = surfaces.values + 6 * size_t(face);
@@ -353,7 +353,7 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
   double per_px_x = wide_x, per_px_y = wide_y;
   for (ptrdiff_t y = 0; y < rows_; ++y)
     for (ptrdiff_t x = 0; x < columns_; ++x) {
-      // The polygons of the pixel's samples: how many samples each has, and the sums of their places.
+      // The polygons of the pixel's samples: number of samples of each, and the sums of their positions.
       int32_t seen[kMostSamples];
       int hits[kMostSamples], count = 1;
       double sum_x[kMostSamples], sum_y[kMostSamples];

@@ -82,7 +82,7 @@ class Correlation {
  private:
   float* row(int v) { return of_.rows.data() + v * room_; }
 
-  // products[n] = sum l r; what stands beyond the rows' last column goes into products beyond count alone.
+  // products[n] = sum l r; values beyond the rows' last column affect only products beyond count.
   void correlate(const float (&l)[kMostSide][kMostSide], int side, ptrdiff_t count) {
     for (ptrdiff_t n = 0; n < count; n += 8) {
       Eight<float> total = {};
@@ -135,7 +135,7 @@ void sample(GreyImage image, double x, double y, int half, int rim, double* __re
   }
 }
 
-// Gauss-Newton from a disparity; unknown where it does not settle.
+// Gauss-Newton from a disparity; unknown unless it converges.
 Disparity refine(const StereoPair& pair, double x, double y, double disparity, int half) {
   const double height = double(pair.right.height), width = double(pair.right.width);
   const int side = 2 * half + 1, area = side * side, stride = side + 2;

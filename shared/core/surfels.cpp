@@ -9,7 +9,7 @@ namespace {
 
 constexpr double kMaxSigmaShare = 0.06;  // standard deviation of a depth, as a share of it
 constexpr double kFootprintShare = 1.5;  // least edge of a voxel, in steps from pixel to pixel that merge in it
-// The square around a pixel whose disparities give the normal, by steps, how far they may be from the pixel's own, and how many at least.
+// Square around a pixel whose disparities give the normal: half size and step, largest difference to its own, least number.
 constexpr ptrdiff_t kFitPx = 6, kFitStepPx = 2;
 constexpr float kFitApartPx = 1.0f;
 constexpr double kMinFit = 12.0;
@@ -24,7 +24,7 @@ constexpr double kMargin = 1.15;      // pixels are finer on one side of a disc 
 constexpr double kMostPixels = 96.0;  // of a disc that the camera touches
 constexpr int kBins = 64;             // of distances
 constexpr ptrdiff_t kBlockPx = 8;     // squares of pixels whose farthest surface is known,
-constexpr size_t kLooks = 24;         // and how often it is looked for
+constexpr size_t kLooks = 24;         // and largest number of probes
 
 constexpr double kHidden = 1e-4;  // share of the light at which a pixel is full
 
@@ -218,7 +218,7 @@ std::vector<uint32_t> near_to_far(const double* points, size_t count, double far
   return order;
 }
 
-// Fills hidden with the farthest of nearest in each block: what lies behind it is seen nowhere there.
+// Fills hidden with the farthest of nearest in each block: points behind it are hidden everywhere there.
 void find_hidden(Picture<float> nearest, Picture<float> hidden) {
   std::fill_n(hidden.at, hidden.height * hidden.width, 0.0f);
   for (ptrdiff_t v = 0; v < nearest.height; ++v)
@@ -236,13 +236,13 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
   const ptrdiff_t rows = rays.height, columns = rays.width;
   if (rows == 0 || columns == 0) return;
   const Mat3 rotation = mat3(cam_from_map, 4);
-  const std::vector<uint32_t> order = near_to_far(points_cam, count, far_m);  // what is hidden by then costs little
+  const std::vector<uint32_t> order = near_to_far(points_cam, count, far_m);  // hidden discs then cost little
   const ptrdiff_t block_rows = (rows + kBlockPx - 1) / kBlockPx, block_columns = (columns + kBlockPx - 1) / kBlockPx;
   std::vector<float> nearest_m(size_t(rows * columns), std::numeric_limits<float>::infinity()),
       hidden_m(size_t(block_rows * block_columns));
   const Picture<float> nearest{nearest_m.data(), rows, columns}, hidden{hidden_m.data(), block_rows, block_columns};
   const size_t step = count / kLooks + 1;
-  // Twice: first for the nearest surface of each pixel, then for what belongs to it.
+  // Twice: first for the nearest surface of each pixel, then for all discs on it.
   for (const bool is_drawing : {false, true})
     for (size_t k = 0; k < count; ++k) {
       if (k % step == 0 && !(is_drawing && k)) find_hidden(nearest, hidden);

@@ -27,13 +27,13 @@ View view_of(Vec3 point, const PlacedCamera& camera) {
   return view;
 }
 
-// A measured number less what it should be, and the derivative of the latter by the point; both times the weight.
+// A measured number minus its prediction, and the derivative of the latter by the point; both times the weight.
 struct Row {
   double residual;
   Vec3 by_point;
 };
 
-// Rows of u, v and, where it is known, disparity; how many those are.
+// Rows of u, v and, if known, disparity; their number.
 int rows_of(const View& view, const Sighting& seen, const StereoLens& lens, const PixelWeights& weights, Row (&rows)[3]) {
   const Mat3& turn = view.cam_from_odom;
   const double inverse = 1.0 / view.at[2];
@@ -209,7 +209,7 @@ int8_t TrackConstraints::add(const std::vector<PlacedCamera>& cameras, const Sig
   };
   const double limit = chi_square_limit(dof, model.gate_quantile);
   if (!(squared() <= limit)) return -1;
-  for (int k = 0; k < 3; ++k) {  // of what a track keeps for itself, only what passes the gate
+  for (int k = 0; k < 3; ++k) {  // of a track's own errors, only the share that passes the gate
     for (size_t row = 0; row < dof; ++row) whitened_[row] = own_[row][k];
     forward_substitute(innovation_[0], whitened_.data(), dof, dof);
     const double share = std::sqrt(share_that_passes(limit, squared()));

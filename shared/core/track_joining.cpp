@@ -7,7 +7,7 @@
 namespace fleetmap {
 
 std::vector<int32_t> join_tracks(const int32_t* first, const int32_t* second, size_t links, const int32_t* keyframes, size_t nodes) {
-  // Groups are trees of parents, and lists of what follows each node, which begin at the root.
+  // Groups are trees of parents, and lists of successors, which begin at the root.
   std::vector<int32_t> parents(nodes), sizes(nodes, 1), following(nodes, -1), last(nodes);
   std::iota(parents.begin(), parents.end(), 0);
   std::iota(last.begin(), last.end(), 0);

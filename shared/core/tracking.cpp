@@ -32,7 +32,7 @@ struct Place {
   double u, v;
 };
 
-// Where a point appears that was seen at a pixel before: there still, where it has come to lie behind the camera.
+// Predicted pixel of a point: its previous pixel if it has come to lie behind the camera.
 Place project(Vec3 point, const double* pixel, const StereoLens& lens) {
   if (!(point[2] > kNearM)) return {pixel[0], pixel[1]};
   return {lens.focal * point[0] / point[2] + lens.cx, lens.focal * point[1] / point[2] + lens.cy};
@@ -52,7 +52,7 @@ Tracker::Tracker(const TrackerModel& model) : model_(model) {
   ids_.reserve(most), kept_.reserve(most), taken_.reserve(most);
 }
 
-// Fills places_ and kept_; how many hold.
+// Fills places_ and kept_; returns the number of points kept.
 size_t Tracker::flow(const SE3& cam_from_previous, size_t levels) {
   const size_t count = ids_.size();
   const StereoLens& lens = model_.lens;
@@ -131,7 +131,7 @@ bool Tracker::search_motion(size_t agree, TrackedMotion& found) {
   return agree >= model_.min_inliers;
 }
 
-// Ends points further than the limit from where the motion takes them; what has no depth cannot disagree. The others go on with the
+// Ends points farther than the limit from their predicted pixels; points without depth cannot disagree. The others go on with the
 // disparity that the motion leaves them, the prior of the new one.
 void Tracker::keep_agreeing(const TrackedMotion& motion) {
   const StereoLens& lens = model_.lens;

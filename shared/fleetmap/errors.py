@@ -25,7 +25,7 @@ from typing import Literal
 
 
 class FleetmapError(Exception):
-    """Base of the tree; `exit_status` is what a command line ends with."""
+    """Base of the tree; `exit_status`: of a command line."""
 
     exit_status = 3
 

@@ -30,7 +30,7 @@ _TRUTH_STEP_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """A run to record. robot: a run of the scenario, its first one for None. frames: at most so many, all for None.
+    """A run to record. robot: a run of the scenario, its first one for None. frames: maximum number, all for None.
 
     hidden: errors of mounting and clock missing in the recording's calibration. camera_pipeline: a key of
     IMAGE_PIPELINES.

@@ -112,7 +112,7 @@ MAKERS = {
 
 @functools.cache
 def asked(function: object) -> list[tuple[str, CodeType]]:
-    """Names of a function's arguments and what makes them, by the signature that is its documentation."""
+    """Names of a function's arguments and their generators, by the signature in its docstring."""
     signature = (inspect.getdoc(function) or "").splitlines()[0]
     for kind, maker in MAKERS.items():
         signature = re.sub(kind, maker, signature)

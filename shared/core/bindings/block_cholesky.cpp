@@ -11,7 +11,7 @@ namespace fleetmap {
 Lapack lapack;
 }
 
-// scipy hands out its LAPACK as capsules, for Cython; what it stands for is Fortran's interface with integers of 32 bits.
+// scipy hands out its LAPACK as capsules, for Cython, of Fortran's interface with 32-bit integers.
 void find_lapack() {
   if (lapack.dpotrf) return;
   auto found = [](const char* library, const char* name, auto& function) {

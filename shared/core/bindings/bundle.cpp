@@ -65,7 +65,7 @@ std::shared_ptr<const T> kept(const T& value) {
           }};
 }
 
-// The rows at a state, as Python says them.
+// The rows at a state, computed by Python.
 ImageRows rows_at(const nb::callable& said, const BundleState& state, bool derivatives, size_t observations) {
   const nb::gil_scoped_acquire held;
   Rows rows;

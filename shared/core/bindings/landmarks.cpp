@@ -25,7 +25,7 @@ void check_size(size_t size, size_t wanted, const char* refusal) {
   if (size != wanted) throw nb::value_error(refusal);
 }
 
-// Lists of values of which there are so many.
+// Lists of a given number of values.
 Lists lists_of(const Indices& starts, size_t size, const char* refusal) {
   if (starts.shape(0) < 1 || starts(0) < 0 || starts(starts.shape(0) - 1) > int64_t(size) ||
       !unlocked([&] { return std::is_sorted(starts.data(), starts.data() + starts.shape(0)); }))

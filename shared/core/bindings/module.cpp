@@ -34,7 +34,7 @@ void bind_tracking(nb::module_&);
 void bind_vocabulary(nb::module_&);
 
 #if defined(__x86_64__)
-// Asked of the processor itself: not every compiler's library knows what __builtin_cpu_supports asks it.
+// Queried from the processor itself: not every compiler's library supports __builtin_cpu_supports.
 static bool has_avx2_and_fma() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   if (!__get_cpuid(1, &a, &b, &c, &d) || !(c & bit_FMA) || !(c & bit_OSXSAVE)) return false;

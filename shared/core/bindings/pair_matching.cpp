@@ -7,7 +7,7 @@ namespace {
 
 using Points = Array<double, -1, 3>;
 using Size = std::tuple<double, double>;
-// pixels (N, 2), octaves (N,), descriptors (N, 4), disparities (N, 2), points_cam (N, 3), whether the disparities are measured
+// pixels (N, 2), octaves (N,), descriptors (N, 4), disparities (N, 2), points_cam (N, 3), true if the disparities are measured
 using Features = std::tuple<Array<double, -1, 2>, Array<int8_t, -1>, Array<uint64_t, -1, 4>, Array<double, -1, 2>, Points, bool>;
 
 KeyframeFeatures features_of(const Features& features) {

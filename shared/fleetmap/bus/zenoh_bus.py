@@ -417,7 +417,7 @@ def query_refused(key: str, reason: str) -> LinkError:
 
 
 def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:
-    # The answer travels with the question's congestion control; what may be dropped would lose large answers.
+    # The reply inherits the query's congestion control; dropping would lose large replies.
     control = zenoh.CongestionControl.BLOCK
     return session.get(key, timeout=timeout_s, payload=payload, congestion_control=control)
 

@@ -19,7 +19,7 @@ __all__ = ["FAR", "Projected", "hamming_knn2", "match_by_projection", "match_mut
 
 
 def packed(descriptors: Descriptors) -> Packed:
-    """(N, 4) uint64 of descriptors (N, 32) uint8: the same bits as machine words, copied only where the core needs it."""
+    """(N, 4) uint64 of descriptors (N, 32) uint8: the same bits as machine words, copied only if the core needs it."""
     assert descriptors.ndim == 2
     assert descriptors.shape[1] == 32
     assert descriptors.dtype == np.uint8

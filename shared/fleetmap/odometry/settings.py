@@ -27,13 +27,13 @@ class FilterSettings(Section, frozen=True):
     """Noise and window of the multi-state constraint filter.
 
     The scales widen the data sheet's densities where measurements are weighed: vibration above the IMU's bandwidth folds
-    into what it reports. noise_share to wheel_yaw_scale_sigma describe the errors as they are, for what is reported.
+    into what it reports. noise_share to wheel_yaw_scale_sigma describe the true errors, for the reported covariance.
     """
 
     clones: Annotated[int, Meta(ge=3)] = 11  # past states in the window
     chunk_frames: int = 9  # longer tracks are used in chunks of this length
     chunk_frames_without_imu: int = 3  # shorter, because nothing else bounds the motion
-    pixel_sigma_px: float = 0.6  # of a tracked point; larger than its true error, for what no model covers
+    pixel_sigma_px: float = 0.6  # of a tracked point; larger than its true error, for unmodelled errors
     disparity_sigma_px: float = 0.35  # of its disparity, equally
     noise_share: float = 0.28  # of these two: the part of the true error that is independent from image to image
     slip_along_share: float = 0.025  # drift of the flow along a point's image motion, as a share of it
@@ -85,7 +85,7 @@ class StartSettings(Section, frozen=True):
 class MonocularSettings(Section, frozen=True):
     """Visual odometry of one camera, and the initialization of its scale by the IMU."""
 
-    first_depth: float = 5.0  # the unit of length: how far away half of what the first two views share is taken to be
+    first_depth: float = 5.0  # the unit of length: assumed median depth of the points common to the first two views
     first_parallax_px: float = 18.0  # median image motion between the first two views
     first_min_points: int = 40  # common to the first two views
     min_angle_deg: float = 1.0  # median angle between the rays of the first two views

@@ -24,7 +24,7 @@ _MAX_IMU_VALUE = 1e5  # no inertial sensor measures this in any unit; flipped bi
 # Between values in the median: no inertial sensor has more than 10 kHz; no camera or odometry more than 2 kHz or less than 0.05 Hz
 _SHORTEST_IMU_NS, _SHORTEST_NS, _LONGEST_NS = 100_000, 500_000, 20_000_000_000
 _EPOCH_NS = (9e17, 5e18)  # 1998 to 2128
-_FEWEST = 10  # values whose steps tell a unit
+_FEWEST = 10  # values needed to recognise a unit by their steps
 # Of a part of a stream with a pause on either side: a part shorter than the second that an odometry needs to start is useless, so
 # an interrupted recording loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
 _SHORTEST_PART_NS, _PAUSE_STEPS, _STRAY_SHARE = 1_000_000_000, 10, 0.05
@@ -175,7 +175,7 @@ def _check_steps(stamps_ns: Stamps, what: str) -> None:
 
 def check_seconds(value: float, where: str) -> None:
     """RecordingError for a value too large for seconds since 1970, naming its likely unit."""
-    if abs(value) > 9_223_372_036:  # what 64 bits of nanoseconds hold
+    if abs(value) > 9_223_372_036:  # limit of 64 bits of nanoseconds
         factor = next((factor for factor in _FINER if abs(value) < 1e11 * factor), 1_000_000_000)
         why = f"{value:.0f} is not a time in seconds"
         raise wrong_unit(f"{where}:", _FINER[factor], why, f"divide them by {factor}")

@@ -63,7 +63,7 @@ class FrameSource(Protocol):
         """Feed the recording's content, including images, to `digest`, in a fixed order."""
 
     def close(self) -> None:
-        """Closes open files."""
+        """Close open files."""
 
 
 @dataclass(frozen=True)

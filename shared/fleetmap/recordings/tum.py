@@ -17,7 +17,7 @@ from fleetmap.recordings.files import read_text
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 _NS = 1_000_000_000
-_MOST_S = 9_223_372_036  # what 64 bits of nanoseconds hold
+_MOST_S = 9_223_372_036  # limit of 64 bits of nanoseconds
 _ROWS, _COLUMNS = np.triu_indices(6)
 
 

@@ -105,7 +105,7 @@ _READOUT_S = 0.015  # from the first row to the last
 
 @dataclass(frozen=True, slots=True)
 class ImagePipeline:
-    """Strengths of the stages; a stage whose strength is None, or no stage at all, leaves the picture as it is.
+    """Strengths of the stages; a stage whose strength is None, or no stage at all, leaves the image unchanged.
 
     blur_px: standard deviation of the lens' point spread. corner_loss: share of light lost in the corners. flicker:
     amplitude of the lamps' flicker, which rows see one after the other. gain: of the sensor, 1 is the renderer's by day.

@@ -124,7 +124,7 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
 
 
 def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:
-    """Raises UsageError where a path (N, 2) comes nearer than clearance_m to a solid thing or a wall."""
+    """Raise UsageError if a path (N, 2) comes nearer than clearance_m to an obstacle or a wall."""
     x, y = points_map[:, 0], points_map[:, 1]
     walls = np.minimum(np.minimum(x, layout.length_m - x), np.minimum(y, layout.width_m - y))
     gap, blocker = float(walls.min()), "a wall"

@@ -127,7 +127,7 @@ class Painter:
             self._light[scene.light.shape[1] :] = mover_light(self._mover_faces, self._movers, floor_light, t_s)
 
     def _move(self, t_s: float) -> Array:
-        """Puts the movers where they are at t; their soft shadows."""
+        """Place the movers at time t; return their soft shadows."""
         if not self._movers:
             return np.zeros((0, 3))
         builder = self._world.builder()

@@ -31,7 +31,7 @@ _GLYPHS = {character: _glyph(character) for character in _ROWS}
 
 
 def write_text(image: Texture, x: int, y: int, text: str, dot: int, grey: float) -> None:
-    """Writes `text` with its top left at (x, y), `dot` texels per font dot; text that does not fit is cut off."""
+    """Write `text` with its top left at (x, y), `dot` texels per font dot; text that does not fit is cut off."""
     if not (0 <= x < image.shape[1] and 0 <= y < image.shape[0]):
         return
     dots = np.concatenate([_GLYPHS.get(character, _GLYPHS[" "]) for character in text.upper()], axis=1)
@@ -41,7 +41,7 @@ def write_text(image: Texture, x: int, y: int, text: str, dot: int, grey: float)
 
 
 def write_barcode(image: Texture, rng: np.random.Generator, x: int, y: int, width: int, height: int) -> None:
-    """Paints a random bar code on a white field into `image`."""
+    """Paint a random bar code on a white field into `image`."""
     image[y : y + height, x : x + width] = 235
     at = x + 3
     while at < x + width - 4:

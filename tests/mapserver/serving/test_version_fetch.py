@@ -45,7 +45,7 @@ def test_a_version_is_active_when_all_of_it_is_there(world: World) -> None:
     again = MapClient(world.robot_bus, TileCache(world.folder.parent / "cache"), "lab", "r1", timeout_s=0.1)
     later = again.ready()
     assert later.wanted == ready.wanted
-    assert "version 1 goes on: no reply" in later.note
+    assert "version 1 stays active: no reply" in later.note
     assert len(again.tiles(again.manifest(later.wanted)).tiles) == len(manifest.tiles)
 
 

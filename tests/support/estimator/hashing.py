@@ -1,4 +1,4 @@
-"""Numbers from well mixed bits: the same for a landmark and a frame whatever was asked before. Arrays (N,) of uint64 throughout."""
+"""Numbers from well mixed bits: the same for a landmark and a frame independent of earlier queries. Arrays (N,) of uint64 throughout."""
 
 import numpy as np
 from numpy.typing import NDArray

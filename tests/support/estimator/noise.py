@@ -102,7 +102,7 @@ _POWERS = _powers()
 
 
 def _change_bits(words: Words, keys: Words, counts: NDArray[np.int64]) -> None:
-    """Flips so many bits of descriptors (N, 4) at places that follow from keys (N,) (some may coincide and cancel)."""
+    """Flip a number of bits of descriptors (N, 4) at places that follow from keys (N,) (some may coincide and cancel)."""
     states = [keys]
     for first in range(0, int(counts.max(initial=0)), 8):
         states.append(mixed(states[-1], first))

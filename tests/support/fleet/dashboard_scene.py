@@ -155,7 +155,7 @@ def picture(words: str, width_px: int = 160) -> bytes:
 def failure(
     robot: str, failure_id: str, *, cause: str = "dark", kind: str = "blind", wall_ns: int | None = None
 ) -> FailureReport:
-    """A failure with everything that a robot can tell."""
+    """A failure with every field that a robot can report."""
     at = np.array([20.0, 6.0, 0.0])
     return FailureReport(
         site=SITE,
@@ -235,7 +235,7 @@ def speak_all(
 
 @contextmanager
 def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]]]:
-    """Robots that speak every second, as real ones do; what is put into the dictionary moves them there."""
+    """Robots that report every second, as real ones do; entries of the dictionary move them."""
     moved: dict[str, tuple[float, float]] = {}
     ended = threading.Event()
     with Bus.connect(endpoint) as bus:
@@ -269,7 +269,7 @@ class Served:
 
 @contextmanager
 def serving(folder: Path, *options: str, http: str = "127.0.0.1:0") -> Iterator[Served]:
-    """A server over a filled store; what it wrote is in `log` afterwards."""
+    """A server over a filled store; its output is in `log` afterwards."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
     environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     arguments = ["--store", str(folder), "--http", http, "--zenoh", "tcp/127.0.0.1:0", *options]
@@ -312,7 +312,7 @@ def is_fault(kind: str, text: str) -> bool:
 
 
 def watch(page) -> Seen:  # type: ignore[no-untyped-def]
-    """Notes what a page loads, errors on its console, and answers that are errors."""
+    """Record a page's requests, console errors, and error responses."""
     seen = Seen()
     page.on("request", lambda request: seen.requests.append(request.url))
     page.on("websocket", lambda socket: seen.requests.append(socket.url))

@@ -1,4 +1,4 @@
-"""Estimates as a localizer would give them, for tests of what listens to one."""
+"""Estimates as a localizer would give them, for tests of its subscribers."""
 
 import numpy as np
 

@@ -30,7 +30,7 @@ def profile(robot: Robot) -> RobotProfile:
 def failed(
     ride: Iterable[SensorBundle], loaded: LoadedMap, pictures: str = "full"
 ) -> tuple[FailureReport, bytes, list[str]] | None:
-    """The first failure of a ride: its report, its recording, and what the robot said of each frame that this holds."""
+    """The first failure of a ride: its report, its recording, and the robot's estimates for its frames."""
     robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     robot.use(loaded)
     context, said = None, {}

@@ -18,7 +18,7 @@ DATA = 1
 
 
 class FoxgloveClient:
-    """Reads until what is asked for has come; AssertionError after within_s."""
+    """Reads until the requested messages have come; AssertionError after within_s."""
 
     def __init__(self, url: str, within_s: float = 10.0) -> None:
         self._stack = ExitStack()

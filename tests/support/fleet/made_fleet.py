@@ -1,4 +1,4 @@
-"""Made-up robots that say what real ones say, with failures that are known: for tests and benchmarks of what is counted."""
+"""Synthetic robots that report like real ones, with known failures: for tests and benchmarks of statistics."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ class Known:
 class MadeRobot:
     """Drives to and fro along x through `tiles` of `tile_m`; fails with a chance of `rate_per_robot_day`, in some tile more often.
 
-    ahead_s: by how much its wall clock is wrong. bad_tile: where it fails `bad_factor` times as often.
+    ahead_s: error of its wall clock. bad_tile: tile in which it fails `bad_factor` times as often.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ class MemoryHub:
         self.queryables: list[tuple[str, Answer, str | None]] = []
         self.subscribers: list[tuple[str, Listen, str | None]] = []
         self.tokens: list[tuple[str, str | None]] = []
-        self.certificates: list[str | None] = []  # of everybody who is there, None for the server
+        self.certificates: list[str | None] = []  # of all participants, None for the server
 
     def passes(self, certificate: str | None, flow: Direction, act: Act, key_expr: str) -> bool:
         """True if a message of or for a participant passes; the server itself (None) is not restricted."""
@@ -122,11 +122,11 @@ class MemoryBus(Bus):
         return sorted(key for key in shown if key_includes(key_expr, key))
 
     def reopen(self, access: Access) -> None:
-        """Other rules for the hub; as Bus, whose session is opened anew."""
+        """Set other rules for the hub; as Bus, whose session is reopened."""
         self._hub.access = access
 
     def certificates(self) -> list[str]:
-        """Names in the certificates of who is on the hub, sorted."""
+        """Certificate names of the participants on the hub, sorted."""
         return sorted(name for name in self._hub.certificates if name)
 
     def connected(self) -> bool:

@@ -15,7 +15,7 @@ PYTHON = "/usr/bin/python3"
 def tf2_lookups(
     messages: Iterable[tuple[Any, bool]], questions: Sequence[tuple[str, str, int]]
 ) -> list[list[float] | str]:
-    """x y z qx qy qz qw of target_from_source at a stamp, or why tf2 has none, for questions (target, source, stamp in ns).
+    """x y z qx qy qz qw of target_from_source at a stamp, or tf2's error, for queries (target, source, stamp in ns).
 
     messages: tf2_msgs/TFMessage as rosbags decodes them, in the order of their arrival; whether of /tf_static.
     """

@@ -97,7 +97,7 @@ class TlsSite:
 
     @contextmanager
     def daemon(self, robot: str) -> Iterator[subprocess.Popen[bytes]]:
-        """`locclient run` as configured; killed at the end where it still lives."""
+        """`locclient run` as configured; killed at the end if it still runs."""
         command = self.command("locclient", "run", "--config", self.folder / f"{robot}.toml", "--verbose")
         with (
             self.log(robot).open("ab") as log,

@@ -1,4 +1,4 @@
-"""A fleet manager of VDA 5050 over a real mosquitto: everything that a robot says is validated against the official schemas."""
+"""A fleet manager of VDA 5050 over a real mosquitto: all messages of a robot are validated against the official schemas."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ PATIENCE_S = 60.0
 
 
 def validator(topic: str) -> jsonschema_rs.Draft202012Validator:
-    """The official schema of a topic; skips where it is not here."""
+    """The official schema of a topic; skips if it is absent."""
     path = SCHEMAS / f"{topic}.schema"
     if not path.is_file():
         pytest.skip(f"the schemas of VDA 5050 are not in {SCHEMAS}")

@@ -1,4 +1,4 @@
-"""Debian's chromium for tests of the pages; what it takes too long to close is closed by force."""
+"""Debian's chromium for tests of the pages; killed if it takes too long to close."""
 
 import shutil
 import threading
@@ -14,7 +14,7 @@ _CLOSE_S = 30.0
 
 
 def chromium() -> str:
-    """The browser of the machine; a machine without one says so and skips."""
+    """The browser of the machine; skips, with the reason, without one."""
     found = next(
         (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
     )
@@ -24,7 +24,7 @@ def chromium() -> str:
 
 
 class Chromium:
-    """A browser that is started anew after it had to be killed.
+    """A browser that is restarted after it had to be killed.
 
     Chromium sometimes never answers that a context is to be closed, and Playwright then waits for ever: the test has long
     passed, and its whole run would fail.

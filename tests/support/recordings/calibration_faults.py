@@ -41,7 +41,7 @@ class RigFault:
 
 
 def baseline(percent: float) -> RigFault:
-    """The right camera is said to be so much further from the left one than it is."""
+    """Baseline too long by a percentage."""
 
     def change(rig: RigCalibration) -> RigCalibration:
         left, right, *rest = rig.cameras
@@ -54,7 +54,7 @@ def baseline(percent: float) -> RigFault:
 
 
 def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
-    """The focal lengths of all cameras, or of those with the numbers `cameras`, are said to be so much larger than they are."""
+    """Focal lengths too large by a percentage, of all cameras or of those with the numbers `cameras`."""
     chosen = None if cameras is None else set(cameras)
 
     def scaled(camera: CameraCalibration) -> CameraCalibration:
@@ -68,7 +68,7 @@ def focal(percent: float, cameras: Iterable[int] | None = None) -> RigFault:
 
 
 def pair_turn(axis: str, degrees: float) -> RigFault:
-    """The right camera is said to be turned against the left one (a key of AXES, the right camera's own axes) as it is not."""
+    """A wrong rotation of the right camera against the left one (a key of AXES, the right camera's own axes)."""
     turn = se3(_rotation(AXES[axis], degrees), np.zeros(3))
 
     def change(rig: RigCalibration) -> RigCalibration:
@@ -78,7 +78,7 @@ def pair_turn(axis: str, degrees: float) -> RigFault:
 
 
 def camera_imu_turn(axis: str, degrees: float) -> RigFault:
-    """All cameras are said to be turned together against the IMU, about the left camera's axis; their places stay."""
+    """A wrong common rotation of all cameras against the IMU, about the left camera's axis; their positions stay."""
 
     def change(rig: RigCalibration) -> RigCalibration:
         axes = rig.cameras[0].body_from_cam[:3, :3]
@@ -91,7 +91,7 @@ def camera_imu_turn(axis: str, degrees: float) -> RigFault:
 
 
 def delay(milliseconds: float) -> RigFault:
-    """The IMU's stamps are said to be so much later than they are, against the cameras'."""
+    """A wrong delay of the IMU's stamps against the cameras'."""
 
     def change(rig: RigCalibration) -> RigCalibration:
         return _with_cameras(rig, lambda c: replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 1e-3 * milliseconds), None)
@@ -105,7 +105,7 @@ def another_robots_file(rig: RigCalibration) -> RigFault:
 
 
 def unlike_robot(rig: RigCalibration, seed: int) -> RigCalibration:
-    """The rig of another robot of the same make: what tolerances of lenses and mounts make of it.
+    """The rig of another robot of the same make: differences by tolerances of lenses and mounts.
 
     Focal lengths 1.5 %, principal points 4 px, the pair's angles 0.4 degrees, its baseline 1 %, the IMU's angles 1 degree (sigmas).
     """

@@ -18,7 +18,7 @@ from fleetmap.sensors.rectification import StereoCamera
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
 _CAMERA = 0  # the only one of a rig yet
-# The filter contradicts the images if it accepts less than this share of so many tracks that were due in so many updates.
+# The filter contradicts the images if it accepts less than this share of at least as many tracks over as many updates.
 _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
 

@@ -206,7 +206,7 @@ def _tangent(direction: Array) -> Array:
 def dynamic_initialization(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, settings: OdometrySettings
 ) -> InitialState | None:
-    """Aligns visual odometry (metric, body transforms in any frame) with the IMU, see `imu_alignment`.
+    """Align visual odometry (metric, body transforms in any frame) with the IMU, see `imu_alignment`.
 
     None if the alignment contradicts gravity's size.
     """

@@ -47,4 +47,4 @@ class Container(Protocol):
         """Read one message again; ValueError if it is damaged, RecordingError if the file has changed."""
 
     def close(self) -> None:
-        """Closes the files."""
+        """Close the files."""

@@ -52,7 +52,7 @@ class FileReader:
             hash_file(named[name], digest)
 
     def close(self) -> None:
-        """Does nothing: no file stays open."""
+        """Do nothing: no file stays open."""
 
     def _portable_name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix() if path.is_relative_to(self.root) else f"outside/{path.name}"

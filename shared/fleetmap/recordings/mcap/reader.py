@@ -122,7 +122,7 @@ class McapFile(KeptBytes):
         self._file.close()
 
     def _record(self, at: int) -> Generator[Message, None, tuple[bool, int | None]]:
-        """Yields the messages of the record at `at`; returns True at the data's end, and where the next record begins, None if unknown."""
+        """Yield the messages of the record at `at`; return True at the data's end, and the start of the next record, None if unknown."""
         self._file.seek(at)
         head = self._file.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
