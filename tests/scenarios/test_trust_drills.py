@@ -228,7 +228,7 @@ def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         drill.publish(seed=2)
         version, note = robot.ready()
         assert version == 2
-        assert "version 2 goes on: freeze: " in note
+        assert "version 2 stays active: freeze: " in note
         result = CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)])
         assert result.exit_code == 1
         assert "root: expired: robots take no new map" in result.output

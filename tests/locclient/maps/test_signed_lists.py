@@ -127,7 +127,7 @@ def test_row_1_a_forged_wanted_and_map(world: World) -> None:
     world.attacker()
     ready = world.client().ready()
     assert (ready.wanted.version, running(world.client())) == (2, 2)
-    assert "version 2 goes on: signature: " in ready.note
+    assert "version 2 stays active: signature: " in ready.note
     with pytest.raises(UntrustedError, match=r"^signature: "):
         fresh = world.client("fresh")
         fresh.fetch(fresh.wanted())
@@ -176,7 +176,7 @@ def test_row_4_a_thief_of_the_online_key(world: World, attempt: str) -> None:
     repository._sign("timestamp", Timestamp(version=99, snapshot_meta=MetaFile(99)), online)
     note = client.ready().note
     kind = {"old serial": "rollback", "unlisted": "rollback"}.get(attempt, "signature")
-    assert f"version 4 goes on: {kind}: " in note
+    assert f"version 4 stays active: {kind}: " in note
     assert running(client) == 4
     if attempt == "unlisted":
         assert world.client("victim", trusting=False).ready().wanted.version == 1  # the control
@@ -200,7 +200,7 @@ def test_row_10_mondays_folder_on_tuesday(world: World) -> None:
     shutil.copytree(world.folder / "monday", world.trust_folder)
     want(world, 1)
     ready = client.ready()
-    assert "version 3 goes on: rollback: " in ready.note
+    assert "version 3 stays active: rollback: " in ready.note
     assert victim.ready().wanted.version == running(victim) == 1  # the control: without lists Tuesday is forgotten
     late = world.client("late")  # and lists cannot tell a robot that never saw Tuesday
     assert late.ready().wanted.version == 1
@@ -213,7 +213,7 @@ def test_an_operators_rollback_works(world: World) -> None:
     releases.roll_back(world.store, SITE)
     assert client.ready().wanted.version == 2
     want(world, 3)
-    assert "version 2 goes on: signature: version 3 " in client.ready().note
+    assert "version 2 stays active: signature: version 3 " in client.ready().note
 
 
 def test_row_12_news_are_held_back(world: World) -> None:
@@ -223,7 +223,7 @@ def test_row_12_news_are_held_back(world: World) -> None:
     world.ahead_s = 31 * 3600.0
     want(world, 1)
     ready = client.ready()
-    assert "version 2 goes on: freeze: " in ready.note
+    assert "version 2 stays active: freeze: " in ready.note
     assert client.word_hours == pytest.approx(31.0, abs=0.05)
     ready = world.client("victim", trusting=False).ready()  # the control: without lists no word is ever too old
     assert (ready.wanted.version, ready.note) == (1, "")
