@@ -131,7 +131,7 @@ def _moment(left: NDArray[np.uint8], landmarks_map: Array, estimates: Sequence[E
 def draw_dashboard() -> None:
     """Pages of a made-up hall: the fleet, a failure, the walk through it."""
     sys.path.insert(0, str(REPOSITORY / "tests"))
-    from support.fleet.dashboard_scene import serving, talking
+    from support.fleet.dashboard_scene import serving, talking, wait_until
     from support.pages.browser import running_chromium
     from support.storage.operator_scene import fill_shift
 
@@ -149,11 +149,11 @@ def draw_dashboard() -> None:
         for name, path in {"dashboard": "", "failure": "failures/15", "walk": "space?x=20&y=14"}.items():
             page.goto(f"{served.http}/dashboard/{path}", timeout=90_000)
             if name == "walk":
-                page.wait_for_function("document.querySelector('.expected img')?.naturalWidth === 320", timeout=90_000)
+                wait_until(page, "document.querySelector('.expected img').naturalWidth === 320", within_s=90.0)
             page.wait_for_timeout(4000)
             page.screenshot(path=str(folder / f"{name}.png"))
     for name in ("dashboard", "failure", "walk"):
-        small = Pillow.open(folder / f"{name}.png").convert("P", palette=Pillow.Palette.ADAPTIVE, colors=64)
+        small = Pillow.open(folder / f"{name}.png").convert("P", palette=Pillow.Palette.ADAPTIVE, colors=128)
         small.save(HERE / f"{name}.png", optimize=True)
 
 

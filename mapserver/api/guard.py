@@ -1,14 +1,8 @@
-"""The guard around the whole server, its mounted pages and their socket: host names, pages from elsewhere, who asks, headers. Plain ASGI.
+"""The guard around the whole server and its mounted pages: host names, pages from elsewhere, who asks, headers. Plain ASGI.
 
 Every request but those of `_OPEN` needs a scope, where sign-in is on; what is not named here needs the strongest that its method may be.
 """
 
-import base64
-import gzip
-import hashlib
-import logging
-import re
-import secrets
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any
@@ -28,13 +22,12 @@ from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
 from mapserver.store import Actor
 
-_log = logging.getLogger(__name__)
-
 SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
-_SOCKET = "/_nicegui_ws/"
-_LEVEL = 5
-_SCRIPT = re.compile(rb"<script\b(?![^>]*\bnonce=)")
+_POLICY = (
+    b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
+    b"form-action 'self'; frame-ancestors 'none'"
+)
 _FIXED = [
     (b"x-content-type-options", b"nosniff"),
     (b"referrer-policy", b"same-origin"),
@@ -50,14 +43,13 @@ class GuardSettings:
     """What the guard knows of a server.
 
     names: host names that it goes by, beside localhost and addresses. operators: who may sign in; None: those of the application's store.
-    must_sign_in: also before anybody is named. handlers: code of the event handlers in its pages. warning: a sentence for every page.
+    must_sign_in: also before anybody is named. warning: a sentence for every page.
     proxy: who signs people in in front of the server, too; None: passwords alone.
     """
 
     names: frozenset[str] = frozenset()
     operators: Operators | None = None
     must_sign_in: bool = False
-    handlers: tuple[str, ...] = ()
     warning: str = ""
     proxy: SignInProxy | None = None
 
@@ -73,22 +65,6 @@ class GuardSettings:
         session = cookie_parser(headers.get("cookie", "")).get(cookie_name(scope), "")
         who = self.operators.identify(session, headers.get("authorization", ""), address_of(scope), uses=uses)
         return who or (None if self.proxy is None else self.proxy.identify(scope, address_of(scope)))
-
-    def acting(self, request: Request, typed: str, reason: str) -> Actor:
-        """Who acts by a page that was opened with `request`, asked anew; typed: the name where nobody signs in.
-
-        Raises HTTPException for a session that has ended or may not change anything.
-        """
-        if not self.is_sign_in_on:
-            return _typed(request, typed, reason)
-        who = self.identify(request.scope)
-        if who is None:
-            raise HTTPException(401, "your session has ended; load the page again and sign in")
-        if Right.CHANGE not in who.scopes:
-            raise HTTPException(
-                403, f"{who.name} is a {who.role} and may not change versions; an admin can change that"
-            )
-        return who.actor(reason)
 
 
 def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
@@ -129,37 +105,21 @@ class Guard:
 
     def __init__(self, app: ASGIApp, settings: GuardSettings) -> None:
         self._app, self._settings = app, settings
-        hashes = (base64.b64encode(hashlib.sha256(code.encode()).digest()).decode() for code in settings.handlers)
-        self._hashes = " ".join(f"'sha256-{digest}'" for digest in hashes)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in {"http", "websocket"}:
+        if scope["type"] == "websocket":  # nothing here speaks it
+            await receive()
+            return await send({"type": "websocket.close", "code": 4403})
+        if scope["type"] != "http":
             return await self._app(scope, receive, send)
         refusal = self._refused_place(scope) or await to_thread.run_sync(self._refused_person, scope)
-        if scope["type"] == "websocket":
-            if refusal is not None:
-                await receive()
-                return await send({"type": "websocket.close", "code": 4403})
-            return await self._app(scope, receive, send)
-        answer = _Answer(scope, send, self._hashes)
-        if refusal is not None:
-            return await refusal(scope, receive, answer.send)
-        is_gone = False
 
-        async def watched() -> Message:
-            nonlocal is_gone
-            message = await receive()
-            is_gone = is_gone or message["type"] == "http.disconnect"
-            return message
+        async def answer(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": _with_ours(scope, message["headers"])}
+            await send(message)
 
-        try:
-            await self._app(answer.scope, watched, answer.send)
-        except RuntimeError as error:
-            # Starlette's word for an answer that nobody waits for any more: a page that was closed while it loaded.
-            if not is_gone or str(error) != "No response returned.":
-                raise
-            _log.info("%s %r: whoever asked has left", scope["method"], scope["path"])
-        return None
+        return await (refusal or self._app)(scope, receive, answer)
 
     def _refused_place(self, scope: Scope) -> Response | None:
         """Refuses other names of the server (DNS rebinding) and requests that pages from elsewhere send."""
@@ -167,7 +127,7 @@ class Guard:
         host = headers.get("host", "").lower()
         if not self._is_ours(host):
             return _refuse(scope, 403, f"this server is not called {host[:80]!r}; name it with --http-name")
-        if scope["type"] == "http" and scope["method"] in {"GET", "HEAD", "OPTIONS"} and _SOCKET not in scope["path"]:
+        if scope["method"] in {"GET", "HEAD", "OPTIONS"}:
             return None
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
         if site not in {None, "same-origin", "none"} or (origin is not None and _netloc(origin) != host):
@@ -198,78 +158,29 @@ class Guard:
                 scope, 403, f"none of the groups of {name} has a role here; --sign-in-group gives one a role"
             )
         if who is None:
-            if scope["type"] == "http" and scope["method"] == "GET" and _wants_page(scope):
+            if scope["method"] == "GET" and "text/html" in _headers(scope).get("accept", ""):
                 asked = scope["path"] + (f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else "")
                 return RedirectResponse(f"{SIGN_IN}?next={quote(asked, safe='')}", 303)
             return _refuse(scope, 401, "sign in, or show a token that has not ended", {"WWW-Authenticate": "Bearer"})
         if right not in who.scopes:
             words = f"this needs the right to {right.value!r}, which {who.name} ({who.role}) does not have"
             if self._settings.operators is not None:
-                self._settings.operators.note(
-                    "refused", f"{scope.get('method', 'socket')} {scope['path'][:200]!r}", who.actor()
-                )
+                self._settings.operators.note("refused", f"{scope['method']} {scope['path'][:200]!r}", who.actor())
             return _refuse(scope, 403, words)
         scope.setdefault("state", {})["operator"] = who
         return None
 
 
-class _Answer:
-    """The way back of one answer: headers, and in pages a number used once in front of each script."""
-
-    def __init__(self, scope: Scope, send: Send, hashes: str) -> None:
-        self._send, self._hashes, self._nonce = send, hashes, secrets.token_urlsafe(16)
-        self._is_secure, self._is_private = _is_secure(scope), "operator" in scope.get("state", {})
-        self._start: Message | None = None
-        self._body = b""
-        # The pages' own compression comes first, and scripts could not be found in what it makes.
-        self.scope, self._may_compress = scope, False
-        if _wants_page(scope):
-            self._may_compress = "gzip" in _headers(scope).get("accept-encoding", "")
-            kept = [(name, value) for name, value in scope["headers"] if name != b"accept-encoding"]
-            self.scope = {**scope, "headers": kept}
-
-    async def send(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            message = {**message, "headers": self._added(message["headers"])}
-            if dict(message["headers"]).get(b"content-type", b"").startswith(b"text/html"):
-                self._start = message
-                return
-        elif message["type"] == "http.response.body" and self._start is not None:
-            self._body += message.get("body", b"")
-            if message.get("more_body"):
-                return
-            is_strict = not any(
-                b"'nonce-" in value for name, value in self._start["headers"] if name == b"content-security-policy"
-            )
-            body = self._body if is_strict else _SCRIPT.sub(b'<script nonce="%s"' % self._nonce.encode(), self._body)
-            if body and self._may_compress:
-                body = gzip.compress(body, _LEVEL)
-                self._start["headers"] += [(b"content-encoding", b"gzip"), (b"vary", b"Accept-Encoding")]
-            headers = [(name, value) for name, value in self._start["headers"] if name != b"content-length"]
-            # An answer to HEAD has the length of a body that is not there.
-            headers = [*headers, (b"content-length", b"%d" % len(body))] if body else self._start["headers"]
-            await self._send({**self._start, "headers": headers})
-            self._start, message = None, {"type": "http.response.body", "body": body}
-        await self._send(message)
-
-    def _added(self, headers: Any) -> list[tuple[bytes, bytes]]:
-        fixed = [*_FIXED, *([(b"strict-transport-security", b"max-age=31536000")] if self._is_secure else [])]
-        names = {name for name, _ in fixed}
-        kept = [(name.lower(), value) for name, value in headers if name.lower() not in names]
-        if self._is_private:
-            kept = [(n, v.replace(b"public", b"private") if n == b"cache-control" else v) for n, v in kept]
-        if b"content-security-policy" not in dict(kept):  # pictures have a stricter one
-            kept.append((b"content-security-policy", self._policy().encode()))
-        return kept + fixed
-
-    def _policy(self) -> str:
-        """NiceGUI compiles templates and handlers in the browser, hence 'unsafe-eval'; what is written into a page does not run."""
-        hashes = f" 'unsafe-hashes' {self._hashes}" if self._hashes else ""
-        return (
-            f"default-src 'none'; script-src 'self' 'nonce-{self._nonce}' 'unsafe-eval'{hashes}; "
-            "style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src 'self' data:; connect-src 'self'; base-uri 'none'; "
-            "form-action 'self'; frame-ancestors 'none'; object-src 'none'; manifest-src 'self'"
-        )
+def _with_ours(scope: Scope, headers: Any) -> list[tuple[bytes, bytes]]:
+    """The headers of an answer with those that all have; pictures have a stricter policy of their own."""
+    fixed = [*_FIXED, *([(b"strict-transport-security", b"max-age=31536000")] if _is_secure(scope) else [])]
+    names = {name for name, _ in fixed}
+    kept = [(name.lower(), value) for name, value in headers if name.lower() not in names]
+    if "operator" in scope.get("state", {}):
+        kept = [(n, v.replace(b"public", b"private") if n == b"cache-control" else v) for n, v in kept]
+    if b"content-security-policy" not in dict(kept):
+        kept.append((b"content-security-policy", _POLICY))
+    return kept + fixed
 
 
 def _needed(scope: Scope) -> Right | None:
@@ -278,13 +189,11 @@ def _needed(scope: Scope) -> Right | None:
         return None
     if path == "/metrics":
         return Right.METRICS
-    # Acts of the pages come by the socket and are asked for one by one.
-    is_reading = scope["type"] == "websocket" or scope["method"] in {"GET", "HEAD", "OPTIONS"}
-    return Right.READ if is_reading or _SOCKET in path else Right.CHANGE
+    return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
 
 
 def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | None = None) -> Response:
-    is_read = scope.get("method", "GET") in {"GET", "HEAD"}
+    is_read = scope["method"] in {"GET", "HEAD"}
     more = {} if is_read else {"Connection": "close"}  # the body is not read
     return problem(status, words, scope["path"], {**(headers or {}), **more})
 
@@ -300,9 +209,5 @@ def _netloc(origin: str) -> str:
         return ""
 
 
-def _wants_page(scope: Scope) -> bool:
-    return scope["type"] == "http" and "text/html" in _headers(scope).get("accept", "")
-
-
 def _is_secure(scope: Scope) -> bool:
-    return scope.get("scheme") in {"https", "wss"}
+    return scope.get("scheme") == "https"

@@ -10,7 +10,7 @@ from mapserver.api.guard import SIGN_IN
 from mapserver.api.problems import problem
 from mapserver.serving.http_connections import MAX_HEAD_BYTES
 
-MAX_BODY_BYTES = 1 << 20  # an act has some hundred bytes; the pages' socket falls back to posts of less than this
+MAX_BODY_BYTES = 1 << 20  # an act has some hundred bytes
 SIGN_IN_BYTES = 4 << 10  # anybody may send one
 BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is there
 
@@ -25,18 +25,13 @@ class RequestLimits:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in {"http", "websocket"}:
+        if scope["type"] != "http":
             return await self._app(scope, receive, send)
         if "://" in scope["path"][:8]:  # the absolute form of an address, which h11 leaves as it is
             scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
             scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
         head_bytes = len(scope["raw_path"]) + len(scope["query_string"])
         head_bytes += sum(len(name) + len(value) + 4 for name, value in scope["headers"])
-        if scope["type"] == "websocket":
-            if head_bytes > MAX_HEAD_BYTES:
-                await receive()
-                return await send({"type": "websocket.close", "code": 4431})
-            return await self._app(scope, receive, send)
         is_sign_in = scope["path"] == SIGN_IN
         most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if is_sign_in else (MAX_BODY_BYTES, BODY_S)
         too_large = 413, f"the body has more than {most_bytes} bytes"

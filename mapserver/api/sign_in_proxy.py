@@ -74,7 +74,7 @@ class ProxiedPeople:
         self._app, self._proxy = app, proxy
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] in {"http", "websocket"}:
+        if scope["type"] == "http":
             named = [
                 (name, value.decode("latin-1").strip()) for name, value in scope["headers"] if name in (USER, GROUPS)
             ]

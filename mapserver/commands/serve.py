@@ -104,7 +104,6 @@ class HttpOptions:
 
         UsageError where the server must not be reached like this."""
         from mapserver.api.guard import GuardSettings
-        from mapserver.dashboard.layout import HANDLERS
         from mapserver.operators.operators import Operators
         from mapserver.serving.http_connections import binding_fault, is_loopback_name
 
@@ -120,7 +119,6 @@ class HttpOptions:
             names=frozenset(names),
             operators=Operators(store),
             must_sign_in=proxy is not None or (not fault and not is_loopback_name(host)),
-            handlers=HANDLERS,
             warning=(_NO_TLS if has_operators else _INSECURE) if fault else warning,
             proxy=proxy,
         )
@@ -196,7 +194,6 @@ def _run(
     from fleetmap.threads import ended_by_threads
     from mapserver.api.app import create_app
     from mapserver.api.metrics import Metrics
-    from mapserver.api.request_limits import MAX_BODY_BYTES
     from mapserver.api.sign_in_proxy import ProxiedPeople
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
@@ -255,7 +252,7 @@ def _run(
         log_level="error",  # each request that is none would be a warning
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
-        ws_max_size=MAX_BODY_BYTES,
+        ws="none",
         proxy_headers=False,
         ssl_certfile=None if certificate is None else certificate.certificate,
         ssl_keyfile=None if certificate is None else certificate.key,

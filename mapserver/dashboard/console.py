@@ -5,11 +5,12 @@ now and then is fetched anew by `static/renew.js`. Acts are requests to the HTTP
 """
 
 import asyncio
-from base64 import b64encode
-from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass
-from hashlib import sha256
+import time
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from typing import TypeVar
 
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, StreamingResponse
@@ -18,23 +19,84 @@ from markupsafe import Markup
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, UsageError
-from mapserver.api.guard import SIGN_IN
-from mapserver.api.moments import zone_of
-from mapserver.dashboard.layout import LOOK_COOKIE, PAGES, ZONE_COOKIE, PageContext, Services, check_query, load, person
+from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
+from mapserver.api.moments import moment_text, read_moment, read_range, zone_of
+from mapserver.dashboard.data import MapData
+from mapserver.dashboard.fleet_health import HealthData
+from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
-from mapserver.dashboard.rendering import TEMPLATES
+from mapserver.dashboard.rendering import TEMPLATES, address, age
+from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.operators.roles import Scope
+from mapserver.serving.live_surveys import LiveSurveys
+
+T = TypeVar("T")
 
 PATH = "/dashboard"
-_HERE = Path(__file__).parent
+PAGES = {"": "Overview", "trends": "Trends", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
+_UNDER = {"space": "map", "robots": ""}  # which of those leads to other pages
+_LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
+_WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0
-_MODULES = {"leaflet": "leaflet/leaflet.js", "three": "three/three.module.min.js", "three/addons/": "three/"}
 _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
-# {}: the hash of the import map, the one script within a page.
-_POLICY = (
-    "default-src 'none'; script-src 'self' 'sha256-{}'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
-    "form-action 'self'; frame-ancestors 'none'"
-)
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way."""
+
+    maps: MapData
+    health: HealthData
+    robots: LiveRobots
+    guard: GuardSettings
+    surveys: LiveSurveys
+
+
+@dataclass(frozen=True, slots=True)
+class PageContext:
+    """The site that is shown; root: prefix of all addresses; zone: the browser's, None: the server's own."""
+
+    root: str
+    site: str
+    zone: tzinfo | None = None
+    query: Mapping[str, str] = field(default_factory=dict)
+
+    def moment(self, stamp_ns: int | None) -> str | None:
+        """A stamp of the server's clock by the clock of whoever looks."""
+        return moment_text(stamp_ns, self.zone)
+
+    def when(self, moment: int | str) -> Markup:
+        """How long ago a stamp of the server's clock or ISO 8601 text is, and where the pointer is the moment."""
+        stamp_ns = moment if isinstance(moment, int) else read_moment(moment, "time", UTC) or 0
+        words = f"{age(max(0.0, time.time() - stamp_ns / 1e9))} ago"
+        return Markup('<time title="{}">{}</time>').format(self.moment(stamp_ns), words)
+
+    def time_range(self) -> tuple[int | None, int | None]:
+        """`since` and `until` of the address; UsageError for what is no time."""
+        return read_range(self.query.get("since"), self.query.get("until"), self.zone)
+
+    def range_fields(self) -> list[tuple[str, str, str]]:
+        """Label, name and value of the fields to choose that range by."""
+        since, until = ("" if ns is None else self.written(ns) for ns in self.time_range())
+        return [("From", "since", since), ("Until", "until", until)]
+
+    def range_presets(self) -> list[tuple[str, str]]:
+        """Ranges of one click: their words and `since`."""
+        now_ns = time.time_ns()
+        hour, today, week = self.written(now_ns - HOUR_NS), self.written(now_ns)[:10], self.written(now_ns - _WEEK_NS)
+        return [("Last hour", hour), ("Today", today), ("Last 7 days", week)]
+
+    def written(self, stamp_ns: int) -> str:
+        """A stamp as `since` and `until` of an address take it, to the minute."""
+        return f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC).astimezone(self.zone):%Y-%m-%dT%H:%M}"
+
+    def to(self, path: str, **query: object) -> str:
+        """The address of a page of the same site."""
+        return address(f"{self.root}/{path}", site=self.site, **query)
+
+    def plan_picture(self, version: int) -> str:
+        """The address of the picture of a version's plan."""
+        return f"{self.root}/plans/{self.site}/{version}.png"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +108,7 @@ class Console:
 
     def files(self) -> None:
         """Adds what all pages load."""
-        self.app.mount("/static", StaticFiles(directory=_HERE / "static"))
+        self.app.mount("/static", StaticFiles(directory=Path(__file__).parent / "static"))
 
     def nothing_else(self) -> None:
         """Adds the page for addresses that no page has."""
@@ -77,7 +139,8 @@ class Console:
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> HTMLResponse:
             """A page."""
-            return await self._shown(request, path.partition("/")[0], template, fill, knows, under_way)
+            page = path.partition("/")[0]
+            return await self._shown(request, _UNDER.get(page, page), template, fill, knows, under_way)
 
     def stream(
         self,
@@ -95,9 +158,8 @@ class Console:
         async def followed(request: Request, site: str) -> StreamingResponse:
             """A stream of server-sent events."""
             chosen = site if site in await load(under_way) else await load(self.services.maps.chosen_site, site)
-            context = PageContext(
-                _root(request), "", chosen, zone_of(request.cookies.get(ZONE_COOKIE)), request.query_params
-            )
+            zone = zone_of(request.cookies.get(_ZONE_COOKIE))
+            context = PageContext(_root(request), chosen, zone, request.query_params)
             guard = self.services.guard
 
             def event() -> bytes:
@@ -133,33 +195,49 @@ class Console:
             if site not in growing:
                 site = growing[0] if site is None and growing else await load(self.services.maps.chosen_site, site)
             check_query(request, knows)
-            zone = zone_of(request.cookies.get(ZONE_COOKIE))
-            context = PageContext(root, page, site, zone, request.query_params)
+            zone = zone_of(request.cookies.get(_ZONE_COOKIE))
+            context = PageContext(root, site, zone, request.query_params)
             found = {"context": context} | await load(lambda: fill(context, **request.path_params))
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
             site = site if site in sites else None  # links lead somewhere
-        files = {name: f"{root}/static/vendor/{file}" for name, file in _MODULES.items()}
-        imports = to_json({"imports": files}).decode()
-        look, who = request.cookies.get(LOOK_COOKIE, ""), getattr(request.state, "operator", None)
+        look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
             "api": f"{root.removesuffix(PATH)}/v1",
-            "imports": Markup(imports),
             "pages": PAGES,
             "page": page,
             "sites": sites,
             "site": site,
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),
-            "person": person(request),
+            "person": who,
+            "sign_out": SIGN_OUT,
             "may_change": who is None or Scope.CHANGE in who.scopes,
-            "is_named": who is not None,
             "warning": self.services.guard.warning,
         }
-        policy = _POLICY.format(b64encode(sha256(imports.encode()).digest()).decode())
-        filled = TEMPLATES.get_template(template).render(frame | found)
-        return HTMLResponse(filled, status, {"Content-Security-Policy": policy})
+        return HTMLResponse(TEMPLATES.get_template(template).render(frame | found), status)
+
+
+async def load(function: Callable[..., T], *arguments: object) -> T:
+    """Result of a blocking function, computed on another thread."""
+    return await asyncio.to_thread(function, *arguments)
+
+
+def check_query(request: Request, knows: Sequence[str]) -> None:
+    """Raises UsageError for a query parameter beside `site` and those that a page knows."""
+    unknown = [name for name in request.query_params if name not in {"site", *knows}]
+    if unknown:
+        raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {', '.join(('site', *knows))}")
+
+
+def number(text: str | None, name: str) -> int | None:
+    """A number of the query string, None if it is empty; UsageError for other text."""
+    if text is None or text == "":
+        return None
+    if not text.isascii() or not text.isdecimal() or len(text) > 12:
+        raise UsageError(f"{name} {text[:40]!r} is not a number; choose one from the list")
+    return int(text)
 
 
 def scene_of(

@@ -8,10 +8,9 @@ from math import hypot
 
 from fleetmap.messages import FailureReport
 from mapserver.dashboard import failure_story as story
-from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES
-from mapserver.dashboard.layout import PageContext, Services, number
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.store import FailureFilter, FailureRow
 

@@ -8,11 +8,9 @@ from datetime import UTC, datetime
 from typing import NamedTuple
 
 from fleetmap.messages import Cause, FailureKind
-from mapserver.dashboard.console import Console, scene_of
-from mapserver.dashboard.data import EVER
+from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
-from mapserver.dashboard.layout import PageContext, Services, number
-from mapserver.dashboard.map_layers import Box, Layer, Mark, box_of, heat
+from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.store import FailureFilter, FailureRow
 
 _AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
@@ -87,7 +85,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     return {
         "answer": _answer(matching),
         "is_chosen": any(kept.values()),
-        "range": context.range_form("failures", usual="All", chosen=chosen),
+        "chosen": chosen,
         "facets": facets,
         "shades": shades,
         "advice": ADVICE,
@@ -203,13 +201,6 @@ def failure_marks(context: PageContext, shown: Sequence[FailureRow]) -> list[Mar
             words, to_failure = f"failure {row.number}: {row.robot}, {row.cause}", context.to(f"failures/{row.number}")
             found.append(Mark(row.x_map_m, row.y_map_m, tone_of(row), "cross", words, to_failure))
     return found
-
-
-def failure_heat(services: Services, context: PageContext, box: Box) -> Layer:
-    """Where failures of the range in the address are dense, without one those of the last days; not shown until it is chosen."""
-    span_ns = context.time_range()
-    name = "Failures of the last days" if span_ns == EVER else "Failures of the chosen time"
-    return Layer(name, heat(services.health.places(context.site, *span_ns), box), shown=False)
 
 
 def tone_of(row: FailureRow) -> str:

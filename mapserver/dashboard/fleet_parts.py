@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from mapserver.dashboard.markup import share
+from mapserver.dashboard.rendering import share
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure

@@ -8,8 +8,7 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
 from fleetmap.messages import encode_message
-from mapserver.dashboard.console import Console
-from mapserver.dashboard.layout import PageContext
+from mapserver.dashboard.console import Console, PageContext
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.serving.live_surveys import LiveSurvey, LiveSurveys

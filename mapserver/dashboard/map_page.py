@@ -6,12 +6,11 @@ from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import UsageError
-from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
-from mapserver.dashboard.layout import PageContext, Services, number
 from mapserver.dashboard.map_layers import Layer, Outline, box_of, heat, squares
-from mapserver.dashboard.markup import share, size
 from mapserver.dashboard.plan import Plan
+from mapserver.dashboard.rendering import share, size
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
@@ -104,7 +103,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "one_way": one_way(plan, maps.areas(site)),
         "changes": changes,
         "requests": requests,
-        "range": context.range_form("map", usual="Last 14 days", chosen={"version": asked}),
+        "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }

@@ -5,14 +5,13 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 import time
 
 from mapserver.dashboard import fleet_parts
-from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.console import Console, PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Bars, Figure
-from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.markup import age, share
+from mapserver.dashboard.rendering import age, share
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telling
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
@@ -167,7 +166,6 @@ def _trends(services: Services, context: PageContext) -> dict[str, object]:
     ]
     cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
     return {
-        "range": context.range_form("trends", usual="Last 24 h"),
         "tried": fleet_parts.trials_shown(health.trials, context.moment),
         "kpis": figures,
         "areas": health.areas,

@@ -1,13 +1,44 @@
 """The templates of all pages, in `templates/`: what they are given is escaped, and a name that is not given is an error."""
 
 from pathlib import Path
+from urllib.parse import urlencode
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
-from mapserver.dashboard.markup import age, share
 from mapserver.fleet_statistics.kpis import Rate, driven_words, format_rate
+
+
+def address(path: str, **query: object) -> str:
+    """`path` with the query parameters that are not empty."""
+    given = {name: value for name, value in query.items() if value is not None and value != ""}
+    return f"{path}?{urlencode(given)}" if given else path
+
+
+def size(number: int | None) -> str | None:
+    """Bytes with a unit."""
+    if number is None:
+        return None
+    value = float(number)
+    for unit in ("B", "kB", "MB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.2f} GB"
+
+
+def share(value: float | None) -> str | None:
+    """A share in percent."""
+    return None if value is None else f"{100 * value:.1f} %"
+
+
+def age(seconds_s: float) -> str:
+    """How long ago."""
+    for limit_s, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172_800, 3600, "h")):
+        if seconds_s < limit_s:
+            return f"{seconds_s / unit_s:.0f} {unit}"
+    return f"{seconds_s / 86400:.0f} days"
 
 
 def script_json(value: object) -> Markup:

@@ -3,13 +3,12 @@
 import time
 
 from fleetmap.errors import UsageError
-from mapserver.dashboard.console import Console, scene_of
+from mapserver.dashboard.console import Console, PageContext, Services, scene_of
 from mapserver.dashboard.failures import failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
-from mapserver.dashboard.layout import PageContext, Services
 from mapserver.dashboard.live import LiveRobot
 from mapserver.dashboard.map_layers import Layer
-from mapserver.dashboard.markup import age
+from mapserver.dashboard.rendering import age
 from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter
@@ -80,7 +79,6 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
         "now": _now(services, context, robot),
         "scene": drawn,
         "version": version,
-        "range": context.range_form(f"robots/{robot.name}", usual="Last 24 h"),
         "at": lambda ns: round(100 * (ns - since_ns) / span_ns, 3),
         "ticks": [since_ns + n * span_ns // (_TICKS - 1) for n in range(_TICKS)],
         "is_day": span_ns <= 1.5 * _USUAL_NS,

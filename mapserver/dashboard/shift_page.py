@@ -8,8 +8,7 @@ from markupsafe import Markup
 from mapserver.api.moments import moment_text
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Bar, Bars, Figure
-from mapserver.dashboard.markup import share
-from mapserver.dashboard.rendering import TEMPLATES
+from mapserver.dashboard.rendering import TEMPLATES, share
 from mapserver.fleet.shift_summary import FleetSummary
 from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, format_rate, is_telling
 

@@ -3,8 +3,7 @@
 import math
 
 from fleetmap.errors import StateError, UsageError
-from mapserver.dashboard.console import Console, scene_of
-from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.map_layers import Layer
 from mapserver.dashboard.space.points import COARSEST_M, FINEST_M
 from mapserver.dashboard.space.robot_views import robot_views

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from mapserver.dashboard.console import Console, scene_of
-from mapserver.dashboard.layout import PageContext, Services, number
+from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
 from mapserver.dashboard.space.loops import Loop, builds_of, dicts, loops_of
 from mapserver.store import JobInfo
@@ -54,7 +53,6 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,
-        "range": context.range_form("surveys", usual="All jobs"),
         "jobs": [(job, _state(job), _progress(job)) for job in jobs],
         "chosen": chosen,
     }

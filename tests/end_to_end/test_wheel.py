@@ -80,7 +80,7 @@ print(json.dumps({plain(d.metadata["Name"]): [r.replace('"', "'") for r in d.req
     assert set(installed) <= needed
     asked = {re.split(r"[^\w.-]", r, maxsplit=1)[0].lower() for r in installed["fleetmap"] if "extra == 'server'" in r}
     assert len(asked - set(installed)) >= 10
-    assert {"fastapi", "gtsam", "scipy", "nicegui"} <= asked - set(installed)
+    assert {"fastapi", "gtsam", "scipy", "jinja2"} <= asked - set(installed)
 
 
 @pytest.mark.parametrize("program", ["mapserver", "locclient", "fleetsim"])

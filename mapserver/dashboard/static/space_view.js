@@ -1,6 +1,5 @@
 // A version in three dimensions, and a walk along the places of its surveys. Words of robots are painted as text, never markup.
-import * as THREE from "three";
-import { OrbitControls } from "three/addons/OrbitControls.js";
+import * as THREE from "./vendor/three/three.js";
 import "./maps.js";
 import { follow } from "./stream.js";
 
@@ -377,7 +376,7 @@ async function begin() {
   } catch {
     throw new Error("This browser draws nothing in three dimensions (WebGL is off); the map page shows the same from above.");
   }
-  controls = new OrbitControls(camera, canvas);
+  controls = new THREE.OrbitControls(camera, canvas);
   controls.maxPolarAngle = 0.495 * Math.PI;
   await fetchMap();
   drawMap();

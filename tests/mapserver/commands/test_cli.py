@@ -26,7 +26,7 @@ from support.storage.map_samples import draft_details, random_tile, save_sample_
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 HEAVY = ("numpy", "cv2", "scipy", "gtsam", "matplotlib", "zenoh", "fastapi", "rich.progress", "msgspec")
-HEAVY += ("nicegui", "starlette", "pydantic", "distributed", "dask", "mcap", "sqlite_utils", "tuf", "securesystemslib")
+HEAVY += ("jinja2", "starlette", "pydantic", "distributed", "dask", "mcap", "sqlite_utils", "tuf", "securesystemslib")
 
 
 def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:

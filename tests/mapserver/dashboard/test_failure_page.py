@@ -18,7 +18,7 @@ from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.dashboard import failure_story as story
 from mapserver.dashboard import failures
-from mapserver.dashboard.layout import PageContext
+from mapserver.dashboard.console import PageContext
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.store import FailureDetail, FailureRow, MapStore, PictureRow
@@ -121,7 +121,7 @@ def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
 
 def test_causes_over_time_are_all_in_the_bars_and_a_bar_leads_to_its_time() -> None:
     query = {"since": "2026-09-21T16:13", "until": "2026-10-05T00:00", "robot": "r"}
-    context = PageContext("", "failures", SITE, ZoneInfo("Africa/Cairo"), query)
+    context = PageContext("", SITE, ZoneInfo("Africa/Cairo"), query)
     found = [("dark", 0), ("dark", 0), ("glare", 0), ("new", 1), ("dark", 13)]
     rows = [replace(detail().failure, cause=cause, happened_ns=AT_NS + day * 24 * HOUR_NS) for cause, day in found]
     chart = failures._chart(context, rows, {"dark": 0, "glare": 1}, {"robot": "r"})

@@ -331,7 +331,7 @@ def wait_until(page: Page, expression: str, arg: object = None, *, within_s: flo
 
 
 def opened(page: Page, served: Served, path: str, **query: object) -> Seen:
-    """Opens a page and waits until it is live."""
+    """Opens a page and waits until it is there."""
     seen = watch(page)
     asked = "&".join(f"{name}={value}" for name, value in query.items())
     page.goto(f"{served.http}/dashboard/{path}?{asked}")

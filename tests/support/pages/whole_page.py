@@ -21,7 +21,7 @@ WEAKEST_CONTRAST = """() => {
   let weakest = [21, ''];
   for (const node of document.querySelectorAll('body *')) {
     const words = [...node.childNodes].some(child => child.nodeType === 3 && child.textContent.trim());
-    if (!words || !node.checkVisibility() || node.closest('svg, style, script, .nicegui-error-popup')) continue;
+    if (!words || !node.checkVisibility() || node.closest('svg, style, script')) continue;
     const behind = ground(node), ink = numbers(getComputedStyle(node).color), share = ink[3] ?? 1;
     const seen = ink.slice(0, 3).map((v, n) => share * v + (1 - share) * behind[n]);
     const [a, b] = [light(seen), light(behind)].sort((one, other) => one - other);

@@ -1,5 +1,5 @@
 // The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports.
-import * as L from "leaflet";
+import * as L from "../vendor/leaflet/leaflet.js";
 import { Axes, Marks, MarkSet, Trails, words } from "./marks.js";
 
 const POINTS_PER_NAME_PX = 7;

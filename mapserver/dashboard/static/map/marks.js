@@ -1,5 +1,5 @@
 // What maps paint on canvases: axes, and the marks of all layers. Hundreds of marks that move cost a browser less than as many elements.
-import * as L from "leaflet";
+import * as L from "../vendor/leaflet/leaflet.js";
 
 const SHAPES = {
   circle: new Path2D("M-5 0a5 5 0 1 0 10 0a5 5 0 1 0-10 0Z"),
