@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Pictures of a running dashboard, for people who are not at the machine: fleet.png and map.png.
+# Screenshots of a running dashboard: fleet.png and map.png.
 #
 #   deploy/dashboard_pictures.sh HTTP OUT SITE
 #
-# HTTP: address of the server. Without Chromium or Chrome it says so and ends well.
+# HTTP: address of the server. Without Chromium or Chrome it prints a note and exits with status 0.
 set -euo pipefail
 http=$1 out=$2 site=$3
 WITHIN_S=30
@@ -13,14 +13,14 @@ for name in chromium chromium-browser google-chrome; do
   if browser=$(command -v "$name"); then break; fi
 done
 if [[ -z $browser ]]; then
-  printf 'No picture of the dashboard was taken: there is no chromium here. See it with: mapserver serve --store %s/store\n' "$out"
+  printf 'No picture of the dashboard was taken: chromium is not installed. See it with: mapserver serve --store %s/store\n' "$out"
   exit 0
 fi
 
 profile=$(mktemp -d)
 trap 'rm -rf "$profile"' EXIT
 options=(--headless=new --hide-scrollbars --window-size=1280,1400 --user-data-dir="$profile" --timeout=4000)
-# The browser's own sandbox cannot be had by root; it looks at nothing but the server of this demo.
+# The browser's sandbox is not available to root; it opens only the server of this demo.
 ((EUID != 0)) || options+=(--no-sandbox)
 for page in fleet map; do
   path=$page

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The whole path. Without a recording: a simulated warehouse is surveyed, mapped and served, and two robots of the next day, after
+# The whole workflow. Without a recording: a simulated warehouse is surveyed, mapped and served, and two robots of the next day, after
 # stock has moved, drive in it: their daemons (`locclient run`) play the recordings in real time as sensors, while the console is up, and
 # replays of the same recordings give the figures. With one: half of its frames become the map, the other half is localized in it.
 #
-#   deploy/demo.sh [--check] [RECORDING]      (run by `make demo`; --check looks at RECORDING and does nothing else)
+#   deploy/demo.sh [--check] [RECORDING]      (run by `make demo`; --check only checks RECORDING)
 #
-# BIN: folder with the commands (default .venv/bin). OUT: where everything is left (default out/demo). SEED: of the warehouse.
+# BIN: folder with the commands (default .venv/bin). OUT: output folder (default out/demo). SEED: of the warehouse.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -78,7 +78,7 @@ build() {
   printf 'http %s, zenoh %s\n' "$http" "$zenoh"
 }
 
-# A robot's daemon, with a recording in the place of its sensors; speed: 1 in real time, 0 as fast as it localizes.
+# Runs a robot's daemon on a recording instead of sensors; speed: 1 in real time, 0 as fast as possible.
 drive() {
   local robot=$1 recording=$2 speed=$3
   printf '[run]\nserver = "%s"\nsite = "demo"\nrobot = "%s"\ncache = "%s"\noutbox = "%s"\n[source]\nkind = "recording"\n' \
@@ -88,7 +88,7 @@ drive() {
   drive_pids+=("$!")
 }
 
-# All daemons have ended well, and no thread of theirs or of the server's died on the way.
+# Checks that all daemons have ended with success, and that no thread of theirs or of the server failed.
 drives_ended() {
   local number log
   for number in "${!drive_pids[@]}"; do
@@ -97,11 +97,11 @@ drives_ended() {
   for log in "$OUT"/*-run.log "$OUT/server.log"; do
     ! grep -q Traceback "$log" || { cat "$log" >&2; fail "something failed while it ran: see $log"; }
   done
-  say "what the server knows of the robots"
+  say "robots known to the server"
   "$BIN/python" deploy/demo_report.py robots "$http/v1/robots"
 }
 
-# Figures against the truth, from the store's folder: to the server the daemon reports. Status 6: it did not find itself; the table shows it.
+# Figures against ground truth, from the store's folder, as only the daemon reports to the server. Status 6: never localized; see the table.
 replay() {
   local robot=$1 status=0
   shift
@@ -118,7 +118,7 @@ record() {
 half_of() {
   local truth=()
   say "building a map of every second frame of $1"
-  # It may be too short or too straight to judge its own calibration, which is then taken as it is; the build says what was not judged.
+  # It may be too short or too straight to verify its own calibration, which is then used as it is; the build lists unverified parts.
   publish_options=(--trust-calibration --reason "a demo of one recording")
   [[ $("$BIN/python" deploy/demo_report.py has-truth "$1") == no ]] || truth=(--frame-from-ground-truth)
   build "$1" --frames 0::2 ${truth[@]+"${truth[@]}"}

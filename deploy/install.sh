@@ -1,10 +1,10 @@
 #!/bin/sh
-# Installs the wheel of this source folder with an extra into a new virtual environment: every library by its hash, without what only
-# its makers need (tests, debug symbols, pip itself). docs/install.md says what that saves.
+# Installs the wheel of this source folder with an extra into a new virtual environment: every library by its hash, without parts for
+# development (tests, debug symbols, pip itself). docs/install.md has the sizes.
 #   python3 -m pip wheel --no-deps --wheel-dir dist .
 #   deploy/install.sh dist/fleetmap-0.1.0-*.whl server /opt/fleetmap
-# LOCK: the list of libraries with their hashes, made by lock.sh where it does not exist (default: deploy/EXTRA.lock); keep it.
-# WHEELS: folder with wheels of your own, such as that of opencv.sh, which are taken before those of the index (default: dist/wheels).
+# LOCK: the list of libraries with their hashes, created by lock.sh if missing (default: deploy/EXTRA.lock); keep it.
+# WHEELS: folder with your own wheels, such as that of opencv.sh, which have priority over those of the index (default: dist/wheels).
 set -eu
 [ $# -eq 3 ] && [ -f "$1" ] && [ ! -e "$3/bin" ] || { echo "usage: deploy/install.sh WHEEL server|client FOLDER; FOLDER/bin must not exist; make the wheel with: python3 -m pip wheel --no-deps --wheel-dir dist ." >&2; exit 2; }
 here=$(dirname "$0")
@@ -30,7 +30,7 @@ pip --no-deps "$wheel"
 rm -rf "$folder"/lib/python*/site-packages/cv2/data/*.xml
 find "$folder"/lib/python*/site-packages/numpy -type d -name tests -prune -exec rm -rf {} +
 if command -v strip readelf >/dev/null; then
-  # Without the *.libs folders: what wheels bundle there was rewritten when they were made, and strip damages such files.
+  # Except the *.libs folders: their bundled libraries were rewritten when the wheels were built, and strip damages such files.
   find "$folder"/lib/python*/site-packages -name '*.so' ! -path '*.libs/*' | while read -r file; do
     ! readelf --sections "$file" | grep -q '\.symtab' || strip --strip-unneeded "$file"
   done

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Writes requirements.lock: every library of an installation with the hashes of the files that this machine's package index gave out now.
-# An index that later gives other bytes under the same version is then refused. Made by the deployer, because platforms and indexes
+# Writes requirements.lock: every library of an installation with the hashes of the files in this machine's package index now.
+# Other bytes under the same version are later refused. The deployer creates it, because platforms and indexes
 # differ; keep the file, and install every machine of that platform from it:
 #   deploy/lock.sh dist/fleetmap-0.1.0-*.whl server requirements.lock
 #   pip install --require-hashes --only-binary :all: -r requirements.lock

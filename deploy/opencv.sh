@@ -1,6 +1,6 @@
 #!/bin/sh
-# Builds OpenCV's wheel without what fleetmap does not use (video codecs, LAPACK, IPP, OpenCL, windows), once for a platform: some twenty
-# minutes of one core. deploy/install.sh takes it from that folder, also on robots that have no compiler. Keep the wheel: its source comes
+# Builds OpenCV's wheel without parts that fleetmap does not use (video codecs, LAPACK, IPP, OpenCL, windows), once per platform: about
+# 20 minutes on one core. deploy/install.sh takes it from that folder, also on robots without a compiler. Keep the wheel: its source comes
 # from the package index by version, its hash in the lock is that of your build.
 #   apt-get install g++ make nasm python3-dev python3-venv
 #   deploy/opencv.sh [FOLDER]      (default: dist/wheels)
@@ -10,13 +10,13 @@ folder=${1:-$here/../dist/wheels}
 for wheel in "$folder"/opencv_python_headless-*.whl; do
   [ ! -f "$wheel" ] || { echo "nothing to build: $wheel"; exit 0; }
 done
-for tool in g++ make nasm; do # without nasm it builds too, and decodes JPEG at half the speed
+for tool in g++ make nasm; do # without nasm the build succeeds, but decodes JPEG at half the speed
   command -v "$tool" > /dev/null || { echo "$tool is missing: apt-get install g++ make nasm python3-dev python3-venv" >&2; exit 2; }
 done
 tools=$(mktemp -d)
 trap 'rm -rf "$tools"' EXIT
 "${PYTHON:-python3}" -m venv "$tools"
-# What remains: JPEG, PNG, TIFF and PNM pictures, and UVC cameras by Video4Linux.
+# Remaining parts: JPEG, PNG, TIFF and PNM images, and UVC cameras by Video4Linux.
 export PIP_DISABLE_PIP_VERSION_CHECK=1 ENABLE_HEADLESS=1 CMAKE_ARGS="\
   -DBUILD_LIST=core,imgproc,imgcodecs,flann,features2d,calib3d,video,videoio,python3 \
   -DWITH_FFMPEG=OFF -DWITH_GSTREAMER=OFF -DWITH_LAPACK=OFF -DWITH_IPP=OFF -DWITH_ITT=OFF -DWITH_OPENCL=OFF -DWITH_PROTOBUF=OFF \

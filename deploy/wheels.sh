@@ -1,7 +1,7 @@
 #!/bin/sh
-# Makes fleetmap's wheels for machines without a compiler, in dist/: deploy/wheels.sh [x86_64] [aarch64] (default: both). Python is the
-# one that runs it (PYTHON=python3.12 deploy/wheels.sh for another). The compiler is that of `ziglang` from the package index, which knows
-# every processor and links for glibc 2.28 (Debian 10, Ubuntu 18.10, RHEL 8, and later).
+# Builds fleetmap's wheels for machines without a compiler, in dist/: deploy/wheels.sh [x86_64] [aarch64] (default: both). They are for the
+# Python that runs it (PYTHON=python3.12 deploy/wheels.sh for another). The compiler is `ziglang` from the package index, which supports
+# both processors and links for glibc 2.28 (Debian 10, Ubuntu 18.10, RHEL 8, and later).
 set -eu
 cd "$(dirname "$0")/.."
 [ $# -gt 0 ] || set -- x86_64 aarch64
@@ -11,7 +11,7 @@ trap 'rm -rf "$tools"' EXIT
 python=$tools/venv/bin/python
 PIP_CONSTRAINT=$PWD/constraints.txt
 export PIP_CONSTRAINT PIP_DISABLE_PIP_VERSION_CHECK=1
-echo "fetching the compiler and what builds with it"
+echo "fetching the compiler and the build tools"
 "$python" -m pip install --quiet ziglang wheel scikit-build-core nanobind cmake ninja
 PATH=$tools/venv/bin:$PATH
 suffix=$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("SOABI").split("-")[1])')
@@ -19,7 +19,7 @@ for processor in "$@"; do
   case $processor in x86_64 | aarch64) ;; *) echo "deploy/wheels.sh: x86_64 or aarch64, not $processor" >&2; exit 2 ;; esac
   bin=$tools/$processor
   mkdir -p "$bin/include/$processor-linux-gnu"
-  # Debian has pyconfig.h in a folder for each processor; those of Linux with 64 bits agree in all that a module reads.
+  # Debian has pyconfig.h in a folder for each processor; on 64-bit Linux they agree in everything that a module uses.
   for own in /usr/include/*-linux-gnu/python3.*; do
     [ ! -d "$own" ] || ln -sf "$own" "$bin/include/$processor-linux-gnu/"
   done

@@ -238,8 +238,8 @@ def check_reach(endpoint: str | None, *, insecure: bool) -> None:
     if endpoint is None or has_tls(check_endpoint(endpoint)) or is_loopback(endpoint) or insecure:
         return
     raise UsageError(
-        f"{endpoint} is on another machine and without TLS: anybody on the way can read and answer. Use tls/HOST:PORT, or "
-        "--insecure where nobody else is on that network"
+        f"{endpoint} is on another machine and without TLS: others on the network can read and answer. Use tls/HOST:PORT, or "
+        "--insecure if no other devices are on that network"
     )
 
 

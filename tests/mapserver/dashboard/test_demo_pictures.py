@@ -40,4 +40,4 @@ def test_without_a_browser_it_says_so(tmp_path: Path) -> None:
         env=os.environ | {"PATH": str(tmp_path)},
     )
     assert done.returncode == 0, done
-    assert "there is no chromium here" in done.stdout
+    assert "chromium is not installed" in done.stdout
