@@ -35,10 +35,10 @@ __all__ += ["__version__", "open_store"]
 
 
 def __getattr__(name: str) -> Any:
-    """The library's names, PEP 562; FleetmapError where the server's libraries are not installed."""
+    """Return a public name of the library (PEP 562). Raises FleetmapError if the server's libraries are not installed."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "__version__":  # which is looked up in the installation's metadata
+    if name == "__version__":  # read from the installation's metadata
         return importlib.import_module("fleetmap").__version__
     try:
         return getattr(importlib.import_module("mapserver.library"), name)

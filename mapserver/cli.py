@@ -75,12 +75,12 @@ def _read_config(path: Path | None) -> "tuple[MapserverConfig, Options]":
 
 app = make_app(COMMANDS, mapserver, _read_config)
 
-# Before anything imports numpy: many small products, for which a second BLAS thread costs more than it brings.
+# Before anything imports numpy: for many small products a second BLAS thread costs more than it saves.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main() -> None:
-    """Runs the command line. Where a robot's libraries alone are installed it answers `--version`, and else says what to install."""
+    """Run the command line. With only a robot's libraries installed, answer `--version` and otherwise name the package to install."""
     run_cli(_run)
 
 

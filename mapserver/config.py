@@ -1,4 +1,4 @@
-"""Configuration file of `mapserver`: what is common to all commands, a section for each command, and the settings of maps, gate and fleet.
+"""Configuration file of `mapserver`: common settings, a section per command, and the settings of maps, gate and fleet.
 
 A command's section holds its options under their names, with `_` for `-`. Paths are relative to the working directory, as on the command
 line.
@@ -50,7 +50,7 @@ TIERS = {
 
 
 class MapserverConfig(Section, frozen=True):
-    """The file without the sections of commands. source: the sensors of a survey robot, for `live`; topics: of recordings too."""
+    """The file without the sections of commands. source: sensors of a survey robot, for `live`; topics: also used for recordings."""
 
     site: str | None = None
     store: str | None = None
@@ -65,7 +65,7 @@ class MapserverConfig(Section, frozen=True):
 
 
 def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig, Options]:
-    """Settings of the file at `path` and the options that it sets, the defaults without one.
+    """Return the settings of the file at `path` and the options that it sets; the defaults for None.
 
     UsageError as `load_toml`, and for keys that are internal constants.
     """
@@ -78,12 +78,12 @@ def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig,
 
 
 def survey_settings(path: Path | None, sensor_set: SensorSet) -> SurveySettings:
-    """Settings of a survey with these sensors: the preset of the sensor set, and over it the [survey] of the file at `path`."""
+    """Return the survey settings for these sensors: the preset, overridden by [survey] of the file at `path`."""
     given: dict[str, Any] = {} if path is None else msgspec.toml.decode(path.read_bytes()).get("survey", {})
     return msgspec.convert(over(preset(sensor_set), given), SurveySettings)
 
 
 def preset(sensor_set: SensorSet) -> dict[str, Any]:
-    """The settings of [survey] in which this sensor set differs from the defaults."""
+    """Return the settings of [survey] in which this sensor set differs from the defaults."""
     content: dict[str, Any] = msgspec.toml.decode((_PRESETS / f"{sensor_set.value}.toml").read_bytes())
     return content

@@ -42,10 +42,10 @@ __all__ += ["open_store", "settings_for"]
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """A draft that was built and stored.
+    """A built and stored draft.
 
-    map: keyframes, landmarks and observations as arrays. report: the keys of docs/reports.md. left_out: by content hash, why a
-    recording is not in the map.
+    map: keyframes, landmarks and observations as arrays. report: the keys of docs/reports.md. left_out: by content hash, the reason
+    why a recording is not in the map.
     """
 
     store: Path
@@ -60,12 +60,12 @@ class BuiltMap:
 
     @property
     def report(self) -> dict[str, Any]:
-        """What the build measured."""
+        """Measurements of the build."""
         return self.draft.report
 
     @property
     def sentence(self) -> str:
-        """The result in words."""
+        """The result as text."""
         return self.draft.sentence
 
     @property
@@ -84,7 +84,7 @@ class BuiltMap:
         return self.map.trajectory
 
     def save_picture(self, path: str | Path) -> None:
-        """Draws the map from above as a PNG."""
+        """Draw the map from above as a PNG."""
         write_file(Path(path), picture_png(self.site, self.draft, self.built))
 
     def publish(
@@ -95,10 +95,10 @@ class BuiltMap:
         force: bool = False,
         actor: Actor = NOBODY,
     ) -> None:
-        """Makes it the site's current version; GateRefusedError where it is not good enough by `gate`, unless forced.
+        """Make it the site's current version; GateRefusedError if `gate` refuses it, unless forced.
 
-        A site's first version is refused where its recordings are too short or too straight to judge the calibration. With
-        trust_calibration the actor, who needs a name and a reason, says that it is right; the manifest keeps that.
+        A site's first version is refused if its recordings are too short or too straight to judge the calibration. With
+        trust_calibration the actor, who needs a name and a reason, confirms it; the manifest records that.
         """
         with MapStore.open(self.store) as maps:
             if trust_calibration:
@@ -109,7 +109,7 @@ class BuiltMap:
 def build_map(
     recordings: Sequence[str | Path] | str | Path, store: str | Path, site: str, options: BuildOptions | None = None
 ) -> BuiltMap:
-    """Surveys the recordings, joins them to the site's current version, and stores the map as a draft."""
+    """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     options = options or BuildOptions()
     paths = (recordings,) if isinstance(recordings, str | Path) else recordings
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
@@ -118,7 +118,7 @@ def build_map(
 
 
 def settings_for(request: BuildRequest) -> SurveySettings:
-    """Settings of the request's survey: its own, or the preset of the first recording's sensors with the [survey] of its file over it."""
+    """Return the survey settings of the request: its own, or the preset of the first recording's sensors, overridden by its file."""
     options = request.options
     if options.settings is not None:
         return options.settings
@@ -127,7 +127,7 @@ def settings_for(request: BuildRequest) -> SurveySettings:
 
 @dataclass(frozen=True)
 class MapArrays:
-    """A version of a site as robots get it: N landmarks and K places (keyframes), tile by tile.
+    """A version of a site in its form for robots: N landmarks and K places (keyframes), tile by tile.
 
     landmark_ids (N,), points_map (N, 3), descriptors (N, 32) uint8; place_ids (K,), map_from_cam (K, 4, 4).
     """
@@ -144,12 +144,12 @@ class MapArrays:
 
 
 def open_store(path: str | Path, *, create: bool = False) -> MapStore:
-    """The map store in a folder; to be closed, or used in a `with` statement."""
+    """Open the map store in a folder; to be closed, or used in a `with` statement."""
     return MapStore.open(Path(path), create=create)
 
 
 def open_map(store: str | Path, site: str, version: int | None = None) -> MapArrays:
-    """The tiles of a version, the current one by default, decoded and put together."""
+    """Return the tiles of a version, by default the current one, decoded and concatenated."""
     with open_store(store) as maps:
         if version is None:
             current = maps.current(site)

@@ -43,7 +43,7 @@ def create_app(
     lifespan: Lifespan | None = None,
     settings: ApiSettings = USUAL_SETTINGS,
 ) -> FastAPI:
-    """The application over an open store; `bus` is looked at for readiness, and robots are told on it; None where none is served."""
+    """Return the application over an open store. `bus`: checked for readiness, and notifies robots; None if the server has none."""
     app = FastAPI(
         title="fleetmap",
         description="Versions of maps, the robots that use them, and the jobs that make them.",
@@ -88,7 +88,7 @@ def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics
 
     @app.get("/version")
     def version() -> views.ServerVersion:
-        """What runs here."""
+        """Version and formats of the server."""
         return views.ServerVersion(str(fleetmap.__version__), TILE_FORMAT, MANIFEST_FORMAT)
 
     @app.get("/metrics", response_class=Response)
@@ -115,8 +115,8 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
     def events(
         site: p.Site, since: p.Since = None, until: p.Until = None, limit: p.Limit = 100, cursor: p.NumberCursor = None
     ) -> views.EventList:
-        """What happened to a site, oldest first: who did what, when and why."""
-        store.current(site)  # an unknown site is not an empty one
+        """Events of a site, oldest first: actor, action, time and reason."""
+        store.current(site)  # raises for an unknown site
         found = store.events(site, p.time_range(since, until), after=cursor or 0, limit=limit + 1)
         return views.EventList(*p.page(found, limit, lambda event: str(event.id)))
 
@@ -128,7 +128,7 @@ def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
         limit: p.Limit = 100,
         cursor: p.NumberCursor = None,
     ) -> views.JobList:
-        """Jobs (of a site) that began in a time, newest first."""
+        """Jobs (of a site) that began within a range of time, newest first."""
         found = store.jobs(site, p.time_range(since, until), before=cursor, limit=limit + 1)
         return views.JobList(*p.page(found, limit, lambda job: str(job.id)))
 

@@ -7,15 +7,15 @@ from fastapi import Request, Response
 from mapserver.api.problems import problem
 
 PICTURE_HEADERS = {"X-Content-Type-Options": "nosniff", "Content-Security-Policy": "default-src 'none'; sandbox"}
-"""Of pictures whose bytes robots send: a browser must not take them for anything but a picture, nor run what is in them."""
+"""Headers of pictures from robots: a browser must treat the bytes as a picture only and run nothing in them."""
 
 _RANGE = re.compile(r"^bytes=(\d{0,18})-(\d{0,18})$")
 
 
 def bytes_response(request: Request, data: bytes, sha256: str, media_type: str, *, immutable: bool) -> Response:
-    """The response for bytes whose address is `sha256`: 200, 206 for a range, 304 for what the client has, or 416.
+    """Return bytes with the address `sha256`: 200, 206 for a range, 304 if the client has them, or 416.
 
-    immutable: the path itself names the bytes, so that caches may keep them for ever.
+    immutable: the path itself names the bytes, so caches may keep them forever.
     """
     etag = f'"{sha256}"'
     headers = {
@@ -44,7 +44,7 @@ def _matches(condition: str | None, etag: str) -> bool:
 
 
 def _span(request: Request, etag: str, size: int) -> tuple[int, int] | None:
-    """Start and end of the wanted range (empty when it cannot be satisfied); None for everything.
+    """Start and end of the requested range (empty when it cannot be satisfied); None for everything.
 
     Ranges that cannot be parsed and lists of ranges are ignored, as the RFC allows, as is one whose If-Range fails.
     """

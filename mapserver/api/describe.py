@@ -1,6 +1,6 @@
 """The OpenAPI document: FastAPI's own, with problem documents for its validation errors; and the JSON of answers.
 
-No stamp loses digits in it: nanoseconds since 1970 are above 2^53, which programs that count in doubles round.
+Stamps keep all digits: nanoseconds since 1970 exceed 2^53, above which programs that use doubles round.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def _is_stamp(key: object, value: object) -> bool:
 
 
 def install(app: FastAPI) -> None:
-    """Gives `app` its document, made when it is first asked for."""
+    """Install the OpenAPI document in `app`; it is built at the first request."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -60,7 +60,7 @@ def _described(app: FastAPI) -> dict[str, Any]:
 
 
 def _describe_stamps(schema: Any) -> None:
-    """Says in the document, in place, that stamps are strings."""
+    """Describe stamps as strings in the document, in place."""
     if isinstance(schema, list):
         for item in schema:
             _describe_stamps(item)

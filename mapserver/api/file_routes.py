@@ -1,4 +1,4 @@
-"""A version as one file under an address that stays, as fleet managers of VDA 5050 pass it on to robots."""
+"""Endpoints of a version as one file under a permanent address (VDA 5050 `downloadMap`), its grid, expected views and changes."""
 
 import base64
 import hashlib
@@ -32,11 +32,11 @@ _PAIRS_PER_S, _MOST_VIEWS = 0.2, 600  # versions compared: a twentieth of a seco
 
 
 def install_file_routes(app: FastAPI, store: MapStore) -> None:
-    """Adds the endpoints."""
+    """Add the endpoints."""
 
     @lru_cache(maxsize=_DIGESTS_KEPT)
     def digest(_manifest_sha256: str, site: str, version: int) -> bytes:
-        """Of the file, which the manifest's address decides: read once, not at every request."""
+        """SHA-256 of the file. Cached: the manifest's hash determines it."""
         whole = hashlib.sha256()
         for chunk in store.version_file(site, version)[1]():
             whole.update(chunk)
@@ -75,7 +75,7 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
 
     @app.get("/v1/sites/{site}/versions/{version}/grid.yaml", response_class=Response)
     def grid_yaml(request: Request, site: Site, version: Version, robot_height_m: RobotHeight = 1.1) -> Response:
-        """The grid of planners as nav2's map_server reads it, for robots up to this height; its image is `grid.pgm`."""
+        """The planner grid in the format of nav2's map_server, for robots up to this height; its image is `grid.pgm`."""
         return grid_file(request, (site, version), robot_height_m, 0)
 
     @app.get("/v1/sites/{site}/versions/{version}/grid.pgm", response_class=Response)
@@ -87,7 +87,7 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
 
     def answer(request: Request, draw: Callable[[], ExpectedView]) -> Response:
         if not drawn.admits(address_of(request.scope)):
-            raise HTTPException(429, "too many views are asked for; wait a second", {"Retry-After": "1"})
+            raise HTTPException(429, "too many requests for views; wait a second", {"Retry-After": "1"})
         view = draw()
         alpha = np.where(view.unknown, np.uint8(0), np.uint8(255))
         png = cv2.imencode(".png", np.dstack([view.picture] * 3 + [alpha]))[1].tobytes()
@@ -95,7 +95,7 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
 
     @app.get("/v1/sites/{site}/versions/{version}/view.png", response_class=Response)
     def view_png(request: Request, site: Site, version: Version, camera: Annotated[ViewPose, Query()]) -> Response:
-        """What the survey's camera should see at a pose, drawn from the version's surfels; transparent where nothing is known."""
+        """Expected image of the survey's camera at a pose, drawn from the version's surfels; transparent where the map has no data."""
         store.version(site, version)
         place = looking((camera.x_m, camera.y_m, camera.z_m), camera.yaw_deg, camera.pitch_deg)
         return answer(request, lambda: views.view(site, version, place, width_px=camera.width_px))
@@ -104,23 +104,23 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
 
     def changed(request: Request, site: str, before: int, after: int) -> Changes:
         if not compared.admits(address_of(request.scope)):
-            raise HTTPException(429, "too many versions are compared; wait some seconds", {"Retry-After": "5"})
+            raise HTTPException(429, "too many comparisons of versions; wait 5 seconds", {"Retry-After": "5"})
         return changes.between(site, before, after)
 
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}/changes.png", response_class=Response)
     def changes_plan(request: Request, site: Site, before: Version, after: Version) -> Response:
-        """A plan of what appeared (blue) and vanished (orange) in the surfels, 0.1 m a pixel, y upwards; what one did not see is pale."""
+        """Plan of appeared (blue) and vanished (orange) surfels, 0.1 m a pixel, y up; places seen by only one version are pale."""
         png = changes_png(changed(request, site, before, after))
         return bytes_response(request, png, sha256_hex(png), "image/png", immutable=False)
 
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}/changes.geojson")
     def changes_patches(request: Request, site: Site, before: Version, after: Version) -> dict[str, Any]:
-        """The same as GeoJSON, metres in `map` in the place of degrees: boxes with their height and area."""
+        """The same changes as GeoJSON with metres in `map` instead of degrees: boxes with height and area."""
         return changes_geojson(changed(request, site, before, after))
 
     @app.get("/v1/failures/{number}/expected.png", response_class=Response)
     def expected(request: Request, number: Number) -> Response:
-        """What a robot's camera should have seen when its failure began, where it believed to be; transparent where nothing is known."""
+        """Expected image of a robot's camera at its estimated pose when the failure began; transparent where the map has no data."""
         report = store.fleet.failure(number).report
         version, map_from_cam, camera = failure_camera(report)
         return answer(request, lambda: views.view(report.site, version, map_from_cam, camera))

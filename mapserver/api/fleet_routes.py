@@ -1,4 +1,4 @@
-"""Endpoints of the fleet's health: figures by site, robot, version, tile, area or cause, failures, tiles to survey again."""
+"""Endpoints of fleet health: figures by site, robot, version, tile, area or cause; failures; tiles to resurvey."""
 
 import time
 from typing import Annotated, Any, NamedTuple
@@ -21,7 +21,7 @@ from mapserver.store import MapStore
 
 
 class Span(NamedTuple):
-    """Hours since 1970, the last one not included."""
+    """Hours since 1970, the end excluded."""
 
     first: int
     end: int
@@ -37,11 +37,11 @@ Asked = Annotated[Span, Depends(_span)]
 
 
 def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettings, placing: RobotPlacing) -> None:
-    """Adds the endpoints."""
+    """Add the endpoints."""
 
     @app.post("/v1/sites/{site}/robots/{robot}/initial_pose")
     def initial_pose(request: Request, site: p.Site, robot: p.Robot, act: views.PlaceAct) -> views.ServiceState:
-        """A person's word of where a robot stands: it believes it over what it tracks, until fixes outweigh it. `ok`: it was told."""
+        """Send an operator's pose to a robot: it overrides the tracked pose until fixes outweigh it. `ok`: the robot was notified."""
         told = InitialPoseMessage(
             site=site,
             robot=robot,
@@ -63,7 +63,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     ) -> views.KpisList:
         """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause.
 
-        Whole hours are counted: those that `since` and `until` lie in, too.
+        Whole hours are counted, including those that contain `since` and `until`.
         """
         found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
         chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
@@ -81,7 +81,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         cursor: p.NumberCursor = None,
     ) -> views.HourList:
         """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
-        store.current(site)  # an unknown site is not an empty one
+        store.current(site)  # raises for an unknown site
         first = max(span.first, (cursor or -1) + 1)
         found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
         shown, following = p.page(list(found.items()), limit, lambda item: str(item[0]))
@@ -89,7 +89,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
 
     @app.get("/v1/failures")
     def failures(query: Annotated[p.FailureQuery, Query()]) -> views.FailureList:
-        """Failures, the last to arrive first; kind `suspected` are estimates of silent ones."""
+        """Failures, latest arrival first; kind `suspected` marks estimated silent failures."""
         found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
         return views.FailureList(*p.page(found, query.limit, lambda failure: str(failure.number)))
 
@@ -115,28 +115,28 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
 
     @app.get("/v1/sites/{site}/areas")
     def areas(site: p.Site) -> dict[str, Any]:
-        """The named areas of a site as GeoJSON, metres in `map` in the place of degrees."""
-        store.current(site)  # an unknown site is not an empty one
+        """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
+        store.current(site)  # raises for an unknown site
         return store.areas(site).geojson(site)
 
     @app.get("/v1/sites/{site}/resurvey")
     def resurvey(site: p.Site) -> ResurveyList:
-        """Tiles to survey again, the worst first, each with its reasons, and a route through them."""
+        """Tiles to resurvey, the most urgent first, each with its reasons, and a route through them."""
         return resurvey_list(store, site, settings, time.time_ns())
 
     @app.post("/v1/sites/{site}/resurvey/requests")
     def ask(request: Request, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
-        """Asks for a survey of a polygon; its tiles are on the list until the request is ended."""
+        """Request a survey of a polygon; its tiles stay on the list until the request is closed."""
         return ask_for_survey(store, site, act.corners_map_m, actor_of(request, act.actor, act.reason))
 
     @app.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
     def end(request: Request, site: p.Site, asked: p.RequestId, act: views.Act) -> views.ServiceState:
-        """Takes a request off the list: it was surveyed, or is not wanted any more."""
+        """Remove a request from the list because it was surveyed or is no longer wanted."""
         end_request(store, site, asked, actor_of(request, act.actor, act.reason))
         return views.ServiceState("ok")
 
     @app.get("/v1/sites/{site}/resurvey/route")
     def resurvey_route(site: p.Site) -> dict[str, Any]:
-        """The route as GeoJSON, metres in `map` in the place of degrees."""
+        """The route as GeoJSON, with metres in `map` instead of degrees."""
         found = resurvey_list(store, site, settings, time.time_ns())
         return route_geojson(site, found.version or 0, found.route)

@@ -1,6 +1,6 @@
-"""The guard around the whole server and its mounted pages: host names, pages from elsewhere, who asks, headers. Plain ASGI.
+"""Access control for the whole server and its mounted pages: host names, origins, sign-in, headers. Plain ASGI.
 
-Every request but those of `_OPEN` needs a scope, where sign-in is on; what is not named here needs the strongest that its method may be.
+With sign-in on, every request except those in `_OPEN` needs a scope; an unlisted path needs the strongest scope of its method.
 """
 
 from dataclasses import dataclass
@@ -40,11 +40,11 @@ _FIXED = [
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardSettings:
-    """What the guard knows of a server.
+    """Settings of the guard.
 
-    names: host names that it goes by, beside localhost and addresses. operators: who may sign in; None: those of the application's store.
-    must_sign_in: also before anybody is named. warning: a sentence for every page.
-    proxy: who signs people in in front of the server, too; None: passwords alone.
+    names: accepted host names, beside localhost and addresses. operators: accounts; None: those of the application's store.
+    must_sign_in: also before the first operator is added. warning: a banner for every page.
+    proxy: an additional sign-in proxy in front of the server; None: passwords only.
     """
 
     names: frozenset[str] = frozenset()
@@ -58,7 +58,7 @@ class GuardSettings:
         return self.must_sign_in or (self.operators is not None and self.operators.is_sign_in_on)
 
     def identify(self, scope: Scope, *, uses: bool = True) -> Identity | None:
-        """Who sent a request, by what the store knows now. uses: whether that keeps a session from ending."""
+        """Return the sender of a request by the store's present state. uses: whether the request extends the session."""
         if self.operators is None:
             return None
         headers = _headers(scope)
@@ -68,7 +68,7 @@ class GuardSettings:
 
 
 def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
-    """Who acts by a request of the API: the operator whom it proved; `typed` where nobody signs in."""
+    """Return the actor of an API request: the authenticated operator, or `typed` if sign-in is off."""
     who: Identity | None = getattr(request.state, "operator", None)
     if who is None:
         return _typed(request, typed or "", reason)
@@ -79,17 +79,17 @@ def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
 
 def _typed(request: Request, name: str, reason: str) -> Actor:
     if not name:
-        raise HTTPException(422, "`actor` is missing: say who acts")
+        raise HTTPException(422, "`actor` is missing: name the person who acts")
     return Actor(name, reason, "", address_of(request.scope))
 
 
 def cookie_name(scope: Scope) -> str:
-    """The name of the session's cookie. Under TLS browsers take one of this name from nobody but this host, by TLS alone."""
+    """Name of the session's cookie. Under TLS the `__Host-` name: browsers accept it from this host and over TLS only."""
     return "__Host-fleetmap" if _is_secure(scope) else "fleetmap"
 
 
 def set_session(response: Response, scope: Scope, session: str) -> None:
-    """Gives a browser its session; an empty one takes it away."""
+    """Set a browser's session cookie; an empty session deletes it."""
     secure, age_s = _is_secure(scope), LIFE_S if session else 0
     response.set_cookie(cookie_name(scope), session, age_s, secure=secure, httponly=True, samesite="strict", path="/")
 
@@ -101,7 +101,7 @@ def address_of(scope: Scope) -> str:
 
 
 class Guard:
-    """Refuses what must not reach the application, tells it in `request.state.operator` who asks, and adds headers to its answers."""
+    """Refuses forbidden requests, stores the operator in `request.state.operator`, and adds headers to responses."""
 
     def __init__(self, app: ASGIApp, settings: GuardSettings) -> None:
         self._app, self._settings = app, settings
@@ -122,16 +122,16 @@ class Guard:
         return await (refusal or self._app)(scope, receive, answer)
 
     def _refused_place(self, scope: Scope) -> Response | None:
-        """Refuses other names of the server (DNS rebinding) and requests that pages from elsewhere send."""
+        """Refuse foreign host names (DNS rebinding) and requests sent by pages of other origins."""
         headers = _headers(scope)
         host = headers.get("host", "").lower()
         if not self._is_ours(host):
-            return _refuse(scope, 403, f"this server is not called {host[:80]!r}; name it with --http-name")
+            return _refuse(scope, 403, f"unknown host name {host[:80]!r}; add it with --http-name")
         if scope["method"] in {"GET", "HEAD", "OPTIONS"}:
             return None
         origin, site = headers.get("origin"), headers.get("sec-fetch-site")
         if site not in {None, "same-origin", "none"} or (origin is not None and _netloc(origin) != host):
-            return _refuse(scope, 403, "a page from elsewhere sent this request")
+            return _refuse(scope, 403, "a page of another origin sent this request; open the server's own page")
         return None
 
     def _is_ours(self, host: str) -> bool:
@@ -142,13 +142,13 @@ class Guard:
         if name == "localhost" or name in self._settings.names:
             return True
         try:
-            # Nobody can point an address elsewhere: a page under it comes from this server.
+            # An address cannot be redirected by DNS: a page under it comes from this server.
             return bool(ip_address(name))
         except ValueError:
             return False
 
     def _refused_person(self, scope: Scope) -> Response | None:
-        """Refuses requests without a session or token, or with one that does not allow them."""
+        """Refuse requests without a session or token, or with insufficient rights."""
         right = _needed(scope)
         if right is None or not self._settings.is_sign_in_on:
             return None
@@ -161,7 +161,7 @@ class Guard:
             if scope["method"] == "GET" and "text/html" in _headers(scope).get("accept", ""):
                 asked = scope["path"] + (f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else "")
                 return RedirectResponse(f"{SIGN_IN}?next={quote(asked, safe='')}", 303)
-            return _refuse(scope, 401, "sign in, or show a token that has not ended", {"WWW-Authenticate": "Bearer"})
+            return _refuse(scope, 401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
         if right not in who.scopes:
             words = f"this needs the right to {right.value!r}, which {who.name} ({who.role}) does not have"
             if self._settings.operators is not None:
@@ -172,7 +172,7 @@ class Guard:
 
 
 def _with_ours(scope: Scope, headers: Any) -> list[tuple[bytes, bytes]]:
-    """The headers of an answer with those that all have; pictures have a stricter policy of their own."""
+    """Return the headers of a response with those common to all; pictures have their own stricter policy."""
     fixed = [*_FIXED, *([(b"strict-transport-security", b"max-age=31536000")] if _is_secure(scope) else [])]
     names = {name for name, _ in fixed}
     kept = [(name.lower(), value) for name, value in headers if name.lower() not in names]

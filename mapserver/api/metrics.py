@@ -1,7 +1,6 @@
 """Prometheus metrics of the server.
 
-Labels take values from fixed sets, or names of sites, which only builds make, versions and areas that the store has, causes (at most some
-dozens) and statuses.
+Label values come from fixed sets or are names of sites, versions and areas in the store, causes (a few dozen at most) and statuses.
 """
 
 from collections import Counter as Counts
@@ -26,20 +25,20 @@ _SEEN_WITHIN_S = 60.0
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
 Family = TypeVar("Family", CounterMetricFamily, GaugeMetricFamily)
 
-# Of counters: name of the metric, its help, and the column.
+# Counters: name of the metric, help, and column.
 _SITE_SUMS = (
     ("reports", "Health reports.", "reports"),
     ("failures", "Position failures that robots reported.", "failures"),
     ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
     ("unreported_blindness", "Stretches of blindness without a reported failure.", "unreported_blindness"),
     ("observed_seconds", "Time that reports cover.", "observed_ms"),
-    ("driving_seconds", "Of it driving; a robot-day is 57600 s.", "driving_ms"),
-    ("driving_judged_seconds", "Driving, also at an unknown speed.", "judged_ms"),
+    ("driving_seconds", "Driving time; a robot-day is 57600 s.", "driving_ms"),
+    ("driving_judged_seconds", "Driving time, including unknown speed.", "judged_ms"),
     ("driving_localised_seconds", "Of that localised.", "found_ms"),
-    ("usable_seconds", "Of it with a usable position.", "usable_ms"),
+    ("usable_seconds", "Driving time with a usable position.", "usable_ms"),
     ("after_first_fix_seconds", "Of it since the run's first fix.", "after_fix_ms"),
     ("localised_seconds", "Of that TRACKING.", "localised_ms"),
-    ("frames", "Frames that were worked on.", "frames"),
+    ("frames", "Processed frames.", "frames"),
     ("frames_dropped", "Frames that were not.", "frames_dropped"),
     ("docks", "Arrivals at docks.", "docks"),
     ("docks_wrong", "Of them with an estimate more than 0.30 m off.", "docks_wrong"),
@@ -59,9 +58,9 @@ _ROBOTS = {
     "robots_seen": "Robots that reported in the last minute.",
     "robots_current": "Robots on the wanted version.",
     "robots_present": "Robots on the bus now.",
-    "robots_copied": "Robots that were connected twice.",
-    "clock_skew_max_seconds": "The most that a robot's clock is wrong.",
-    "map_word_hours_max": "The oldest proof of what may be run, of robots heard in the last minute.",
+    "robots_copied": "Robots connected twice.",
+    "clock_skew_max_seconds": "Largest clock error of a robot.",
+    "map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",
 }
 
 
@@ -75,14 +74,14 @@ class Metrics:
         self._requests = Counter("fleetmap_http_requests_total", "HTTP requests.", labels, registry=own)
         name, words = "fleetmap_http_request_seconds", "Time to answer an HTTP request."
         self._seconds = Histogram(name, words, ["route"], registry=own, buckets=_BUCKETS_S)
-        name, words = "fleetmap_bus_messages_total", "Questions and messages on the bus."
+        name, words = "fleetmap_bus_messages_total", "Queries and messages on the bus."
         self._bus_messages = Counter(name, words, ["what", "result"], registry=own)
         name, words = "fleetmap_bus_sent_bytes_total", "Bytes sent in answers."
         self._bus_bytes = Counter(name, words, ["what"], registry=own)
         own.register(_FleetCollector(store, fleet))
 
     def count_http(self, method: str, route: str, status: int, seconds_s: float) -> None:
-        """One HTTP request; `route` is the template, not the path, so that paths cannot make new series."""
+        """Count one HTTP request; `route` is the template, not the path, so paths cannot create new series."""
         self._requests.labels(method, route, str(status)).inc()
         self._seconds.labels(route).observe(seconds_s)
 
@@ -95,9 +94,9 @@ class Metrics:
 
 
 class _FleetCollector(Collector):
-    """Reads sites, robots and the fleet's sums when it is asked.
+    """Reads sites, robots and fleet sums at each scrape.
 
-    The store forgets what is too old, which Prometheus takes for a restart.
+    The store deletes old data; Prometheus treats the decrease as a restart.
     """
 
     def __init__(self, store: MapStore, fleet: Fleet) -> None:
@@ -110,7 +109,7 @@ class _FleetCollector(Collector):
         yield _filled(_gauge("site_current_version", "Current version, 0 for none."), current.items())
         tried = {row.site: row.version for row in self._store.canaries(running=True)}
         trials = [((info.site,), tried.get(info.site, 0)) for info in sites]
-        yield _filled(_gauge("site_canary_version", "Version that some robots try, 0 for none."), trials)
+        yield _filled(_gauge("site_canary_version", "Version in canary, 0 for none."), trials)
         nights = {info.site: self._store.last_night(info.site) for info in sites}
         failed = [((site,), float(night is not None and night.state == "failed")) for site, night in nights.items()]
         yield _filled(_gauge("site_night_failed", "1 where the last night failed."), failed)
@@ -134,15 +133,15 @@ class _FleetCollector(Collector):
     def _area_names(self, site: str) -> list[str]:
         try:
             return self._store.areas(site).names
-        except FleetmapError:  # areas in a building that the map is no longer aligned with
+        except FleetmapError:  # areas of a building plan, after the map's alignment was removed
             return []
 
     def _robots(self, sites: list[str]) -> Iterator[Metric]:
         robots = self._fleet.robots()
         gauges = {name: _gauge(f"site_{name}", words) for name, words in _ROBOTS.items()}
-        statuses = _gauge("site_robots_status", "Robots heard in the last minute.", "status")
+        statuses = _gauge("site_robots_status", "Robots seen in the last minute.", "status")
         drifting = _gauge(
-            "site_robots_calibration", "Robots heard in the last minute that drift, by parameter.", "parameter"
+            "site_robots_calibration", "Robots seen in the last minute that drift, by parameter.", "parameter"
         )
         for site in sites:
             own = [robot for robot in robots if robot.site == site]
@@ -171,13 +170,13 @@ class _FleetCollector(Collector):
 
 def _trust(store: MapStore) -> Iterator[Metric]:
     """Days that the signed lists last; no figures for a store that is not signed."""
-    faults = GaugeMetricFamily("fleetmap_trust_faults", "What keeps robots from new maps, now or soon.")
+    faults = GaugeMetricFamily("fleetmap_trust_faults", "Faults that block new maps for robots, now or soon.")
     days = GaugeMetricFamily("fleetmap_trust_days_left", "Days until a role expires.", labels=["role"])
     try:
         found = trust_status(store)
-    except StateError:  # a store that is not signed
+    except StateError:  # an unsigned store
         pass
-    except StoreError:  # lists that cannot be read
+    except StoreError:  # unreadable lists
         faults.add_metric([], 1)
     else:
         faults.add_metric([], len(found.faults))

@@ -1,4 +1,4 @@
-"""Moments as people and programs write them, and as pages show them: with an offset from UTC, or by a local time zone."""
+"""Times as text for operators, programs and pages: with an offset from UTC, or in a local time zone."""
 
 import re
 from datetime import UTC, date, datetime, timedelta, tzinfo
@@ -8,11 +8,11 @@ from fleetmap.errors import UsageError
 
 _LATEST_YEAR = 2200
 _NAME = re.compile(r"[A-Za-z0-9_+\-/]{1,64}", re.ASCII)
-_LOST_PLUS = re.compile(r"(T[\d:.]+) (\d\d:?\d\d)$")  # in an address + means a space
+_LOST_PLUS = re.compile(r"(T[\d:.]+) (\d\d:?\d\d)$")  # `+` in a URL means a space
 
 
 def zone_of(name: str | None) -> tzinfo | None:
-    """The zone of an IANA name; None, the machine's own zone, for none and for one that this machine does not know."""
+    """Return the zone of an IANA name; None, the machine's own zone, for None and for an unknown name."""
     if not name or not _NAME.fullmatch(name):
         return None
     try:
@@ -22,7 +22,7 @@ def zone_of(name: str | None) -> tzinfo | None:
 
 
 def moment_text(stamp_ns: int | None, zone: tzinfo | None) -> str | None:
-    """A stamp by a zone's clock, with the zone's name for that moment; None for none."""
+    """Return a stamp in a zone's local time with the zone's name; None for None."""
     if stamp_ns is None:
         return None
     at = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).astimezone(zone)
@@ -30,13 +30,13 @@ def moment_text(stamp_ns: int | None, zone: tzinfo | None) -> str | None:
 
 
 def clock_text(stamp_ns: int, zone: tzinfo | None) -> str:
-    """The time of day of a stamp by a zone's clock, to a tenth of a second."""
+    """Return the local time of day of a stamp, to a tenth of a second."""
     at = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).astimezone(zone)
     return f"{at:%H:%M:%S}.{stamp_ns // 100_000_000 % 10}"
 
 
 def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_end: bool = False) -> int | None:
-    """Nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone, None: the machine's own. None for no text.
+    """Return nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone (None: the machine's). None for no text.
 
     A day alone is its beginning, or its end with `is_end`. Raises UsageError for other text, naming the parameter.
     """
@@ -53,7 +53,7 @@ def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_e
         at = None
     if at is None or not 1970 < at.year < _LATEST_YEAR:
         raise UsageError(
-            f"{name} {text[:40]!r} is no time; write 2026-01-31T14:03, with +01:00 or Z where it is not local"
+            f"{name} {text[:40]!r} is an invalid time; write 2026-01-31T14:03, with +01:00 or Z if it is not local"
         )
     if at.tzinfo is None:
         at = at.replace(tzinfo=zone) if zone is not None else at.astimezone()
@@ -62,7 +62,7 @@ def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_e
 
 
 def read_range(since: str | None, until: str | None, zone: tzinfo | None = None) -> tuple[int | None, int | None]:
-    """Both ends of a range. UsageError for text that is no time, and for an end before the beginning."""
+    """Return both ends of a range. Raises UsageError for an invalid time and for an end before the start."""
     start_ns, end_ns = read_moment(since, "since", zone), read_moment(until, "until", zone, is_end=True)
     if start_ns is not None and end_ns is not None and end_ns <= start_ns:
         raise UsageError(f"until {(until or '')[:40]!r} is not after since {(since or '')[:40]!r}; exchange them")

@@ -24,7 +24,7 @@ RequestId = Annotated[str, Path(pattern="^[0-9a-f]{8}$", examples=["3fa9c1d2"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]
 RobotHeight = Annotated[
-    float, Query(gt=FLOOR_M, le=TOP_M, description="metres; what hangs higher is no obstacle", examples=[1.1])
+    float, Query(gt=FLOOR_M, le=TOP_M, description="metres; higher objects are not obstacles", examples=[1.1])
 ]
 Sha256 = Annotated[str, Path(pattern=SHA256_PATTERN, examples=["5e" * 32])]
 Number = Annotated[int, Path(ge=1, le=1 << 62, examples=[12])]
@@ -34,20 +34,20 @@ Axis = Annotated[
     Query(description="what the figures are for", examples=["version"]),
 ]
 Hours = Annotated[
-    int, Query(ge=1, le=24 * 400, description="so many hours back, the running one included", examples=[24])
+    int, Query(ge=1, le=24 * 400, description="number of past hours, the current one included", examples=[24])
 ]
 KeyFilter = Annotated[
-    str | None, Query(max_length=64, description="this robot, version, tile, area or cause alone", examples=[None])
+    str | None, Query(max_length=64, description="only this robot, version, tile, area or cause", examples=[None])
 ]
 VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on this version alone", examples=[None])]
 Limit = Annotated[int, Query(ge=1, le=1000, description="items of a page", examples=[100])]
-_NEXT = "`next` of the page before"
+_NEXT = "`next` of the previous page"
 NumberCursor = Annotated[int | None, Query(ge=0, le=(1 << 62), description=_NEXT, examples=[None])]
 NameCursor = Annotated[str | None, Query(max_length=160, description=_NEXT, examples=[None])]
 
 
 class ViewPose(BaseModel):
-    """Where a camera looks from and to, in `map`."""
+    """Camera position and viewing direction in `map`."""
 
     x_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[1.5])
     y_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[2.0])
@@ -57,7 +57,7 @@ class ViewPose(BaseModel):
     width_px: int = Field(320, ge=16, le=640, description="of the picture", examples=[320])
 
 
-_TIME = "ISO 8601; without an offset the server's local time, a day alone from its beginning to its end"
+_TIME = "ISO 8601; without an offset the server's local time; a date alone is the whole day"
 Since = Annotated[
     str | None, Query(max_length=40, description=f"not before: {_TIME}", examples=["2026-01-02T03:04:05Z"])
 ]
@@ -65,7 +65,7 @@ Until = Annotated[str | None, Query(max_length=40, description=f"before: {_TIME}
 
 
 def time_range(since: str | None, until: str | None) -> tuple[int | None, int | None]:
-    """Nanoseconds since 1970, None for an open end; 422 for what is no time or ends before it begins."""
+    """Return nanoseconds since 1970, None for an open end; 422 for an invalid time or an end before the start."""
     try:
         return read_range(since, until)
     except UsageError as error:
@@ -73,9 +73,9 @@ def time_range(since: str | None, until: str | None) -> tuple[int | None, int | 
 
 
 async def known_parameters(request: HTTPConnection) -> None:
-    """Refuses query parameters that an address of the API does not know, for a filter that is not applied gives a wrong answer.
+    """Refuse query parameters unknown to an API address: an ignored filter would give a wrong result.
 
-    Pages answer for theirs themselves.
+    Pages check their own parameters.
     """
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute) or not route.include_in_schema:

@@ -15,30 +15,30 @@ _log = logging.getLogger(__name__)
 
 _STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
     (StateError, HTTPStatus.CONFLICT),
-    (UsageError, HTTPStatus.NOT_FOUND),  # the path named a site or version that is not there
+    (UsageError, HTTPStatus.NOT_FOUND),  # the path names an unknown site or version
     (GateRefusedError, HTTPStatus.CONFLICT),
     (StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
-    (MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # bytes in our own store are damaged
+    (MapFormatError, HTTPStatus.INTERNAL_SERVER_ERROR),  # damaged bytes in the server's own store
 )
 
 
 _CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
-    "4XX": {"description": "What was asked for is not there, not right or not allowed.", "content": _CONTENT},
-    "5XX": {"description": "The store cannot be read or written; the server's log says more.", "content": _CONTENT},
+    "4XX": {"description": "The request is invalid or not allowed, or its target does not exist.", "content": _CONTENT},
+    "5XX": {"description": "The store cannot be read or written; see the server's log.", "content": _CONTENT},
 }
-"""What every endpoint may answer instead, for the OpenAPI document."""
+"""Error responses of every endpoint, for the OpenAPI document."""
 
 
 def problem(status: int, detail: str, path: str, headers: dict[str, str] | None = None) -> JSONResponse:
-    """A problem document; its type is about:blank, so that its title is the status's phrase."""
+    """Return a problem document; its type is about:blank, so its title is the status's phrase."""
     kind = {"type": "about:blank", "title": HTTPStatus(status).phrase, "status": status}
     content = kind | {"detail": detail, "instance": path}
     return JSONResponse(content, status, headers=headers, media_type="application/problem+json")
 
 
 def install(app: FastAPI) -> None:
-    """Makes every error of `app` a problem document."""
+    """Make every error of `app` a problem document."""
     app.add_exception_handler(FleetmapError, _fleetmap_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
@@ -66,4 +66,4 @@ def _validation_error(request: Request, error: Exception) -> Response:
 
 def _unexpected(request: Request, error: Exception) -> Response:
     _log.error("%s %r failed", request.method, request.url.path, exc_info=error)
-    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "an internal error; the server's log says more", request.url.path)
+    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "an internal error; see the server's log", request.url.path)

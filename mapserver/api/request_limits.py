@@ -1,4 +1,4 @@
-"""Limits on requests, outside of everything else: they hold before anything of a body is kept or any token is looked at."""
+"""Limits on requests, checked first: before the body is stored or a token is read."""
 
 import asyncio
 from contextlib import suppress
@@ -10,15 +10,15 @@ from mapserver.api.guard import SIGN_IN
 from mapserver.api.problems import problem
 from mapserver.serving.http_connections import MAX_HEAD_BYTES
 
-MAX_BODY_BYTES = 1 << 20  # an act has some hundred bytes
-SIGN_IN_BYTES = 4 << 10  # anybody may send one
-BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is there
+MAX_BODY_BYTES = 1 << 20  # an action has about 100 bytes
+SIGN_IN_BYTES = 4 << 10  # accepted without authentication
+BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
 
 
 class RequestLimits:
-    """Answers 431 to a large head, 413 to a large body, stated or not, and 408 to a slow one, and closes the connection.
+    """Answer 431 to large headers, 413 to a large body (declared or not), 408 to a slow one, and close the connection.
 
-    Whoever leaves before the body is there causes no line in the log.
+    A client that disconnects before the body is complete is not logged.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -27,7 +27,7 @@ class RequestLimits:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
-        if "://" in scope["path"][:8]:  # the absolute form of an address, which h11 leaves as it is
+        if "://" in scope["path"][:8]:  # the absolute form of a URL, which h11 does not change
             scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
             scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
         head_bytes = len(scope["raw_path"]) + len(scope["query_string"])
@@ -50,11 +50,11 @@ class RequestLimits:
                 return {"type": "http.disconnect"}
             refusal = too_large
             try:
-                # Behind the body this waits for the end of the connection.
+                # After the body this waits until the connection closes.
                 async with asyncio.timeout_at(None if is_whole or is_answered else until_s):
                     message = await receive()
             except TimeoutError:
-                refusal = 408, f"the body was not there within {within_s:g} s"
+                refusal = 408, f"the body was not complete within {within_s:g} s"
             else:
                 taken += len(message.get("body", b""))
                 is_whole = is_whole or not message.get("more_body", False)

@@ -1,6 +1,6 @@
-"""People whom a proxy in front of the server has signed in. docs/security.md explains it.
+"""Users signed in by a proxy in front of the server. See docs/security.md.
 
-The proxy names them and their groups in headers. These count from its addresses alone; of every other request they are removed.
+The proxy sends their name and groups in headers. These are accepted from the proxy's addresses only and removed from all other requests.
 """
 
 import re
@@ -16,8 +16,8 @@ from mapserver.operators.roles import SCOPES, Identity, Role
 from mapserver.serving.http_connections import plain_address
 
 USER, GROUPS = b"x-forwarded-user", b"x-forwarded-groups"
-PREFIX = "proxy:"  # in front of their names in the log: no name of ours has a colon
-PAGE_S = 3600  # how long an open page counts as its person's before it is loaded, and the proxy asked, again
+PREFIX = "proxy:"  # prefix of their names in the log; names of operators contain no colon
+PAGE_S = 3600  # after which an open page is loaded and authenticated by the proxy again
 _KEY = "fleetmap.proxied"
 _NAME = re.compile(r"[A-Za-z0-9._@+|:/=~-]{1,128}")
 
@@ -30,7 +30,7 @@ class _Person(NamedTuple):
 
 @dataclass(frozen=True)
 class SignInProxy:
-    """Addresses of proxies, and the roles of the groups that they name. UsageError for an address that is none."""
+    """Addresses of proxies, and the roles of their groups. UsageError for an invalid address."""
 
     addresses: frozenset[str]
     roles: Mapping[str, Role]
@@ -38,7 +38,7 @@ class SignInProxy:
 
     @classmethod
     def of(cls, addresses: Iterable[str], groups: Iterable[str]) -> "SignInProxy":
-        """By words such as `127.0.0.1` and `map-people=operator`; UsageError for others."""
+        """Parse text such as `127.0.0.1` and `map-people=operator`; UsageError for invalid text."""
         roles: dict[str, Role] = {}
         for given in groups:
             group, _, role = given.rpartition("=")
@@ -51,12 +51,12 @@ class SignInProxy:
             roles[group] = Role(role)
         if not roles:
             raise UsageError(
-                "--sign-in-proxy needs --sign-in-group GROUP=ROLE: without a role nobody whom it signs in may enter"
+                "--sign-in-proxy needs --sign-in-group GROUP=ROLE: without a role no user of the proxy may sign in"
             )
         return cls(frozenset(_address(given) for given in addresses), roles)
 
     def identify(self, scope: Scope, address: str) -> Identity | None:
-        """Whom a proxy names in a request, with the highest role of their groups; None for nobody, or for groups without a role."""
+        """Return the user named by a proxy, with the highest role of their groups; None without a name, or for groups without a role."""
         person: _Person | None = scope.get(_KEY)
         if person is None or self.clock_s() - person.seen_s > PAGE_S:
             return None
@@ -68,7 +68,7 @@ class SignInProxy:
 
 
 class ProxiedPeople:
-    """ASGI, around everything else: takes the headers out of requests, and remembers what the proxies' ones say."""
+    """Outermost ASGI layer: removes the headers from requests, and keeps the values sent by the proxies."""
 
     def __init__(self, app: ASGIApp, proxy: SignInProxy | None) -> None:
         self._app, self._proxy = app, proxy
@@ -80,7 +80,7 @@ class ProxiedPeople:
             ]
             scope = {**scope, "headers": [pair for pair in scope["headers"] if pair[0] not in (USER, GROUPS)]}
             users = [value for name, value in named if name == USER]
-            # A second name would be one that somebody else has written, and the proxy has passed on.
+            # A second name would come from the client and have been passed on by the proxy.
             if self._proxy is not None and len(users) == 1 and _NAME.fullmatch(users[0]) and _is_of(scope, self._proxy):
                 groups = (group.strip() for name, value in named if name == GROUPS for group in value.split(","))
                 scope[_KEY] = _Person(users[0], tuple(groups), self._proxy.clock_s())
@@ -88,7 +88,7 @@ class ProxiedPeople:
 
 
 def proxied_name(scope: Scope) -> str:
-    """Whom a proxy names in a request, whatever their groups are; empty for nobody."""
+    """Return the user named by a proxy, whatever the groups; empty if absent."""
     person: _Person | None = scope.get(_KEY)
     return "" if person is None else PREFIX + person.name
 

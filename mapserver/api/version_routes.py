@@ -20,7 +20,7 @@ from mapserver.store import CanaryRow, MapStore, VersionInfo
 
 
 class ApiSettings(NamedTuple):
-    """Who is let in, and how drafts, canaries and tiles are judged."""
+    """Settings of access, the gate, canaries and tiles."""
 
     guard: GuardSettings = GuardSettings()
     gate: GateSettings = GateSettings()
@@ -29,23 +29,23 @@ class ApiSettings(NamedTuple):
 
 
 def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
-    """Adds the endpoints; the guard lets those change something who may."""
+    """Add the endpoints; the guard checks the right to change versions."""
 
     @app.get("/v1/sites/{site}/versions/{version}/quality")
     def quality(site: Site, version: Version) -> views.QualityView:
-        """What the gate said about a version, and the report of its build."""
+        """Gate results of a version, and the report of its build."""
         info = store.version(site, version)
         report = store.manifest(site, version).report
         return views.QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
 
     @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
     def diff(site: Site, before: Version, after: Version) -> Difference:
-        """What changed between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
+        """Difference between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
         return releases.difference(store, site, before, after)
 
     @app.post("/v1/sites/{site}/versions/{version}/publish")
     def publish(request: Request, site: Site, version: Version, act: views.PublishAct) -> views.VersionView:
-        """Takes a draft through the gate and makes it current."""
+        """Check a draft by the gate and make it current."""
         actor = actor_of(request, act.actor, act.reason)
         if act.trust_calibration:
             releases.trust_calibration(store, store.version(site, version), actor)
@@ -54,35 +54,35 @@ def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings)
 
     @app.post("/v1/sites/{site}/versions/{version}/promote")
     def promote(request: Request, site: Site, version: Version, act: views.Act) -> views.VersionView:
-        """Makes a version that was published before the current one."""
+        """Make an earlier published version current."""
         releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
         return views.version_view(store, store.version(site, version))
 
     @app.post("/v1/sites/{site}/rollback")
     def rollback(request: Request, site: Site, act: views.RollbackAct) -> views.VersionView:
-        """Makes the version current that was so before; the current one retires. A version on trial is taken back instead."""
+        """Make the previous current version current again; the present one retires. A running canary is withdrawn instead."""
         actor = actor_of(request, act.actor, act.reason)
         releases.roll_back(store, site, to=act.to, canary=act.canary, actor=actor)
         return views.version_view(store, cast(VersionInfo, store.current(site)))
 
     @app.get("/v1/sites/{site}/canary")
     def canary(site: Site) -> views.CanaryView:
-        """The version that some robots try, or tried last, beside the others' counts."""
+        """The latest canary version, with its counts beside those of the other robots."""
         store.current(site)
         found = store.canaries(site)
         if not found:
             raise HTTPException(
                 404,
                 f"site {site} never had a canary; `mapserver promote VERSION "
-                f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` begins one",
+                f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` starts one",
             )
         return _view(store, found[0], settings.canary)
 
     @app.post("/v1/sites/{site}/versions/{version}/canary")
     def start_canary(request: Request, site: Site, version: Version, act: views.CanaryAct) -> views.CanaryView:
-        """Lets a share of the robots run a version before the others; a draft goes through the gate first.
+        """Let a share of the robots run a version before the others; a draft goes through the gate first.
 
-        `rollback` takes it back, promoting it ends it early; otherwise the server decides by the failures of both sides.
+        `rollback` withdraws it, promoting it ends it early; otherwise the server decides by the failures of both groups.
         """
         share = settings.canary.share if act.share is None else act.share
         actor = actor_of(request, act.actor, act.reason)

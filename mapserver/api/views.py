@@ -1,4 +1,4 @@
-"""Answers of the API, and the bodies of requests that change something."""
+"""Response and request bodies of the API."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Self
@@ -25,9 +25,9 @@ from mapserver.store import (
 
 
 class VersionView(BaseModel):
-    """A version; map_bytes is what a robot downloads for the whole site, vocabulary apart.
+    """A version; map_bytes is what a robot downloads for the whole site, vocabulary excluded.
 
-    trusted_calibrations: those that a person trusts, by name and reason, although no recording judged them.
+    trusted_calibrations: those trusted by an operator, by name and reason, although no recording judged them.
     """
 
     model_config = ConfigDict(from_attributes=True)
@@ -46,7 +46,7 @@ class VersionView(BaseModel):
 
 
 def version_view(store: MapStore, info: VersionInfo) -> VersionView:
-    """A version as the API tells it."""
+    """Return the API's view of a version."""
     return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
 
 
@@ -76,7 +76,7 @@ class RobotList:
 
 @dataclass(frozen=True, slots=True)
 class EventList:
-    """What happened to a site, oldest first: who did what, when (nanoseconds since 1970) and why."""
+    """Events of a site, oldest first: actor, action, time (nanoseconds since 1970) and reason."""
 
     events: list[Event]
     next: str | None
@@ -92,7 +92,7 @@ class JobList:
 
 @dataclass(frozen=True, slots=True)
 class QualityView:
-    """What is known about a version's quality: what the gate said, oldest first, calibrations that a person trusts, the build's report."""
+    """Quality of a version: gate results, oldest first, calibrations trusted by an operator, and the build's report."""
 
     site: str
     version: int
@@ -122,7 +122,7 @@ class KpisList:
 
 @dataclass(frozen=True, slots=True)
 class HourView:
-    """The figures of one hour; hour_ns: its begin, nanoseconds since 1970."""
+    """The figures of one hour; hour_ns: its start, nanoseconds since 1970."""
 
     hour_ns: int
     measures: Kpis
@@ -146,7 +146,7 @@ class FailureList:
 
 @dataclass(frozen=True, slots=True)
 class FailureView:
-    """One failure. report: the robot's report without pictures; pictures: those that are still kept."""
+    """One failure. report: the robot's report without pictures; pictures: those still stored."""
 
     failure: FailureRow
     report: dict[str, Any]
@@ -155,7 +155,7 @@ class FailureView:
 
 @dataclass(frozen=True, slots=True)
 class CanaryView:
-    """The last version that some robots tried first, and what its counts say; robots: those that take part and are known."""
+    """The latest canary version and its decision; robots: the known robots that take part."""
 
     canary: CanaryRow
     finding: CanaryFinding
@@ -170,7 +170,7 @@ def _body(**example: JsonValue) -> ConfigDict:
 
 
 class Act(BaseModel):
-    """Why something is changed, and by whom; the name is that of the session or token where there is one."""
+    """Reason and author of a change; with a session or token, the author is its name."""
 
     model_config = _body(actor="ada", reason="robots lose themselves in aisle 3")
     actor: Annotated[str | None, Field(min_length=1, max_length=200)] = None
@@ -178,9 +178,9 @@ class Act(BaseModel):
 
 
 class PublishAct(Act):
-    """Who publishes, and why; with `force` also what the gate refuses, except beyond hard limits.
+    """Author and reason of publishing; `force` also publishes what the gate refuses, except beyond hard limits.
 
-    With `trust_calibration` the person says that the calibration is right, although no recording judged it.
+    With `trust_calibration` the author confirms the calibration although no recording judged it.
     """
 
     model_config = _body(actor="ada", reason="hall 2 was emptied", force=True)
@@ -195,7 +195,7 @@ class PublishAct(Act):
 
 
 class RollbackAct(Act):
-    """Who takes the last release back, and why.
+    """Author and reason of a rollback.
 
     With `to` only where that version becomes current again, with `canary` only where it ends the trial of that `id`: else it is 409.
     """
@@ -206,14 +206,14 @@ class RollbackAct(Act):
 
 
 class CanaryAct(Act):
-    """Who lets some robots try a version, and why; share of the robots, the setting's without it."""
+    """Author and reason of a canary; share of the robots, by default the setting's."""
 
     model_config = _body(actor="ada", reason="the nightly map", share=0.05)
     share: Annotated[float | None, Field(gt=0, lt=1)] = None
 
 
 class PlaceAct(Act):
-    """Who says where a robot stands: metres in `map`, the heading from x towards y, and how far off the word may be (one sigma)."""
+    """An operator's pose for a robot: metres in `map`, heading from x towards y, and its uncertainty (one sigma)."""
 
     model_config = _body(actor="ada", x_map_m=12.5, y_map_m=3.0, heading_rad=1.57, sigma_m=0.5)
     x_map_m: Metres
@@ -223,7 +223,7 @@ class PlaceAct(Act):
 
 
 class SurveyAct(Act):
-    """Who asks for a survey of a polygon, and why; its corners in metres of `map`, the first not repeated at the end."""
+    """Author and reason of a survey request; corners of its polygon in metres of `map`, the first not repeated at the end."""
 
     model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
     corners_map_m: Annotated[
@@ -251,7 +251,7 @@ class Problem(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class ServerVersion:
-    """What runs here, and the newest formats that it reads and writes."""
+    """Version of the server, and the newest formats that it reads and writes."""
 
     fleetmap: str
     tile_format: int
@@ -260,6 +260,6 @@ class ServerVersion:
 
 @dataclass(frozen=True, slots=True)
 class ServiceState:
-    """`ok`, or what is missing."""
+    """`ok`, or the missing part."""
 
     status: str

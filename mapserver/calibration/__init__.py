@@ -1,4 +1,4 @@
-"""Calibration measured from recordings: a rig's parameters with their covariance, or what motion would show them."""
+"""Calibration from recordings: a rig's parameters with their covariance, or the motion needed to observe them."""
 
 from mapserver.calibration.estimate import CalibrationEstimate, ParameterEstimate, estimate_from
 from mapserver.calibration.parameters import CalibrationParameter

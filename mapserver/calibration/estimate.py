@@ -1,4 +1,4 @@
-"""The calibration that recordings show: every parameter with its sigma, and whether that is good enough to be used."""
+"""Calibration estimated from recordings: every parameter with its sigma, and whether it is accurate enough to be used."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,24 +16,24 @@ from mapserver.calibration.problem import CalibrationData
 P = CalibrationParameter
 _PAIR = {P.BASELINE, P.FOCAL_RATIO, P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL, P.BASELINE_Y, P.BASELINE_Z}
 _INERTIAL = {P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z, P.TIME_OFFSET, P.GYRO_NOISE, P.ACCEL_NOISE}
-_LARGEST_PRIOR_SHARE = 0.5  # of the prior's sigma: above, the estimate is what was believed before
-MIN_KEYFRAMES = 20  # neighbouring views share their errors: few of them agree with each other about a wrong calibration
+_LARGEST_PRIOR_SHARE = 0.5  # of the prior's sigma: above, the estimate only repeats the prior
+MIN_KEYFRAMES = 20  # neighbouring views have common errors: a few of them can agree on a wrong calibration
 _ADVICE = dict.fromkeys(P, "drive turns")
 _ADVICE[P.BASELINE] = "the accelerometer is hardly excited: start, stop and turn more often, or record wheel odometry"
 _ADVICE |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), "turn to both sides, and start and stop")
 _ADVICE |= {P.TIME_OFFSET: "begin and end turns briskly"}
 _ADVICE |= {P.CAMERA_POSITION_X: "turn to both sides", P.CAMERA_POSITION_Y: "turn to both sides"}
-_ADVICE |= {P.CAMERA_POSITION_Z: "a robot on a level floor does not show it: tilt it over a ramp, or measure by hand"}
+_ADVICE |= {P.CAMERA_POSITION_Z: "unobservable on a level floor: tilt it over a ramp, or measure by hand"}
 _ADVICE |= {P.WHEEL_SCALE: "the wheels' own error and the baseline's look alike: start, stop and turn more often"}
 _ADVICE |= dict.fromkeys((P.GYRO_NOISE, P.ACCEL_NOISE), "record for longer")
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterEstimate:
-    """Correction of one parameter: estimate 0 where the calibration is right.
+    """Correction of one parameter: estimate 0 if the calibration is right.
 
-    sigma: the prior's where nothing shows the parameter. is_judged: known well enough to be used. reason: what motion or sensor
-    would show it, empty where it is judged.
+    sigma: the prior's if the parameter is unobservable. is_judged: accurate enough to be used. reason: the motion or sensor
+    that would make it observable, empty if it is judged.
     """
 
     name: CalibrationParameter
@@ -48,7 +48,7 @@ class ParameterEstimate:
 class CalibrationEstimate:
     """All parameters, and the covariance (C, C) of the first C of them, which are columns of the adjustment.
 
-    keyframes, observations: how much was seen.
+    keyframes, observations: their numbers.
     """
 
     parameters: tuple[ParameterEstimate, ...]
@@ -61,9 +61,9 @@ class CalibrationEstimate:
         return next(p for p in self.parameters if p.name is name)
 
     def corrections(self) -> Array:
-        """(C,) corrections of the judged parameters, given that the rest of the rig keeps its values: those are zero.
+        """Return (C,) corrections of the judged parameters; the rest of the rig keeps its values, corrections zero.
 
-        The wheels are no part of the rig: whatever their error is, it stays as uncertain as it is.
+        The wheels are not part of the rig: the uncertainty of their error is unchanged.
         """
         theta = np.array([p.estimate for p in self.parameters[: len(COLUMNS)]])
         judged = np.array([p.is_judged for p in self.parameters[: len(COLUMNS)]])
@@ -77,12 +77,12 @@ class CalibrationEstimate:
         return theta
 
     def corrected(self, rig: RigCalibration) -> RigCalibration:
-        """`rig`, which must be that of the recordings, with all that is judged corrected."""
+        """Return `rig`, which must be that of the recordings, with all judged parameters corrected."""
         return corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), self.corrections())
 
 
 def continued_from(before: Array, found: CalibrationEstimate) -> CalibrationEstimate:
-    """An estimate relative to a rig that had been corrected by `before` (C,), as one relative to the rig before that."""
+    """Convert an estimate relative to a rig corrected by `before` (C,) into one relative to the uncorrected rig."""
     if not before.any():
         return found
     parameters = []
@@ -95,12 +95,12 @@ def continued_from(before: Array, found: CalibrationEstimate) -> CalibrationEsti
 
 
 def estimate_from(stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
-    """What stretches of drives with one rig say together."""
+    """Return the estimate from stretches of drives with one rig together."""
     return combined([adjust(data) for data in stretches], stretches)
 
 
 def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
-    """The sum of their information; the prior counts once."""
+    """Return the sum of their information; the prior counts once."""
     information = np.diag(prior_information())
     pull = np.zeros(len(COLUMNS))
     for each in adjusted:
@@ -111,7 +111,7 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
     theta = covariance @ pull
     covariance += np.diag(_common_errors(stretches) ** 2)
     first = stretches[0]
-    if not first.is_inertial:  # a gyro tells the focal length whatever the lens is; depths alone do not
+    if not first.is_inertial:  # with a gyro the focal length is observable for any lens; by depths alone it is not
         covariance[INDEX[P.FOCAL], INDEX[P.FOCAL]] += max(each.focal_by_lens for each in adjusted) ** 2
     keyframes = sum(len(data.stamps_ns) for data in stretches)
     has_wheels = any(len(data.wheel) > 0 for data in stretches)
@@ -128,7 +128,7 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
 
 
 def _common_errors(stretches: Sequence[CalibrationData]) -> Array:
-    """(C,) what an error that all pixels or disparities have in common shifts each parameter by: an angle, a share, a lever."""
+    """Return (C,) shifts of the parameters by an error common to all pixels or disparities: an angle, a share, a lever."""
     data, errors = stretches[0], np.zeros(len(COLUMNS))
     camera, bias_px = data.rectifier.camera, data.bias_px
     disparities = np.concatenate([each.obs_pixels[:, 0] - each.obs_pixels[:, 2] for each in stretches])
@@ -173,7 +173,7 @@ def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, flo
 def _judged(
     name: CalibrationParameter, estimate: float, sigma: float, keyframes: int, reason: str
 ) -> ParameterEstimate:
-    """reason: what would show it where it is not sharp."""
+    """reason: the motion or sensor needed if the estimate is not accurate."""
     limits = RANGES[name]
     is_long = keyframes >= MIN_KEYFRAMES
     is_sharp = sigma <= min(limits.useful_sigma, _LARGEST_PRIOR_SHARE * limits.prior_sigma)
@@ -205,7 +205,7 @@ def in_words(parameter: ParameterEstimate) -> tuple[str, str]:
 
 
 def corrected_file(estimate: CalibrationEstimate, rig: RigCalibration, names: list[str]) -> str:
-    """The text of a camchain: the corrected rig, and in comments what was measured and what kept its value."""
+    """Return the text of a camchain: the corrected rig, with comments on measured and unchanged values."""
     lines = [f"# Measured by `mapserver calibrate` from {', '.join(names)}."]
     for p in estimate.parameters:
         value, sigma = in_words(p)

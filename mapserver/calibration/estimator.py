@@ -1,7 +1,7 @@
 """Self-calibrating bundle adjustment: poses, landmarks, motion and the calibration itself, with its covariance.
 
-The survey's bundle adjustment solves; the calibration is the border of its system, and its covariance the inverse of that border's own
-Schur complement. The sizes of the errors are estimated too: each kind of measurement is believed as far as its own residuals allow.
+The survey's bundle adjustment solves; the calibration is the border of its system, and its covariance the inverse of the border's
+Schur complement. The noise scales are estimated too: each kind of measurement is weighted by its own residuals.
 Sources: Triggs et al. 2000, Bundle adjustment, a modern synthesis; Förstner and Wrobel 2016, Photogrammetric computer vision, variance
 components.
 """
@@ -28,16 +28,14 @@ from mapserver.survey.bundle.problem import (
 from mapserver.survey.settings import BundleSettings
 
 SETTINGS = BundleSettings(max_iterations=12, huber_sigmas=3.0, cutoff_sigmas=8.0, lambda_start=1e-6)
-_ROUNDS = 5  # in each the sizes of the errors are estimated anew, and the samples integrated at the new biases
+_ROUNDS = 5  # each re-estimates the noise scales and integrates the samples at the new biases
 _TOLERANCE = 1e-5
-_ROUGH_TOLERANCE = 1e-2  # where the sizes of the errors are not known yet
-_SLOPE_ROUNDS = (
-    2  # in which the lenses' derivatives are taken: at the given calibration, and near the one that is found
-)
-_SHARE = 0.01  # by which a kind of measurement counts more, for its redundancy
-_FIRST_SIGMAS = np.array([0.1] * 3 + [3.0] * 3)  # holds what nothing observes: heading and place of the first keyframe
+_ROUGH_TOLERANCE = 1e-2  # while the noise scales are unknown
+_SLOPE_ROUNDS = 2  # rounds that compute the lenses' derivatives: at the given calibration, and near the result
+_SHARE = 0.01  # increase of one kind's weight, to compute its redundancy by differences
+_FIRST_SIGMAS = np.array([0.1] * 3 + [3.0] * 3)  # fixes the unobservable heading and position of the first keyframe
 _BIAS_SIGMAS = np.repeat([10.0, 0.1, 0.5], 3)  # of the first keyframe: velocity m/s, gyro rad/s, accelerometer m/s^2
-_LOOSE_SIGMAS = np.array([10.0] * 3 + [1000.0] * 3)  # of keyframes that see nothing
+_LOOSE_SIGMAS = np.array([10.0] * 3 + [1000.0] * 3)  # of keyframes without observations
 _MEDIAN_NORM = 1.83  # of four normal rows
 _SMALLEST_SCALE, _LARGEST_SCALE = 0.05, 100.0
 
@@ -52,12 +50,12 @@ class ErrorScales:
     wheel: float = 1.0
 
     def noise(self, given: ImuNoise) -> ImuNoise:
-        """The IMU's noise with these factors; the walks of its biases as they are."""
+        """Return the IMU's noise with these factors; the random walks of its biases are unchanged."""
         gyro, accel = given.gyro_noise_radps_rthz * self.gyro, given.accel_noise_mps2_rthz * self.accel
         return replace(given, gyro_noise_radps_rthz=gyro, accel_noise_mps2_rthz=accel)
 
     def corrected(self, squares: Array, redundancy: Array) -> "ErrorScales":
-        """The scales with which every kind of residual, whose sum of squares should be its redundancy (6,), is as large as it should be."""
+        """Return the scales at which each kind's sum of squared residuals equals its redundancy (6,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.sqrt(squares / redundancy)
         ratio = np.where(np.isfinite(ratio) & (redundancy > 3.0), ratio, 1.0)
@@ -70,9 +68,9 @@ class ErrorScales:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """The optimum: theta (C,) with information (C, C), priors included; the state; the scales of the errors, and
-    their sigmas' shares; lens (UNKNOWNS - C,): corrections of the distortion. focal_by_lens: by how much radial distortion beyond what the
-    given lens may be off by moves the focal length."""
+    """The optimum: theta (C,) with information (C, C), priors included; the state; the noise scales, and the relative sigmas of
+    those; lens (UNKNOWNS - C,): corrections of the distortion. focal_by_lens: change of the focal length by radial distortion beyond the
+    error allowed for the given lens."""
 
     theta: Array
     information: Array
@@ -86,7 +84,7 @@ class Adjusted:
 
 
 def adjust(data: CalibrationData) -> Adjusted:
-    """The calibration that explains `data` best."""
+    """Return the calibration that fits `data` best."""
     problem = Problem(data)
     theta, state = np.zeros(UNKNOWNS), data.start
     scales, redundancy = problem.first_scales(), np.zeros(6)
@@ -113,12 +111,12 @@ def adjust(data: CalibrationData) -> Adjusted:
 
 
 def prior_information() -> Array:
-    """(C,) of the calibration that came with the recording."""
+    """Return (C,) information of the calibration that came with the recording."""
     return np.array([RANGES[p].prior_sigma ** -2 for p in COLUMNS])
 
 
 class Problem:
-    """One stretch, with the samples integrated at some biases and the scales of the errors."""
+    """One stretch, with samples integrated at given biases and noise scales."""
 
     def __init__(self, data: CalibrationData) -> None:
         self.data, self.seen = data, Observations.of(data)
@@ -126,9 +124,9 @@ class Problem:
         self.measured = (
             np.zeros(UNKNOWNS),
             self.seen.measured(np.zeros(UNKNOWNS)),
-        )  # the last theta, and what it makes of the pixels
-        self.slopes = np.zeros((len(data.obs_keyframe), 4, UNKNOWNS))  # of that, by the calibration
-        # Weak priors keep the gauge.
+        )  # the last theta, and its pixels
+        self.slopes = np.zeros((len(data.obs_keyframe), 4, UNKNOWNS))  # derivatives of the pixels by the calibration
+        # Weak priors fix the gauge.
         first = _FIRST_SIGMAS if data.is_inertial else 1e-3 * _FIRST_SIGMAS
         self.priors = [
             PriorTerm(k, map_from_body, np.diag((_LOOSE_SIGMAS if k else first) ** -2.0))
@@ -136,7 +134,7 @@ class Problem:
         ]
 
     def prepare(self, state: MotionState, theta: Array, scales: ErrorScales) -> None:
-        """Integrates the samples and takes over the scales."""
+        """Integrate the samples and set the noise scales."""
         offset_s = float(theta[INDEX[CalibrationParameter.TIME_OFFSET]])
         self.scales, self.base_offset_s = scales, offset_s
         given = self.data.calibration.imu
@@ -145,7 +143,7 @@ class Problem:
         self.rates_map = body_rates(self.data, state, offset_s)
 
     def rows(self, map_from_body: Array, motions: Array, points: Array, theta: Array, derivatives: bool) -> ImageRows:
-        """The images' rows where the body was when they were taken: states are those at the offset at which the samples were integrated."""
+        """Return the images' rows at the body's poses at exposure: states are at the time offset used to integrate the samples."""
         late_s = float(theta[INDEX[CalibrationParameter.TIME_OFFSET]]) - self.base_offset_s
         if self.data.is_inertial and late_s != 0.0:
             turns = np.array([so3_exp(late_s * rate) for rate in self.rates_map])
@@ -158,7 +156,7 @@ class Problem:
         return image_rows(self.seen, self.data, state, *self.measured, self.scales.images, fixed)
 
     def bundle(self, theta: Array, state: MotionState, shares: Array, rows: ImageRows | None = None) -> BundleProblem:
-        """The adjustment at theta and `state`, or with `rows` its images at that point; each kind of motion counts shares (3,) times."""
+        """Return the adjustment at theta and `state`, with `rows` linearised there; each kind of motion is weighted by shares (3,)."""
         rotation, motion, way = shares.tolist()
         inertial, data = None, self.data
         if data.is_inertial:
@@ -189,20 +187,20 @@ class Problem:
         )
 
     def descend(self, theta: Array, state: MotionState, tolerance: float) -> tuple[Array, MotionState]:
-        """The optimum near theta and `state`."""
+        """Return the optimum near theta and `state`."""
         solver = solver_of(self.bundle(theta, state, np.ones(3)), SETTINGS)
         solver.optimize(SETTINGS.lambda_start, SETTINGS.max_iterations, tolerance)
         motions = solver.motions() if self.data.is_inertial else state.motions
         return solver.calibration(), MotionState(solver.map_from_body(), motions, solver.points_map())
 
     def calibration_information(self, theta: Array, state: MotionState) -> Array:
-        """(C, C) of the calibration with everything else marginalised."""
+        """Return (C, C) information of the calibration with everything else marginalised."""
         lower, _ = solver_of(self.bundle(theta, state, np.ones(3)), SETTINGS).reduced(0.0)
         root = np.linalg.cholesky(lower)[-UNKNOWNS:, -UNKNOWNS:]
         return np.asarray(root @ root.T)
 
     def first_scales(self) -> ErrorScales:
-        """Wide enough for the median observation: under a wrong calibration nothing fits at first."""
+        """Return scales wide enough for the median observation: with a wrong calibration all residuals are large at first."""
         rows = image_rows(self.seen, self.data, self.data.start, *self.measured, np.ones(4), None).residuals
         norm = np.linalg.norm(rows[np.isfinite(self.seen.row_sigmas[:, 0])], axis=1)
         return ErrorScales(np.full(4, max(1.0, float(np.median(norm)) / _MEDIAN_NORM) if len(norm) else 1.0))
@@ -233,7 +231,7 @@ class Problem:
         return squares, redundancy
 
     def _log_determinant(self, theta: Array, state: MotionState, rows: ImageRows, shares: Array) -> float:
-        """Of the information of all unknowns, where kinds count shares (6,) times."""
+        """Return it for the information of all unknowns, with the kinds weighted by shares (6,)."""
         factor = np.sqrt(shares[[0, 0, 1, 2]])[:, None]
         scaled = rows._replace(by_point=rows.by_point * factor, by_calibration=rows.by_calibration * factor)
         return solver_of(self.bundle(theta, state, shares[3:], scaled), SETTINGS).log_determinant()

@@ -1,9 +1,9 @@
-"""Calibration of a pair of which only the image size and the baseline are known: focal length = image width, no distortion.
+"""Calibration of a camera pair from the image size and the baseline only: initial focal length = image width, no distortion.
 
-First epipolar geometry: matches of the pair and of the left camera in time, in raw pixels. Nothing is known but that both lenses are of one
-make, have square pixels and look about the same way. Every focal length of a wide range is tried; what explains the matches best is within
-some percent. Then passes of the self-calibrating adjustment with wide priors, images alone; after each the images are rectified again and
-followed anew. It ends where nothing moves any more, and says so where that does not happen.
+First epipolar geometry: matches of the pair and of the left camera in time, in raw pixels. It assumes two lenses of one type with
+square pixels and nearly parallel axes. Every focal length of a wide range is tried; the best fit is within some per cent.
+Then passes of the self-calibrating adjustment with wide priors, by images alone; after each the images are rectified and
+tracked again. It ends when the focal length has converged, and fails with an error if it does not.
 Sources: Hartley and Zisserman 2004, section 11.4 (Sampson distance); Brown 1966 (distortion).
 """
 
@@ -37,8 +37,8 @@ P = CalibrationParameter
 # Radial and tangential terms of any pinhole lens, their difference between two of one make, the right principal point in pixels
 _WIDE_SIGMAS = np.array([0.3, 0.3, 1e-3, 1e-3] + [1e-2, 1e-2, 1e-3, 1e-3] + [15.0] * 2)
 _MOST_PASSES, _SETTLED = 7, 0.003  # of the focal length, as a share
-_LARGEST_PIXEL_SCALE = 3.0  # of the pixels' errors: above, no pinhole lens explains the images
-# What images alone leave, in addition to their own sigma: the recordings of the development were off by 0.8 to 1.1 %
+_LARGEST_PIXEL_SCALE = 3.0  # of the pixels' noise: above, no pinhole lens fits the images
+# Error of images alone, in addition to their own sigma: the recordings of the development were off by 0.8 to 1.1 %
 FOCAL_FLOOR = 0.01
 _MOMENTS, _STEPS, _MATCHES = 20, (4, 10), 120
 _LEAST_FLOW_PX = 8.0  # of a motion, in the median
@@ -54,7 +54,7 @@ class RawMatches:
 
 @dataclass(frozen=True, slots=True)
 class GuessedCalibration:
-    """rig: found by images alone, its baseline as it was given. focal_sigma: as a share. passes: how often the images were followed."""
+    """rig: estimated by images alone, with the given baseline. focal_sigma: relative. passes: number of times the images were tracked."""
 
     rig: RigCalibration
     focal_sigma: float
@@ -63,7 +63,7 @@ class GuessedCalibration:
 
 
 def first_rig(width_px: int, height_px: int, baseline_m: float) -> RigCalibration:
-    """Two parallel pinholes so far apart, with a focal length of the image's width, and no IMU."""
+    """Return two parallel pinholes at this baseline, with a focal length of the image's width, and no IMU."""
     lens = np.array([width_px, width_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1)], np.float64)
     places = (np.zeros(3), np.array([baseline_m, 0.0, 0.0]))
     return RigCalibration(
@@ -77,9 +77,9 @@ def first_rig(width_px: int, height_px: int, baseline_m: float) -> RigCalibratio
 def calibration_from_guess(
     recording: Recording, settings: SurveySettings, tools: SurveyTools | None = None
 ) -> GuessedCalibration:
-    """The lenses and the pair's shape of a recording that was opened with `first_rig`.
+    """Estimate the lenses and relative pose of the pair from a recording opened with `first_rig`.
 
-    RecordingError where they cannot be told from it: too little motion, passes that do not settle, images that no pinhole lens explains.
+    RecordingError if they are unobservable: too little motion, passes without convergence, images that no pinhole lens fits.
     """
     if len(recording.calibration.cameras) < 2:
         raise RecordingError(f"{recording.path} has one camera: only the lenses of a pair can be guessed")
@@ -92,7 +92,7 @@ def calibration_from_guess(
         data = replace(followed(alone, rig, settings, tools), lens_sigmas=_WIDE_SIGMAS)
         found = adjust(data)
         theta = found.theta.copy()
-        theta[[INDEX[P.BASELINE], INDEX[P.WHEEL_SCALE]]] = 0.0  # images alone say nothing about metres
+        theta[[INDEX[P.BASELINE], INDEX[P.WHEEL_SCALE]]] = 0.0  # images alone have no scale
         rig = corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), np.concatenate([theta, found.lens]))
         if number > 0 and abs(theta[INDEX[P.FOCAL]]) < _SETTLED:
             return _judged(rig, found, len(data.stamps_ns), number + 1)
@@ -114,7 +114,7 @@ def _judged(rig: RigCalibration, found: Adjusted, keyframes: int, passes: int) -
 
 
 def raw_matches(recording: Recording, on_progress: Callable[[str, int, int], None]) -> RawMatches:
-    """Matches of unrectified images at moments spread over the busiest stretch."""
+    """Return matches of unrectified images at times spread over the stretch with the most motion."""
     frames = busiest_frames(recording.frame_stamps_ns, recording.imu)
     settings, rng = OrbSettings(count=1500), np.random.default_rng(0)
     pairs, motions = [], []
@@ -154,15 +154,15 @@ def _matched(first: Features, second: Features) -> Array:
 _START_SHARES = (0.6, 1.0, 1.4)  # focal lengths in image widths: from 80 to 40 degrees across
 _ROBUST_PX = 0.5
 _MOST_EVALUATIONS = 60
-# Sigmas of lenses and mounts before anything is seen: right centre in widths, distortion in widths, angles, direction.
+# Sigmas of lenses and mounts a priori: right centre in widths, distortion in widths, angles, direction.
 _CENTRE_SIGMA, _DISTORTION_SIGMA, _TURN_SIGMA, _DIRECTION_SIGMA = 0.02, 1.0, 0.05, 0.03
 _GRID = (30, 24)  # pixels at which a lens is compared with another
 _LENS, _MOTION = 10, 6  # unknowns: of the rig, of each motion
-_LARGEST_SIGMA = 0.25  # of the focal length: from there the adjustment finds its way, from farther nobody has seen it
+_LARGEST_SIGMA = 0.25  # of the focal length: the adjustment converges from within it; beyond is untested
 
 
 class _Unknowns(NamedTuple):
-    """Of the rig: log of the focal length in widths, k1 k2 in widths, turn and direction y z of the right camera, its centre in widths."""
+    """Rig: log of the focal length in widths, k1 k2 in widths, rotation and direction y z of the right camera, its centre in widths."""
 
     focal: float
     distortion: Array
@@ -176,9 +176,9 @@ class _Unknowns(NamedTuple):
 
 
 def guessed_rig(given: RigCalibration, matches: RawMatches) -> RigCalibration:
-    """`given` with lenses and the pair's turn as the matches show them; the length of the baseline stays.
+    """Return `given` with lenses and the pair's rotation estimated from the matches; the length of the baseline is unchanged.
 
-    RecordingError where they do not show the focal length.
+    RecordingError if the focal length is unobservable.
     """
     width, baseline_m = given.cameras[0].width_px, _baseline_m(given)
     if len(matches.pair) < 100 or not matches.motions:
@@ -216,7 +216,7 @@ class _EpipolarProblem:
         self.middle = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
 
     def fit(self, share: float) -> tuple[float, float, Array]:
-        """Cost of the best explanation near a focal length of so many widths, sigma of the focal length as a share, the unknowns."""
+        """Return the cost of the best fit near a focal length in widths, relative sigma of the focal length, the unknowns."""
         start = np.zeros(_LENS + _MOTION * len(self.matches.motions))
         start[0] = np.log(share)
         for n, match in enumerate(self.matches.motions):
@@ -235,7 +235,7 @@ class _EpipolarProblem:
         return float(fit.cost), float(np.sqrt(np.linalg.inv(information)[0, 0])), np.asarray(fit.x)
 
     def residuals(self, values: Array) -> Array:
-        """Distances of the pair's matches, of each motion's, then how far the unknowns are from what is usual, in sigmas."""
+        """Return distances of the pair's matches, of each motion's, then deviations of the unknowns from their priors, in sigmas."""
         rig = _Unknowns.of(values)
         pair, focal_px = self.matches.pair, rig.focal * self.width
         left, right = self._rays(pair[:, :2], rig, 0), self._rays(pair[:, 2:], rig, 1)
@@ -251,7 +251,7 @@ class _EpipolarProblem:
         return np.concatenate([*rows, *usual])
 
     def _rays(self, pixels: Array, rig: _Unknowns, number: int) -> Array:
-        """(N, 3) with z = 1; radial terms act on the distorted place, so that nothing must be inverted."""
+        """Return (N, 3) rays with z = 1; radial terms use the distorted position, so no inversion is needed."""
         places = (pixels - self.middle) / self.width - number * rig.centre
         squared = (places**2).sum(axis=1)
         straight = places * (1.0 + rig.distortion[0] * squared + rig.distortion[1] * squared**2)[:, None] / rig.focal
@@ -268,7 +268,7 @@ class _EpipolarProblem:
         return np.concatenate([so3_log(np.asarray(turn, np.float64)), way.ravel()])
 
     def _pattern(self, unknowns: int) -> lil_matrix:
-        """Which residual depends on which unknown."""
+        """Return the sparsity: which residual depends on which unknown."""
         counts = [len(match) for match in self.matches.motions]
         seen = len(self.matches.pair)
         pattern = lil_matrix((seen + sum(counts) + _LENS - 1 + len(counts), unknowns), dtype=int)
@@ -293,7 +293,7 @@ def _sampson(first: Array, second: Array, rotation: Array, direction: Array) -> 
 
 
 def _distorted(camera: CameraCalibration, focal_px: float, terms: Array) -> CameraCalibration:
-    """The lens of radial-tangential form that has the rays of the guess, at least squares over the image."""
+    """Return the radial-tangential lens with the rays of the guess, by least squares over the image."""
     columns, rows = np.meshgrid(
         np.linspace(0, camera.width_px - 1, _GRID[0]), np.linspace(0, camera.height_px - 1, _GRID[1])
     )
@@ -310,7 +310,7 @@ def _distorted(camera: CameraCalibration, focal_px: float, terms: Array) -> Came
 
 
 def guessed_in_words(found: GuessedCalibration) -> list[str]:
-    """What images alone showed, and what they cannot."""
+    """Return text on the results from images alone, and the parameters that they cannot show."""
     left, right = found.rig.cameras
     turn = np.degrees(so3_log((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, :3]))
     lenses = [
@@ -324,7 +324,7 @@ def guessed_in_words(found: GuessedCalibration) -> list[str]:
 
 
 def guessed_file(found: GuessedCalibration, name: str) -> str:
-    """The text of a camchain of what was found from a guess."""
+    """Return the text of a camchain of the result."""
     lines = [f"# Found by `mapserver calibrate` from {name}, beginning with focal length = image width."]
     return (
         "\n".join([*lines, *(f"# {line}" for line in guessed_in_words(found))]) + "\n" + format_calibration(found.rig)

@@ -1,8 +1,8 @@
-"""Rows of the adjustment that images give: each observation against its landmark, as a function of the calibration.
+"""Image rows of the adjustment: each observation against its landmark, as a function of the calibration.
 
-Measured pixels are taken back to the raw images once; what they mean follows from the lenses, so that a changed calibration moves the
-measurements instead of asking for other images. Rows are compared at the scale of the raw pixels, whose errors are known: at a fixed
-scale a longer focal length would shrink the errors, and so seem likelier than it is.
+Measured pixels are mapped back to the raw images once; their rectified positions follow from the lenses, so a changed calibration moves
+the measurements and needs no new images. Rows are compared at the scale of the raw pixels, whose noise is known: at a fixed
+scale a longer focal length would shrink the errors, and so seem more likely than it is.
 """
 
 from dataclasses import dataclass, replace
@@ -28,10 +28,8 @@ from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
-_BEHIND_SIGMAS = (
-    1000.0  # what an observation counts as whose landmark is behind the camera: beyond every cutoff, and no way out
-)
-# What moves the measurements, and by how much for a difference: lenses in shares and pixels, the pair's angles, distortion
+_BEHIND_SIGMAS = 1000.0  # residual of a landmark behind the camera: beyond every cutoff, with zero slope
+# Step sizes of the numerical derivatives of the measurements: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PAIR_PITCH], INDEX[P.PAIR_YAW], INDEX[P.PAIR_ROLL]), 1e-5)
@@ -43,7 +41,7 @@ _SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
 
 
 class Fixed(NamedTuple):
-    """What hardly changes near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes` (M, 4, C)."""
+    """Nearly constant values near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes` (M, 4, C)."""
 
     rates_map: Array
     slopes: Array
@@ -51,7 +49,7 @@ class Fixed(NamedTuple):
 
 @dataclass(frozen=True)
 class Observations:
-    """Raw pixels (M, 2) in the left and the right image, and the sigmas of the rows (M, 4), infinite where nothing is seen."""
+    """Raw pixels (M, 2) in the left and the right image, and the sigmas of the rows (M, 4), infinite without an observation."""
 
     calibration: RigCalibration
     axes: RigAxes
@@ -62,7 +60,7 @@ class Observations:
 
     @classmethod
     def of(cls, data: CalibrationData) -> "Observations":
-        """The observations of `data` as the raw images show them."""
+        """Return the observations of `data` in raw pixels."""
         rig, camera = data.calibration, data.rectifier.camera
         axes = RigAxes.of(rig, data.rectifier)
         pixels, sigma = data.obs_pixels, data.obs_sigma_px
@@ -76,7 +74,7 @@ class Observations:
         return cls(rig, axes, camera, left, right, np.where(np.isfinite(sigmas), sigmas, np.inf))
 
     def measured(self, theta: Array, views: tuple[StereoCamera, StereoCamera] | None = None) -> Array:
-        """(M, 4) rows: left pixel, disparity and row difference in the rectified image that theta gives, at the scale of `views`."""
+        """Return (M, 4) rows: left pixel, disparity, row difference in the image rectified by theta, at the scale of `views`."""
         rig = corrected_rig(self.calibration, self.axes, theta)
         views = views or self.views(theta)
         left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
@@ -87,13 +85,13 @@ class Observations:
         return np.column_stack([left, left - right])
 
     def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
-        """The pinholes of left and right, each as long as its lens."""
+        """Return the left and right pinholes, each with the focal length of its lens."""
         left = self.camera.focal_px * (1.0 + float(theta[INDEX[P.FOCAL]]))
         right = left * (1.0 + float(theta[INDEX[P.FOCAL_RATIO]]))
         return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
 
     def measured_slopes(self, theta: Array) -> Array:
-        """(M, 4, C) derivatives of `measured` by central differences, the scale of its pinholes held; zero where there are none."""
+        """Return (M, 4, C) derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
         views, slopes = self.views(theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
         for column, size in _LENS_STEPS.items():
             step = size * (np.arange(UNKNOWNS) == column)
@@ -113,7 +111,7 @@ def _rays(camera: StereoCamera, pixels: Array) -> Array:
 
 @dataclass(frozen=True)
 class _View:
-    """Landmarks as the keyframes see them: in the left camera (M, 3), and where they are from the body (M, 3), map axes."""
+    """Landmarks from the keyframes: in the left camera (M, 3), and relative to the body (M, 3), map axes."""
 
     in_left: Array
     from_body: Array
@@ -141,9 +139,9 @@ def image_rows(
     scales: Array,
     fixed: Fixed | None,
 ) -> ImageRows:
-    """Whitened rows at a state, a theta and what is `measured` there, zero where nothing is seen; with `fixed` also their derivatives.
+    """Return whitened rows at a state, a theta and its `measured`, zero without an observation; with `fixed` also derivatives.
 
-    A landmark behind the camera is as far off as can be.
+    A landmark behind the camera gets the largest residual.
 
     scales (4,): factors on the rows' sigmas.
     """
@@ -176,7 +174,7 @@ def image_rows(
 
 
 def _right_place_slopes(axes: RigAxes, theta: Array) -> Array:
-    """(3, 3) derivatives of the right camera's place by baseline and its direction."""
+    """Return (3, 3) derivatives of the right camera's position by baseline and its direction."""
     steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
     moved = [right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1] for step in steps]
     return np.stack(moved, axis=1) / 2e-6
@@ -191,7 +189,7 @@ def _predicted(view: _View, views: tuple[StereoCamera, StereoCamera]) -> Array:
 
 
 def _projection_slopes(points: Array, camera: StereoCamera) -> Array:
-    """(M, 2, 3) derivatives of pixels by points."""
+    """Return (M, 2, 3) derivatives of pixels by points."""
     z = np.maximum(points[:, 2], _MIN_DEPTH_M)
     slopes = np.zeros((len(points), 2, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = camera.focal_px / z

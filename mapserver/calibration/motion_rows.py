@@ -1,4 +1,4 @@
-"""What the IMU and the wheels say of neighbouring keyframes: terms of the adjustment and their whitened residuals."""
+"""IMU and wheel terms between neighbouring keyframes, and their whitened residuals."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -19,29 +19,29 @@ _RATE_NS = 5_000_000  # half the time over which the angular rate at a keyframe 
 
 
 class InertialEdge(NamedTuple):
-    """Samples between keyframes first and first + 1; root (15, 15): of their covariance, its lower triangular factor."""
+    """Samples between keyframes first and first + 1; root (15, 15): lower triangular factor of their covariance."""
 
     first: int
     summed: Preintegrated
     root: Array
 
     def residual(self, state: MotionState) -> Array:
-        """(15,) whitened: rotation, motion, and what the biases wander."""
+        """Return (15,) whitened: rotation, motion, and change of the biases."""
         ends = slice(self.first, self.first + 2)
         increments = packed_increments([self.summed])[0]
         residual, _ = core.inertial_residual(state.map_from_body[ends], state.motions[ends], GRAVITY_MAP, increments)
         return np.asarray(np.linalg.solve(self.root, residual))
 
     def believed(self, rotation: float, motion: float) -> Preintegrated:
-        """The samples with information of rotation and motion that counts so many times."""
+        """Return the samples with information of rotation and motion scaled by these factors."""
         root = self.root / np.sqrt(np.repeat([rotation, motion, 1.0], [3, 6, 6]))
         return replace(self.summed, cov=root @ root.T - np.diag(FLOOR_SIGMA**2))
 
 
 class WheelEdge(NamedTuple):
-    """What the wheels rolled between keyframes first and first + 1.
+    """Wheel displacement between keyframes first and first + 1.
 
-    way_m (3,): in body axes; lever_m (3,): what the turning adds, which no scale changes. whitening (3, 3): the way ahead, and slip.
+    way_m (3,): in body axes; lever_m (3,): part due to the rotation, independent of scale. whitening (3, 3): forward, and slip.
     """
 
     first: int
@@ -50,20 +50,20 @@ class WheelEdge(NamedTuple):
     whitening: Array
 
     def residual(self, state: MotionState, wheel_scale: float) -> Array:
-        """(3,) the way of the body in the axes of the base against that of the wheels, whitened."""
+        """Return (3,) whitened displacement of the body in the axes of the base minus that of the wheels."""
         here, there = state.map_from_body[self.first : self.first + 2]
         way_m = here[:3, :3].T @ (there[:3, 3] - here[:3, 3])
         return np.asarray(self.whitening @ (way_m - (1.0 + wheel_scale) * self.way_m - self.lever_m))
 
     def term(self, share: float) -> RelativeTerm:
-        """The way as a relative pose that says nothing of the turn; it counts so many times along the way."""
+        """Return the displacement as a relative pose without rotation; it is weighted by share along the way."""
         whitening, information = np.sqrt([[share], [1.0], [1.0]]) * self.whitening, np.zeros((6, 6))
         information[3:, 3:] = whitening.T @ whitening
         return RelativeTerm(self.first, self.first + 1, se3(np.eye(3), self.way_m + self.lever_m), information)
 
 
 def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, noise: ImuNoise) -> list[InertialEdge]:
-    """Preintegrated samples between keyframes at the state's biases; offset_s: correction of the calibration's time offset."""
+    """Return preintegrated samples between keyframes at the state's biases; offset_s: correction of the calibration's time offset."""
     if not data.is_inertial:
         return []
     stamps = imu_stamps(data, offset_s)
@@ -77,13 +77,13 @@ def inertial_edges(data: CalibrationData, state: MotionState, offset_s: float, n
 
 
 def imu_stamps(data: CalibrationData, offset_s: float) -> Array:
-    """(K,) stamps of the keyframes on the IMU's clock."""
+    """Return (K,) stamps of the keyframes on the IMU's clock."""
     given_s = data.calibration.cameras[0].imu_minus_cam_s
     return np.asarray(data.stamps_ns + round((given_s + offset_s) * 1e9), np.int64)
 
 
 def body_rates(data: CalibrationData, state: MotionState, offset_s: float) -> Array:
-    """(K, 3) angular rates of the body at the keyframes in map axes, by the gyro; zero without an IMU."""
+    """Return (K, 3) angular rates of the body at the keyframes in map axes, by the gyro; zero without an IMU."""
     rates = np.zeros((len(data.stamps_ns), 3))
     if not data.is_inertial:
         return rates
@@ -95,7 +95,7 @@ def body_rates(data: CalibrationData, state: MotionState, offset_s: float) -> Ar
 
 
 def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scale: float) -> list[WheelEdge]:
-    """What the wheels rolled between keyframes, along the turn that the state has there. scale: of the sigma along the way."""
+    """Return wheel displacements between keyframes, with the rotation of the state. scale: of the sigma along the way."""
     if not data.wheel:
         return []
     stamps, base_from_body = imu_stamps(data, offset_s), data.calibration.base_from_body
@@ -112,7 +112,7 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
         for sample, (at, share) in zip(samples, shares, strict=True):
             way += share * dt_s * so3_exp(turn * at) @ base_from_body[:3, :3].T @ sample.velocity_base_mps
             variance += (share * dt_s * sample.sigma_mps) ** 2
-        # the base moves by R v; the body, which sits elsewhere, by that and the turn of what lies between
+        # the base moves by R v; the body also by the rotation of the lever between them
         lever = base_in_body - so3_exp(turn) @ base_in_body
         sigma = np.array([scale * np.sqrt(variance), _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
         turned = base_from_body[:3, :3] @ so3_exp(-0.5 * turn)
@@ -121,7 +121,7 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
 
 
 def _shares(sample_ns: list[int], start_ns: int, end_ns: int) -> Array:
-    """(n, 2) of each sample, its place between start and end and the share of the time that it stands for."""
+    """Return (n, 2) for each sample: its position between start and end, and its share of the time."""
     at = (np.array(sample_ns, np.int64) - start_ns) / (end_ns - start_ns)
     bounds = np.concatenate([[0.0], 0.5 * (at[1:] + at[:-1]), [1.0]])
     return np.column_stack([at, np.diff(bounds)])

@@ -1,4 +1,4 @@
-"""Parameters of a rig's calibration that a recording can tell, and a rig with them changed.
+"""Parameters of a rig's calibration that a recording can show, and the corrected rig.
 
 All are corrections to the calibration that a recording came with: zero where that is right. Axes of the pair are the rectified ones of
 that calibration: x along the baseline, y down, z ahead.
@@ -15,7 +15,7 @@ from fleetmap.sensors.rectification import Rectifier
 
 
 class CalibrationParameter(StrEnum):
-    """What is estimated. Shares are true / given - 1."""
+    """Estimated parameters. Shares are true / given - 1."""
 
     BASELINE = "baseline"
     FOCAL = "focal length"
@@ -40,11 +40,11 @@ class CalibrationParameter(StrEnum):
 
 
 P = CalibrationParameter
-# The noise scales are no columns of the adjustment: they follow from its residuals.
+# The noise scales are not columns of the adjustment: they follow from its residuals.
 COLUMNS: tuple[CalibrationParameter, ...] = tuple(p for p in P if p not in (P.GYRO_NOISE, P.ACCEL_NOISE))
-# Errors of the lens model take part and are not reported: distortion of both lenses, and the right one's difference and principal point.
-# Their size is what is left of a board's calibration, 0.3 px at the corner of a wide image: no other parameter is to take them up.
-# Tangential terms look like a principal point beside its place: left wide, they take up errors of the images.
+# Errors of the lens model are estimated but not reported: distortion of both lenses, the right one's difference and principal point.
+# Their sigma is the residual error of a board calibration, 0.3 px at the corner of a wide image, so other parameters do not absorb them.
+# Tangential terms resemble a shift of the principal point: with a wide prior they would absorb errors of the images.
 DISTORTION = 4
 LENS_SIGMAS = np.array([1e-3, 1e-3, 5e-5, 5e-5] * 2 + [1e-3] * 2)
 UNKNOWNS = len(COLUMNS) + len(LENS_SIGMAS)
@@ -53,9 +53,9 @@ INDEX: dict[CalibrationParameter, int] = {p: n for n, p in enumerate(COLUMNS)}
 
 @dataclass(frozen=True, slots=True)
 class ParameterRange:
-    """Unit; sigma of what a careless calibration is off by; sigma above which an estimate is of no use.
+    """Unit; sigma of the error of a careless calibration; sigma above which an estimate is useless.
 
-    A limit is what displaces a point at 3 m by about 1 cm, or the image by half a pixel.
+    A limit is the error that displaces a point at 3 m by about 1 cm, or the image by half a pixel.
     """
 
     unit: str
@@ -63,7 +63,7 @@ class ParameterRange:
     useful_sigma: float
 
 
-# By unit: how many of what people read, and with how many digits
+# By unit: factor to the displayed unit, and number of digits
 SHOWN = {
     "": (100.0, "%", 2),
     "rad": (float(np.degrees(1.0)), "degrees", 3),
@@ -89,7 +89,7 @@ RANGES: dict[CalibrationParameter, ParameterRange] = {
     P.CAMERA_POSITION_Y: ParameterRange("m", 0.03, 0.01),
     P.CAMERA_POSITION_Z: ParameterRange("m", 0.03, 0.01),
     P.TIME_OFFSET: ParameterRange("s", 0.05, 2e-3),
-    # Tyres wear and carry loads: half a percent is what a robot's odometry is good for unless somebody has measured it
+    # Tyres wear and deform under load: half a per cent is the accuracy of a robot's odometry without calibration
     P.WHEEL_SCALE: ParameterRange("", 0.005, 0.005),
     P.GYRO_NOISE: ParameterRange("", 10.0, 0.5),
     P.ACCEL_NOISE: ParameterRange("", 10.0, 0.5),
@@ -109,14 +109,14 @@ class RigAxes:
 
     @classmethod
     def of(cls, rig: RigCalibration, rectifier: Rectifier) -> "RigAxes":
-        """The axes to which `rectifier` turns the cameras of `rig`."""
+        """Return the axes to which `rectifier` rotates the cameras of `rig`."""
         body_from_rect = rectifier.body_from_cam[:3, :3]
         turned = np.array([body_from_rect.T @ camera.body_from_cam[:3, :3] for camera in rig.cameras])
         return cls(body_from_rect, turned, rectifier.camera.baseline_m if len(rig.cameras) > 1 else 0.0)
 
 
 def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibration:
-    """`rig` with corrections theta: lenses, the pair's shape, its mounting on the IMU, the clocks. A theta (UNKNOWNS,) holds distortion."""
+    """Return `rig` with corrections theta: lenses, pair, mount on the IMU, clocks. Theta (UNKNOWNS,) includes distortion."""
     left = _camera(rig.cameras[0], theta, 0)
     body_from_rect = axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
     shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
@@ -130,7 +130,7 @@ def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibr
 
 
 def right_camera(axes: RigAxes, theta: Array) -> tuple[Array, Array]:
-    """Rotation (3, 3) rect_from_cam1 and position (3,) of the right camera in the rectified axes of the left one."""
+    """Return rotation (3, 3) rect_from_cam1 and position (3,) of the right camera in the rectified axes of the left one."""
     turn = so3_exp(theta[INDEX[P.PAIR_PITCH] : INDEX[P.PAIR_ROLL] + 1])
     direction = np.array([1.0, theta[INDEX[P.BASELINE_Y]], theta[INDEX[P.BASELINE_Z]]])
     length = axes.baseline_m * (1.0 + theta[INDEX[P.BASELINE]])
@@ -138,7 +138,7 @@ def right_camera(axes: RigAxes, theta: Array) -> tuple[Array, Array]:
 
 
 def with_distortion(distortion: Array, change: Array) -> Array:
-    """The coefficients (k,) with a change (DISTORTION,) of the first ones; what a lens has beyond them is held."""
+    """Return the coefficients (k,) with a change (DISTORTION,) of the first ones; the others are fixed."""
     size = max(DISTORTION, len(distortion))
     return np.pad(distortion, (0, size - len(distortion))) + np.pad(change, (0, size - DISTORTION))
 

@@ -1,4 +1,4 @@
-"""Values that a calibration is estimated from: keyframes, landmarks, inertial samples, wheels."""
+"""Inputs of a calibration estimate: keyframes, landmarks, inertial samples, wheels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,12 +27,12 @@ class MotionState:
 
 @dataclass(frozen=True)
 class CalibrationData:
-    """One stretch of a recording, as a survey has followed it under `calibration`, with `rectifier` made from that.
+    """One stretch of a recording, tracked by a survey under `calibration`, with the `rectifier` of that calibration.
 
     stamps_ns (K,) on the cameras' clock. Observations are sorted by landmark: obs_keyframe, obs_landmark (M,); obs_pixels (M, 4) of
-    the rectified pair: u_left, v_left, u_right, v_right, the last two NaN where the right image shows nothing. obs_sigma_px (M, 3): of the
-    left pixel, of the disparity, of the row difference. imu: empty without one. bias_px: error that pixels and disparities may have in
-    common, which no number of them averages out. lens_sigmas: of the distortion that was given.
+    the rectified pair: u_left, v_left, u_right, v_right, the last two NaN without a match in the right image. obs_sigma_px (M, 3): of the
+    left pixel, of the disparity, of the row difference. imu: empty if absent. bias_px: possible common error of pixels and disparities,
+    which does not average out. lens_sigmas: of the given distortion.
     """
 
     calibration: RigCalibration
@@ -50,5 +50,5 @@ class CalibrationData:
 
     @property
     def is_inertial(self) -> bool:
-        """Whether an IMU takes part."""
+        """True if the data include an IMU."""
         return self.calibration.imu is not None and len(self.imu) > 0

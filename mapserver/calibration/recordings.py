@@ -1,4 +1,4 @@
-"""Calibration of recordings: their busiest stretches are followed as a survey would, and adjusted together with the calibration."""
+"""Calibration of recordings: the stretches with the most motion are tracked as in a survey, then adjusted with the calibration."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,10 +27,10 @@ from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTo
 P = CalibrationParameter
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 Follow = Callable[[Recording, RigCalibration], CalibrationData]
-LONGEST_S = 30.0  # of a recording: its busiest stretch
+LONGEST_S = 30.0  # of a recording: its stretch with the most motion
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
 _PASSES = 3
-# A correction above this changes what is matched and how: the images are rectified again and followed anew.
+# A correction above this changes the matches: the images are rectified and tracked again.
 _ANEW = {
     P.FOCAL: 0.005,
     P.FOCAL_RATIO: 0.002,
@@ -50,11 +50,11 @@ def estimate_calibration(
     is_enough: IsEnough = lambda *_: False,
     follow: Follow | None = None,
 ) -> CalibrationEstimate:
-    """The calibration that recordings of one rig show together.
+    """Return the calibration estimated from recordings of one rig together.
 
-    is_enough: whether an estimate need not be any better, however far the parameters that are named are from the given calibration.
-    follow: gives what a recording shows under a calibration; None for its busiest stretch.
-    RecordingError where there is none or where their calibrations differ; SurveyError where one of them holds too little to be followed.
+    is_enough: True if an estimate is accurate enough, however far the named parameters are from the given calibration.
+    follow: returns the tracked data of a recording under a calibration; None for its stretch with the most motion.
+    RecordingError if there is no recording or their calibrations differ; SurveyError if one of them is too short to be tracked.
     """
     if not recordings:
         raise RecordingError("no recording to calibrate from; name at least one")
@@ -101,7 +101,7 @@ def _is_same(rig: RigCalibration, other: RigCalibration) -> bool:
 def followed(
     recording: Recording, rig: RigCalibration, settings: SurveySettings, tools: SurveyTools
 ) -> CalibrationData:
-    """The busiest stretch of a recording, followed under the calibration `rig`."""
+    """Return the stretch with the most motion, tracked under the calibration `rig`."""
     recording, chosen = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frames = (recording.read_frame(int(index)) for index in chosen)
@@ -110,7 +110,7 @@ def followed(
 
 
 def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
-    """Numbers of the frames of the LONGEST_S seconds in which gyro and accelerometer feel most, the first where there is no IMU."""
+    """Return the numbers of the frames of the LONGEST_S seconds with the most motion by gyro and accelerometer, the first without IMU."""
     last = np.searchsorted(stamps, stamps + int(LONGEST_S * 1e9))
     starts = np.flatnonzero(last < len(stamps))
     if not len(starts):
@@ -126,7 +126,7 @@ def busiest_frames(stamps: Stamps, imu: ImuSamples) -> NDArray[np.int64]:
     return np.arange(best, last[best], dtype=np.int64)
 
 
-MOST_KEYFRAMES, _SEEN = 120, 300  # of one stretch, and landmarks of each: more would cost time and say little more
+MOST_KEYFRAMES, _SEEN = 120, 300  # of one stretch, and landmarks of each: more cost time and add little
 _ROW_SIGMA_PX = 0.15
 # Stereo windows are off by 0.02 px on slanted surfaces, measured in the simulator
 _BIAS_PX = 0.02
@@ -136,7 +136,7 @@ _ROW_SEARCH_PX = 3.0
 def busiest_stretch(
     begun: AdjustedChain, rig: tuple[RigCalibration, Rectifier], wheel: Sequence[WheelSample]
 ) -> CalibrationData:
-    """The keyframes of a survey that turn most, with what they see. rig: the calibration that the survey used, and its rectifier."""
+    """Return the keyframes of a survey with the most rotation, and their observations. rig: the survey's calibration and rectifier."""
     chosen, keyframes = _busiest(begun.state), begun.odometry.keyframes
     part = begun.state.of(chosen)
     marks, motion = _thinned(part.landmarks, len(part.stamps_ns)), part.motion
@@ -164,14 +164,14 @@ def busiest_stretch(
 
 
 def _thinned(marks: Landmarks, keyframes: int) -> Landmarks:
-    """An even choice of the landmarks, with about _SEEN of them in each keyframe."""
+    """Return an even choice of the landmarks, with about _SEEN of them in each keyframe."""
     share = min(1.0, _SEEN * keyframes / max(len(marks.obs_landmark), 1))
     kept = np.diff(np.floor(share * np.arange(len(marks.points_map) + 1))) > 0
     return marks.keep_observations(kept[marks.obs_landmark], 1)
 
 
 def _busiest(state: SurveyState) -> NDArray[np.bool_]:
-    """(K,) the run of keyframes with the most turning, all of them where they are few."""
+    """Return (K,) the run of keyframes with the most rotation, all of them if they are few."""
     count = len(state.stamps_ns)
     chosen = np.ones(count, bool)
     if count <= MOST_KEYFRAMES:
@@ -187,7 +187,7 @@ def _busiest(state: SurveyState) -> NDArray[np.bool_]:
 
 
 def _with_rows(pixels: Array, obs_keyframe: NDArray[np.int32], keyframes: Sequence[Keyframe]) -> Array:
-    """(M, 4) the observations with their rows in the right image, NaN where it shows none."""
+    """Return (M, 4) the observations with their rows in the right image, NaN without a match."""
     found = np.full((len(pixels), 4), np.nan)
     found[:, :3] = pixels
     for k, keyframe in enumerate(keyframes):
@@ -199,7 +199,7 @@ def _with_rows(pixels: Array, obs_keyframe: NDArray[np.int32], keyframes: Sequen
 
 
 def _right_rows(frame: RectifiedFrame, pixels: Array) -> Array:
-    """(M,) rows at which the right image shows what the left one has at `pixels` (M, 3), by Lucas-Kanade; NaN where it does not."""
+    """Return (M,) rows in the right image of the left image's `pixels` (M, 3), by Lucas-Kanade; NaN without a match."""
     if frame.right is None:
         return np.full(len(pixels), np.nan)
     left = pixels[:, :2].astype(np.float32).reshape(-1, 1, 2)

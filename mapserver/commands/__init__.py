@@ -1,1 +1,1 @@
-"""The commands of `mapserver`, a file for each or for those that belong together."""
+"""The commands of `mapserver`, one file per command or group."""

@@ -1,4 +1,4 @@
-"""`mapserver align`: where a site's map lies in the drawing of its building."""
+"""`mapserver align`: the pose of a site's map in the drawing of its building."""
 
 from math import degrees
 from pathlib import Path
@@ -28,26 +28,26 @@ def align(
         typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: the pins give it.")
+        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: estimated from the pins.")
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Print the alignment that is kept; change nothing.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Print the stored alignment; change nothing.")] = False,
     level: Annotated[str, typer.Option(metavar="NAME", help="Name of the level for Open-RMF.")] = "L1",
     json: Json = False,
     by: ActorOptions,
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
 ) -> None:
-    """Find where the map lies in the drawing of its building, and keep it; robots learn it by the signed list."""
+    """Estimate the pose of the map in the building's drawing, and store it; robots get it with the signed list."""
     from fleetmap.mapformat.building import ALIGNMENT
     from mapserver.floor_plan.alignment import PLAN, encode_alignment
 
     named = plan is not None or bool(pin)
     if show + forget + named != 1:
-        raise UsageError("name --pin (and --plan) to align, --show to print what is kept, or --forget")
+        raise UsageError("name --pin (and --plan) to align, --show to print the stored alignment, or --forget")
     with open_store(where.store, read_only=show) as maps:
         corners = _corners(maps, where.site)
         if forget:
             maps.keep_site_files(where.site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=by.named())
-            typer.echo(f"site {where.site}: the alignment is forgotten; robots go by what their version says")
+            typer.echo(f"site {where.site}: the alignment is forgotten; robots use the alignment of their version")
             return
         if named:
             found, data = _aligned(plan, pin or [], metres_per_pixel, corners)
@@ -63,12 +63,12 @@ def align(
 
 
 def _corners(maps: "MapStore", site: str) -> "Array":
-    """Of the current version, in whose frame pins are: a draft without one before it has a frame of its own."""
+    """Corners of the current version. Its frame is that of the pins; a first draft has its own frame."""
     from mapserver.floor_plan.alignment import map_corners_m
 
     current = maps.current(site)
     if current is None:
-        raise UsageError(f"site {site} has no current version, whose frame stays; publish one first")
+        raise UsageError(f"site {site} has no current version to align; publish one first")
     return map_corners_m(maps.manifest(site, current.version))
 
 
@@ -86,7 +86,7 @@ def _aligned(
     fit = fit_pins(pins, metres_per_pixel, corners)
     if not fit.is_checked:
         typer.echo(
-            "note: the pins lie on one line: a mirrored plan would not show; add a pin beside the line", err=True
+            "note: the pins lie on one line and cannot reveal a mirrored plan; add a pin beside the line", err=True
         )
     typer.echo(f"at the far end of the map positions in the building are known to {2 * fit.far_sigma_m:.2f} m (95 %)")
     return Alignment(

@@ -1,4 +1,4 @@
-"""`mapserver areas`: the areas of a site that people have names for."""
+"""`mapserver areas`: the named areas of a site."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ def import_(
     where: SiteOptions,
     by: ActorOptions,
 ) -> None:
-    """Take the areas of FILE in the place of those that the site has; reports, pages and metrics then speak of them."""
+    """Replace the areas of the site by those of FILE; reports, pages and metrics then use them."""
     from fleetmap.mapformat.building import AREAS
     from mapserver.floor_plan.areas import MAX_AREAS_BYTES, read_areas
     from mapserver.grid.masks import check_masks_on_map
@@ -37,7 +37,7 @@ def import_(
 
 @expand_options
 def remove(where: SiteOptions, by: ActorOptions) -> None:
-    """Forget the areas of a site; what was counted for them stays."""
+    """Delete the areas of a site; their past counts stay."""
     from fleetmap.mapformat.building import AREAS
 
     with open_store(where.store) as maps:
@@ -49,7 +49,7 @@ def remove(where: SiteOptions, by: ActorOptions) -> None:
 def list_(where: SiteOptions, json: Json = False) -> None:
     """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
     with open_store(where.store, read_only=True) as maps:
-        maps.current(where.site)  # an unknown site is not an empty one
+        maps.current(where.site)  # raises for an unknown site
         areas = maps.areas(where.site)
     if json:
         print_json(areas.geojson(where.site))
@@ -70,7 +70,7 @@ def export(
         Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's SpeedFilter, and its image.")
     ] = None,
 ) -> None:
-    """Write the areas with a mask as nav2's costmap filters read them, in the frame of the map."""
+    """Write the areas with a mask for nav2's costmap filters, in the frame of the map."""
     from fleetmap.occupancy_grid import write_grid
     from mapserver.floor_plan.areas import MaskKind
     from mapserver.grid.masks import mask_grid
@@ -90,6 +90,6 @@ def export(
 
 
 AREAS_GROUP = Group(
-    "The areas of a site that people have names for.",
+    "Named areas of a site.",
     {"import": import_, "list": list_, "remove": remove, "export": export},
 )

@@ -1,4 +1,4 @@
-"""`mapserver build`: recordings become a draft in the store."""
+"""`mapserver build`: build a draft in the store from recordings."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ def build(
     recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Folder or file to survey.")],
     options: BuildCommandOptions,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system to begin with.")
+        Path | None, typer.Option(metavar="FILE", help="Poses of another SLAM system as the start.")
     ] = None,
     trajectory_frame: Annotated[
         str | None, typer.Option(metavar="NAME", help="Poses of the `camera` (default) or of the `body`.")
@@ -81,5 +81,5 @@ def _other_trajectory(file: Path | None, frame: str | None, scale: float | None)
         return OtherTrajectory(file, frame or "camera", scale)
     for option, value in (("--trajectory-frame", frame), ("--trajectory-scale", scale)):
         if value is not None:
-            raise UsageError(f"{option} says something of --trajectory FILE, which is missing")
+            raise UsageError(f"{option} describes --trajectory FILE, which is missing; add it")
     return None

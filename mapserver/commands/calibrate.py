@@ -34,15 +34,15 @@ def calibrate(
         str | None,
         typer.Option(
             metavar="WxH:M",
-            help="No calibration is at hand: size of the raw images and metres between the cameras, 752x480:0.11.",
+            help="Without a calibration: raw image size and metres between the cameras, 752x480:0.11.",
         ),
     ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Measure the calibration of cameras, IMU and wheels from recordings with turns, and write it.
 
-    What the recordings do not show keeps its value. With --guess nothing else is known: lenses and the pair's
-    angles are found from focal length = image width, by the images alone.
+    Parameters that the recordings cannot show keep their values. With --guess no calibration is needed: lenses and the
+    pair's angles are estimated from focal length = image width, by the images alone.
     """
     check_output("--out", out)
     from fleetmap.recordings import OpenOptions, open_recording
@@ -67,14 +67,14 @@ def calibrate(
         return
     if not any(p.is_judged for p in estimate.parameters):
         raise RecordingError(
-            f"--out {out}: nothing could be judged, so nothing is written; the table says what motion is missing"
+            f"--out {out}: nothing could be judged, so nothing is written; the table names the missing motion"
         )
     text = corrected_file(estimate, rig, [source.name for source in sources])
     _write(out, text, f"check it with `mapserver doctor RECORDING --calibration {out}`")
 
 
 def _sound(recording: "Recording") -> "Recording":
-    """The recording without the damaged images of the stretch that is followed, its issues printed."""
+    """Return the recording without damaged images in the tracked stretch, with its issues printed."""
     from mapserver.calibration.recordings import busiest_frames
 
     sound, _ = recording.readable(busiest_frames(recording.frame_stamps_ns, recording.imu))
@@ -85,7 +85,7 @@ def _sound(recording: "Recording") -> "Recording":
 
 @contextmanager
 def _shown() -> "Iterator[SurveyTools]":
-    """Tools of a survey whose progress is shown."""
+    """Tools of a survey with displayed progress."""
     from rich.progress import Progress
 
     from fleetmap.console import plain_console
@@ -123,7 +123,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))
     if out is not None:
-        advice = f"add how the IMU is mounted, then calibrate again with --calibration {out}"
+        advice = f"add the pose of the IMU, then calibrate again with --calibration {out}"
         _write(out, guessed_file(found, name), advice)
 
 

@@ -56,7 +56,7 @@ def doctor(
 
 
 def _print(source: "Recording", findings: "list[Finding]") -> None:
-    """One line for all, then the findings, the worst first; those that lack the same in one row."""
+    """Print a summary line, then the findings, the worst first; those with the same missing sensor in one row."""
     from rich.table import Table
     from rich.text import Text
 

@@ -24,7 +24,7 @@ def evaluate(
     json: Json = False,
     config: ConfigFile = None,
 ) -> None:
-    """Print the errors of a trajectory: aligned rigidly, aligned with scale, as it is, from stamp to stamp, and its drift."""
+    """Print the errors of a trajectory: aligned rigidly, aligned with scale, unaligned, between stamps, and its drift."""
     from rich.table import Table
 
     from fleetmap.console import plain_console

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class ExportFormat(StrEnum):
-    """What `fleet export` writes."""
+    """File format of `fleet export`."""
 
     JSONL = "jsonl"
     MCAP = "mcap"
@@ -34,7 +34,7 @@ def report(
     hours: Annotated[int, typer.Option(min=1, max=9600, help="Hours to look back.")] = 24,
     config: ConfigFile = None,
 ) -> None:
-    """Write one page for the shift leader: failures per robot-day, the worst robots, versions, causes, tiles to survey again."""
+    """Write a one-page report for the shift leader: failures per robot-day, worst robots, versions, causes, tiles to resurvey."""
     from mapserver.dashboard.shift_page import html_page
     from mapserver.fleet.shift_summary import summarise
 
@@ -54,7 +54,7 @@ def export(
         ExportFormat | None, typer.Option("--format", help="jsonl or mcap; default: by the file's name.")
     ] = None,
 ) -> None:
-    """Write failures as JSON lines, or as MCAP with log, places and pictures, which Foxglove opens."""
+    """Write failures as JSON lines, or as MCAP with log, positions and pictures for Foxglove."""
     from mapserver.fleet.exports import write_json_lines, write_mcap
     from mapserver.store import FailureFilter
 
@@ -80,7 +80,7 @@ def resurvey(
     json: Json = False,
     config: ConfigFile = None,
 ) -> None:
-    """List the tiles that should be surveyed again and why, those that people asked for first; with --route a way through them."""
+    """List the tiles to resurvey with reasons, requested tiles first; --route writes a route through them."""
     from mapserver.fleet.resurvey_list import resurvey_list
 
     settings = settings_of(context).resurvey
@@ -95,7 +95,7 @@ def resurvey(
         typer.echo(f"{concern.name}: {'; '.join(concern.reasons)}")
     for request in found.requests:
         typer.echo(
-            f"request {request.id} of {request.actor or 'somebody'}: {len(request.corners_map_m)} corners, {request.reason or '-'}"
+            f"request {request.id} of {request.actor or 'unnamed'}: {len(request.corners_map_m)} corners, {request.reason or '-'}"
         )
     typer.echo(f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints")
 
@@ -120,13 +120,11 @@ def replay(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Ask whether the present localizer would have failed too, in the robot's map or in another version."""
+    """Replay a failure with the present localizer, in the robot's map or in another version."""
     from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
 
     if find_spec("locclient") is None:
-        raise StateError(
-            "the client of the robots is not installed here; install the distribution `fleetmap` as a whole"
-        )
+        raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
     with open_store(store, read_only=True) as maps, TemporaryDirectory() as folder:
         path = Path(folder) / f"failure-{failure}.mcap"
         path.write_bytes(maps.fleet.replay(failure))
@@ -135,7 +133,7 @@ def replay(
         options = ["--store", str(store), "--site", site, "--report", str(report)]
         if version is not None:
             options += ["--version", str(version)]
-        # A process of its own: the server's side does not know the robot's (ARCHITECTURE.md), and the file is a robot's.
+        # In a separate process: the server does not import the robot's side (ARCHITECTURE.md), and the file is from a robot.
         command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
         output = report.read_text("utf-8") if json and report.exists() else done.output

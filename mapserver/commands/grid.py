@@ -1,4 +1,4 @@
-"""`mapserver grid`: the map of planners that a version holds, as map_server files."""
+"""`mapserver grid`: the planner grid of a version, as map_server files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,13 +10,13 @@ from fleetmap.errors import disk_errors
 from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, version_named
 
 RobotHeight = Annotated[
-    float, typer.Option(metavar="METRES", help="Height of the tallest robot: what hangs higher is no obstacle.")
+    float, typer.Option(metavar="METRES", help="Height of the tallest robot: higher objects are not obstacles.")
 ]
 
 
 def export(
     file: Annotated[
-        Path, typer.Argument(metavar="OUT.yaml", help="File to write; its image OUT.pgm is put beside it.")
+        Path, typer.Argument(metavar="OUT.yaml", help="File to write; its image OUT.pgm is written beside it.")
     ],
     site: SiteName,
     store: StoreFolder,
@@ -27,7 +27,7 @@ def export(
         typer.Option(metavar="FILE.npz", help="Write the lowest and highest surface of each cell to this file, too."),
     ] = None,
 ) -> None:
-    """Write the occupancy grid of a version as nav2's map_server reads it, in the frame of the map that robots use."""
+    """Write the occupancy grid of a version for nav2's map_server, in the robots' map frame."""
     check_output("OUT.yaml", file, ".yaml")
     check_output("--heights", heights)
     import numpy as np
@@ -59,4 +59,4 @@ def export(
     )
 
 
-GRID = Group("The map of planners that a version holds.", {"export": export})
+GRID = Group("Planner grid of a version.", {"export": export})

@@ -1,4 +1,4 @@
-"""`mapserver live`: a survey is mapped while it drives, seen by everybody who looks, and stored as a draft at its end."""
+"""`mapserver live`: map a survey during the drive, show it to viewers, and store it as a draft at its end."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -34,15 +34,15 @@ class LiveCommandOptions(SurveyOptions):
     sensors: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Drive with the sources and topics of this file instead.")
     ] = None
-    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Where --sensors are recorded to.")] = None
+    record: Annotated[Path | None, typer.Option(metavar="FILE.mcap", help="Recording of --sensors to write.")] = None
     server: Annotated[
         str | None,
         typer.Option(metavar="ENDPOINT", help="zenoh endpoint of the server whose dashboard shows the survey."),
     ] = None
     foxglove: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there; nobody signs in.")
+        str | None, typer.Option(metavar="[HOST:]PORT", help="Show the survey in Foxglove there, without sign-in.")
     ] = None
-    insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines see what --foxglove shows.")] = False
+    insecure: Annotated[bool, typer.Option("--insecure", help="Let other machines connect to --foxglove.")] = False
 
 
 @expand_options
@@ -52,7 +52,7 @@ def live(
     recording: Annotated[Path | None, typer.Argument(metavar="[RECORDING]", help="Folder or file to play.")] = None,
     config: ConfigFile = None,
 ) -> None:
-    """Map a survey while it drives; Ctrl-C ends the drive, and what was seen becomes a draft."""
+    """Map a survey during the drive; Ctrl-C ends the drive and stores a draft."""
     options.check()
     sensors = (options.sensors or config_path(context)) if recording is None else options.sensors
     if (recording is None) == (sensors is None) or (recording is None) != (options.record is not None):
@@ -62,7 +62,7 @@ def live(
     of_recordings = [name for name in ("use", "calibration", "topic") if getattr(options, name) is not None]
     if recording is None and of_recordings:
         raise UsageError(
-            f"--{of_recordings[0]} says how a RECORDING is read; the [source] and [topics] of {sensors} say it of sensors"
+            f"--{of_recordings[0]} applies to a RECORDING only; for sensors set [source] and [topics] in {sensors}"
         )
     from fleetmap.console import plain_console
     from fleetmap.foxglove import require_foxglove, viewer_address
@@ -94,7 +94,7 @@ def live(
 
 @contextmanager
 def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[tuple[Drive, SurveySettings]]":
-    """A recording, and the settings that suit its sensors."""
+    """Return a recording, and the settings for its sensors."""
     from mapserver.config import survey_settings
     from mapserver.live import RecordedDrive
 
@@ -107,7 +107,7 @@ def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[t
 def _driven(
     given: "MapserverConfig", record: Path | None, build: "BuildOptions"
 ) -> "Iterator[tuple[Drive, SurveySettings]]":
-    """The sensors that a configuration file names, and the settings that suit them; errors of `open_source`."""
+    """Return the sensors named in a configuration file, and their settings; errors of `open_source`."""
     from fleetmap.sensors.samples import SensorSet
     from fleetmap.sources.source import open_source
     from mapserver.config import survey_settings
@@ -126,7 +126,7 @@ def _driven(
 
 
 def _stopping() -> Callable[[], bool]:
-    """Whether Ctrl-C or SIGTERM has ended the drive; a second one ends the build too."""
+    """Return a function that is True once Ctrl-C or SIGTERM has ended the drive; a second signal ends the build too."""
     stopped = False
 
     def stop(*_: object) -> None:
@@ -170,7 +170,7 @@ def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSu
 
     def tell(state: "LiveSurveyState") -> None:
         if bus is not None:
-            with suppress(LinkError):  # a survey goes on without those who look at it
+            with suppress(LinkError):  # a survey continues without viewers
                 bus.publish(live_key(state.site), encode_message(state), may_drop=True)
         if viewer is not None:
             viewer.tell(state)

@@ -1,4 +1,4 @@
-"""`mapserver nightly`: new recordings become the site's next version."""
+"""`mapserver nightly`: build the site's next version from new recordings."""
 
 import time
 from contextlib import suppress
@@ -27,7 +27,7 @@ class NightlyOptions(SurveyOptions):
 def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile = None) -> None:
     """Check, build, judge and publish the recordings in the inbox; one run at a time for each site.
 
-    Status 0 also with an empty inbox, 4 if the gate refuses, 5 if another run is at work.
+    Status 0 also for an empty inbox, 4 if the gate refuses, 5 if another run is at work.
     """
     options.check()
     from fleetmap.console import plain_console
@@ -57,5 +57,5 @@ def _write(options: NightlyOptions) -> None:
     content = None if report is None else last_report(options.store, options.site)
     if report is None or content is None:
         return
-    with disk_errors(f"{report} cannot be written", "the store's jobs say the same"):
+    with disk_errors(f"{report} cannot be written", "the store's jobs hold the same report"):
         report.write_bytes(to_json(content, indent=2) + b"\n")

@@ -1,4 +1,4 @@
-"""`mapserver operators`: the people and programs that a server answers."""
+"""`mapserver operators`: accounts of operators and programs."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +19,7 @@ Asked = Annotated[bool, typer.Option("--ask", help="Ask for a password instead o
 
 @expand_options
 def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.VIEWER, ask: Asked = False) -> None:
-    """Name an operator; prints the password once. From the first one on, a server answers only who signs in."""
+    """Add an operator; prints the password once. With the first operator, the server requires sign-in."""
     from mapserver.operators.operators import Operators
 
     with open_store(store) as maps:
@@ -30,7 +30,7 @@ def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.V
 
 @expand_options
 def password(name: Name, store: StoreFolder, by: ActorOptions, ask: Asked = False) -> None:
-    """Give an operator another password, a disabled one too; ends the sessions that there are."""
+    """Set a new password for an operator, also a disabled one; ends the existing sessions."""
     from mapserver.operators.operators import Operators
 
     with open_store(store) as maps:
@@ -47,7 +47,7 @@ def role(
     store: StoreFolder,
     by: ActorOptions,
 ) -> None:
-    """Give an operator another role, at once."""
+    """Change the role of an operator, effective at once."""
     with open_store(store) as maps:
         _check_person(maps, name)
         maps.operators.set_role(name, role.value, by.named())
@@ -56,7 +56,7 @@ def role(
 
 @expand_options
 def disable(name: Name, store: StoreFolder, by: ActorOptions) -> None:
-    """End the sessions and tokens of a name at once, and let nobody sign in by it."""
+    """End the sessions and tokens of a name at once, and refuse its sign-in."""
     with open_store(store) as maps:
         maps.operators.disable(name, by.named())
     typer.echo(f"operator {name} is disabled")
@@ -70,12 +70,12 @@ def token(
     scope: Annotated[list[str] | None, typer.Option(metavar="SCOPE", help="What it may; repeat it.")] = None,
     days: Annotated[float, typer.Option(min=0.01, max=400, help="Days after which it ends.")] = 90,
 ) -> None:
-    """Make a token for a program, which shows it as `Authorization: Bearer TOKEN`; prints it once."""
+    """Create a token for a program, sent as `Authorization: Bearer TOKEN`; prints it once."""
     from mapserver.operators.operators import Operators
 
     wrong = [word for word in scope or () if word not in set(Scope)]
     if wrong or not scope:
-        raise UsageError(f"--scope {wrong[0] if wrong else ''}: say what the token may: {', '.join(Scope)}")
+        raise UsageError(f"--scope {wrong[0] if wrong else ''}: choose the token's scope: {', '.join(Scope)}")
     with open_store(store) as maps:
         made = Operators(maps).make_token(name, scope, days, by.named())
     typer.echo(made)
@@ -106,7 +106,7 @@ def _check_person(maps: "MapStore", name: str) -> None:
 
 
 def _password(*, ask: bool) -> tuple[str, str]:
-    """A password, and the words that show one that was made."""
+    """Return a password, and text that shows a generated one."""
     from mapserver.operators.operators import MAX_PASSWORD, MIN_PASSWORD
     from mapserver.trust.keys import make_passphrase
 
@@ -115,12 +115,12 @@ def _password(*, ask: bool) -> tuple[str, str]:
         return made, f"; password (shown once): {made}"
     chosen: str = typer.prompt("password", hide_input=True, confirmation_prompt=True)
     if not MIN_PASSWORD <= len(chosen) <= MAX_PASSWORD:
-        raise UsageError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} signs; leave --ask out to have one made")
+        raise UsageError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters; leave --ask out to generate one")
     return chosen, ""
 
 
 OPERATORS = Group(
-    "The people and programs that a server answers.",
+    "Accounts of operators and programs.",
     {
         "add": add,
         "password": password,

@@ -61,7 +61,7 @@ class SurveyOptions(SiteOptions):
     calibration: Calibration = None
     topic: TopicNames = None
     zones: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="TOML file with areas that cannot see each other.")
+        Path | None, typer.Option(metavar="FILE", help="TOML file of areas without sight of each other.")
     ] = None
     report: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the JSON report to this file.")] = None
     threads: Annotated[int | None, typer.Option(min=1, help="Number of threads; default: one per core.")] = None
@@ -71,7 +71,7 @@ class SurveyOptions(SiteOptions):
     ] = None
 
     def build_options(self, context: typer.Context, **more: Any) -> "BuildOptions":
-        """Those of a build, and more of them."""
+        """Return the options of a build, with additions."""
         from mapserver import BuildOptions
 
         names = ("frames", "calibration", "zones", "report", "threads", "scheduler")
@@ -80,7 +80,7 @@ class SurveyOptions(SiteOptions):
         return BuildOptions(**shared | {"topics": topics, "config": config_path(context)} | more)
 
     def check(self) -> None:
-        """Raises UsageError for a report that cannot be written and for an impossible name of the site."""
+        """Raise UsageError for a report that cannot be written and for an invalid name of the site."""
         from fleetmap.mapformat import check_name
 
         check_output("--report", self.report)
@@ -88,7 +88,7 @@ class SurveyOptions(SiteOptions):
 
 
 def topics_of(context: typer.Context, words: list[str] | None) -> "Topics":
-    """The [topics] of the configuration file, and over them those that --topic names."""
+    """Return the [topics] of the configuration file, overridden by those of --topic."""
     from fleetmap.recordings import named_topics
 
     topics: Topics = settings_of(context).topics
@@ -96,14 +96,14 @@ def topics_of(context: typer.Context, words: list[str] | None) -> "Topics":
 
 
 def open_store(folder: Path, *, create: bool = False, read_only: bool = False) -> "MapStore":
-    """The store in a folder. Its module comes when it is opened: options are checked before."""
+    """Open the store in a folder. Its module is imported here, after the options are checked."""
     from mapserver.store import MapStore
 
     return MapStore.open(folder, create=create, read_only=read_only)
 
 
 def version_named(maps: "MapStore", site: str, version: int | None) -> int:
-    """The version that is asked for, the current one for None; UsageError for a site without one."""
+    """Return the requested version, the current one for None; UsageError for a site without a current version."""
     if version is not None:
         return version
     current = maps.current(site)
@@ -113,7 +113,7 @@ def version_named(maps: "MapStore", site: str, version: int | None) -> int:
 
 
 def check_output(option: str, path: Path | None, *suffixes: str) -> None:
-    """Raises UsageError unless `path` can be a file, with one of these suffixes where there are some."""
+    """Raise UsageError unless `path` can be a file, with one of these suffixes if given."""
     if path is not None and (path.is_dir() or not path.parent.is_dir()):
         raise UsageError(f"{option} {path}: name a file in a folder that exists")
     if path is not None and suffixes and path.suffix.lower() not in suffixes:
@@ -121,13 +121,13 @@ def check_output(option: str, path: Path | None, *suffixes: str) -> None:
 
 
 def write_output(path: Path, data: bytes) -> None:
-    """Replaces the file that a command was asked to write; StoreError where the disk refuses."""
+    """Replace the output file of a command; StoreError if it cannot be written."""
     with disk_errors(f"{path} cannot be written", "choose another place"):
         path.write_bytes(data)
 
 
 def print_json(value: object) -> None:
-    """Writes a value to stdout, indented; dataclasses become objects."""
+    """Print a value to stdout as indented JSON; dataclasses become objects."""
     from fleetmap.encoding import to_json
 
     typer.echo(to_json(value, indent=2).decode())

@@ -1,4 +1,4 @@
-"""`mapserver versions`, `inspect`, `diff`, `publish`, `promote` and `rollback`: the versions of a site, and which one is current."""
+"""`mapserver versions`, `inspect`, `diff`, `publish`, `promote` and `rollback`: versions of a site and changes of the current one."""
 
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -48,7 +48,7 @@ def inspect(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Show a version: sizes, recordings and what was found in them, the gate's verdicts, history. --json has the whole manifest."""
+    """Show a version: sizes, recordings and their findings, gate results, history. --json has the whole manifest."""
     with open_store(store, read_only=True) as maps:
         info = _chosen(maps, site, version)
         manifest = maps.manifest(site, info.version)
@@ -82,7 +82,7 @@ def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
 
 
 def bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
-    """Size of the map per metre of surveyed path, None where the report does not know the path."""
+    """Return the size of the map per metre of surveyed path, None if the report has no path length."""
     path_m = manifest.report.get("path_m")
     return info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
 
@@ -93,7 +93,7 @@ _FIGURES = {
     "keyframes": "{} keyframes",
     "ate_rmse_m": "{:.4f} m from the ground truth after alignment",
 }
-"""Of a build's report, in words; --json has all of it."""
+"""Text for keys of a build's report; --json has all keys."""
 
 
 def _print_words(
@@ -126,7 +126,7 @@ def _print_words(
         for reason in verdict.reasons:
             console.print(f"  {reason}")
     for event in history:
-        if event.kind not in ("refused", "forced"):  # as the gate says above
+        if event.kind not in ("refused", "forced"):  # shown above with the gate
             who = f" by {event.actor}" if event.actor else ""
             why = f" ({event.reason})" if event.reason else ""
             console.print(f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}")
@@ -184,12 +184,12 @@ def publish(
     context: typer.Context,
     where: SiteOptions,
     by: ActorOptions,
-    version: Annotated[int | None, typer.Option(min=1, help="The draft to publish; default: the newest.")] = None,
+    version: Annotated[int | None, typer.Option(min=1, help="Draft to publish; default: the newest.")] = None,
     trust: Annotated[
         bool,
         typer.Option(
             "--trust-calibration",
-            help="Say that the calibration is right although no recording judged it; kept in the manifest; needs --reason.",
+            help="Confirm the calibration although no recording judged it; kept in the manifest; needs --reason.",
         ),
     ] = False,
     force: Annotated[
@@ -198,7 +198,7 @@ def publish(
     ] = False,
     config: ConfigFile = None,
 ) -> None:
-    """Take a draft through the gate and make it the current version; status 4 if the gate refuses it."""
+    """Check a draft by the gate and make it the current version; status 4 if the gate refuses it."""
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
     from mapserver.quality.probes import lookalike_words
@@ -234,13 +234,13 @@ def promote(
     where: SiteOptions,
     by: ActorOptions,
     canary: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Try it on this share of the robots first, such as 5%.")
+        str | None, typer.Option(metavar="SHARE", help="Run it on this share of the robots first, such as 5%.")
     ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Make VERSION, published before, the current version of its site.
 
-    With --canary some robots run it first (a draft goes through the gate before); the server then promotes it or rolls it back.
+    With --canary some robots run it first (a draft goes through the gate first); the server then promotes it or rolls it back.
     """
     from mapserver import releases
 
@@ -253,8 +253,8 @@ def promote(
             return
         begun = releases.start_canary(maps, where.site, version, share, actor=by.named(), gate=gate)
     typer.echo(
-        f"site {where.site}: {share:g} of the robots try version {version}, the others stay on {begun.base_version}; "
-        "`mapserver serve` judges it, `rollback` takes it back"
+        f"site {where.site}: {share:g} of the robots run version {version}, the others stay on {begun.base_version}; "
+        "`mapserver serve` judges it, `rollback` withdraws it"
     )
 
 

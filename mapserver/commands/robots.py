@@ -1,4 +1,4 @@
-"""`mapserver robots`: the robots that a store knows."""
+"""`mapserver robots`: the robots known to a store."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,9 +19,9 @@ def remove(
     where: SiteOptions,
     by: ActorOptions,
 ) -> None:
-    """Forget robots: they no longer stand in lists or keep versions from `gc`. What was counted of them stays.
+    """Remove robots from lists; `gc` need not keep their versions any more. Their past counts stay.
 
-    A server that runs forgets them within seconds; a robot that speaks again is known again.
+    A running server removes them within seconds; a robot that reports again is added again.
     """
     with open_store(where.store) as maps:
         removed = maps.remove_robots(where.site, robots, actor=by.named())
@@ -29,7 +29,7 @@ def remove(
         typer.echo(f"site {where.site}: robot {robot} is removed")
     missing = [robot for robot in robots if robot not in removed]
     if missing:
-        raise UsageError(f"site {where.site} knows no robot {', '.join(missing)}; its others of these are removed")
+        raise UsageError(f"site {where.site} knows no robot {', '.join(missing)}; the other named robots are removed")
 
 
 @expand_options
@@ -39,13 +39,13 @@ def enrol(
     by: ActorOptions,
     endpoint: Annotated[
         str | None,
-        typer.Option(metavar="ENDPOINT", help="Where they reach the server; default: its certificate's first name."),
+        typer.Option(metavar="ENDPOINT", help="Endpoint of the server; default: its certificate's first name."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the bundles ROBOT.fleetmap.")] = Path(),
 ) -> None:
-    """Let robots speak on the bus: writes one bundle a robot, for `locclient enrol`, to be used once within a day.
+    """Allow robots on the bus: writes one bundle per robot for `locclient enrol`, to be used once within a day.
 
-    A bundle is a secret until it was used: carry it on a stick or over SSH.
+    A bundle is secret until it is used: transfer it on a USB stick or over SSH.
     """
     from fleetmap.bus import check_endpoint
     from fleetmap.files import write_atomically
@@ -66,7 +66,7 @@ def enrol(
 
 @expand_options
 def revoke(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
-    """Take robots off the bus at once, such as stolen ones; a server that runs follows within two seconds."""
+    """Remove robots, such as stolen ones, from the bus at once; a running server follows within two seconds."""
     from mapserver.trust.enrolment import RobotRegister
 
     with open_store(where.store) as maps:
@@ -75,7 +75,7 @@ def revoke(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
         typer.echo(f"site {where.site}: robot {robot} is revoked")
     missing = [robot for robot in robots if robot not in gone]
     if missing:
-        raise UsageError(f"site {where.site} has not enrolled {', '.join(missing)}; its others of these are revoked")
+        raise UsageError(f"site {where.site} has not enrolled {', '.join(missing)}; the other named robots are revoked")
 
 
 def list_(
@@ -83,7 +83,7 @@ def list_(
     site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
     json: Json = False,
 ) -> None:
-    """Show the enrolled robots, the names in their certificates, and how long those last."""
+    """Show the enrolled robots, the names in their certificates, and the days until they expire."""
     from rich.table import Table
 
     from fleetmap.console import plain_console
@@ -102,6 +102,6 @@ def list_(
 
 
 ROBOTS = Group(
-    "The robots that a store knows, and those that may speak to its server.",
+    "Known robots of a store, and those enrolled at its server.",
     {"enrol": enrol, "revoke": revoke, "list": list_, "remove": remove},
 )

@@ -1,4 +1,4 @@
-"""`mapserver serve`: a store on HTTP and on the bus."""
+"""`mapserver serve`: serve a store over HTTP and the bus."""
 
 import atexit
 import logging
@@ -34,33 +34,31 @@ if TYPE_CHECKING:
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
 
-_STOP_WITHIN_S = 5  # requests under way may take so long still
-_END_WITHIN_S = 5.0  # and what works on threads so long after that
+_STOP_WITHIN_S = 5  # limit for open requests
+_END_WITHIN_S = 5.0  # additional limit for threads
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
 _WARN_EVERY_S = 86_400.0
 _LOOPBACK = frozenset({"127.0.0.1", "::1"})
-_INSECURE = (
-    "This server was started with --insecure. Whoever reaches it may read everything and change the maps of the robots."
-)
-_OPEN_BUS = "This server was started with --insecure. Whoever reaches its bus may speak as any robot."
-_NO_TLS = "This server was started with --insecure. Passwords and sessions can be read on their way to it."
+_INSECURE = "This server was started with --insecure. Anyone who can connect may read everything and change the maps of the robots."
+_OPEN_BUS = "This server was started with --insecure. Anyone who can connect to its bus may act as any robot."
+_NO_TLS = "This server was started with --insecure. Passwords and sessions are sent unencrypted."
 
 
 @dataclass(frozen=True, kw_only=True)
 class HttpOptions:
-    """Where HTTP is served, and by which names."""
+    """HTTP address and host names of the server."""
 
     http: Annotated[str, typer.Option(help="HTTP address to listen on; port 0 picks a free port.")] = "127.0.0.1:8080"
     http_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="PEM certificate for HTTPS; taken anew when it is renewed.")
+        Path | None, typer.Option(metavar="FILE", help="PEM certificate for HTTPS; reloaded when it is renewed.")
     ] = None
     http_key: Annotated[Path | None, typer.Option(metavar="FILE", help="PEM key of --http-cert.")] = None
     http_name: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Host name that a proxy passes on; repeat it.")
     ] = None
     sign_in_proxy: Annotated[
-        list[str] | None, typer.Option(metavar="ADDRESS", help="Proxy that signs people in, by address; repeat it.")
+        list[str] | None, typer.Option(metavar="ADDRESS", help="Address of a proxy that signs users in; repeat it.")
     ] = None
     sign_in_group: Annotated[
         list[str] | None, typer.Option(metavar="GROUP=ROLE", help="Role of a group that the proxy names; repeat it.")
@@ -71,14 +69,14 @@ class HttpOptions:
     ] = False
 
     def host_and_port(self) -> tuple[str, int]:
-        """Where to listen; UsageError for what is no address."""
+        """Return the address to listen on; UsageError for an invalid address."""
         host, _, port = self.http.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise UsageError(f"--http {self.http!r}: write it like 127.0.0.1:8080")
         return host.strip("[]"), int(port)
 
     def load_certificate(self) -> "HttpCertificate | None":
-        """The certificate, None without one; UsageError for half of a pair, and as `HttpCertificate`."""
+        """Return the certificate, None if not configured; UsageError if one of the two options is missing, and as `HttpCertificate`."""
         from mapserver.trust.http_certificate import HttpCertificate
 
         if (self.http_cert is None) != (self.http_key is None):
@@ -88,7 +86,7 @@ class HttpOptions:
         return HttpCertificate(self.http_cert, self.http_key)
 
     def load_proxy(self) -> "SignInProxy | None":
-        """The proxy that signs people in, None without one; UsageError as `SignInProxy.of`, and for half of the two options."""
+        """Return the sign-in proxy, None if not configured; UsageError as `SignInProxy.of`, and if one of the two options is missing."""
         from mapserver.api.sign_in_proxy import SignInProxy
 
         if self.sign_in_proxy:
@@ -100,9 +98,9 @@ class HttpOptions:
     def guard(
         self, store: "MapStore", certificate: "HttpCertificate | None", proxy: "SignInProxy | None", warning: str
     ) -> "GuardSettings":
-        """Who is let in. warning: about something else, for every page.
+        """Return the access settings. warning: another warning for every page.
 
-        UsageError where the server must not be reached like this."""
+        UsageError for an insecure configuration."""
         from mapserver.api.guard import GuardSettings
         from mapserver.operators.operators import Operators
         from mapserver.serving.http_connections import binding_fault, is_loopback_name
@@ -135,12 +133,12 @@ def serve(
     ] = "tcp/127.0.0.1:7447",
     config: ConfigFile = None,
 ) -> None:
-    """Serve maps to robots and operators; prints the addresses when ready, ends with status 0 on SIGTERM or SIGINT."""
+    """Serve maps to robots and operators; prints the addresses when ready, exits with status 0 on SIGTERM or SIGINT."""
     from mapserver.serving.http_connections import raise_file_limit
 
     raise_file_limit()
     host, port = at.host_and_port()
-    typer.echo(f"mapserver serve starts with the store {store}; `ready` follows", err=True)
+    typer.echo(f"mapserver serve is starting with the store {store}; `ready` follows", err=True)
     from fleetmap.bus import check_endpoint
     from mapserver.serving.bus_access import check_binding, prepare_bus
 
@@ -148,7 +146,7 @@ def serve(
     from mapserver.trust import prepare_lists
 
     certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
-    # The sockets come before the store is read, so that a wrong address is reported at once.
+    # The sockets are opened before the store is read, so an invalid address is reported at once.
     proxies = (_LOOPBACK if at.http_name else frozenset()) | (proxy.addresses if proxy else frozenset())
     with _listening(host, port, proxies) as listener, open_store(store) as maps:
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
@@ -169,9 +167,9 @@ def serve(
 
 
 def _end_process() -> None:
-    """Ends with status 0 now. Taking two thousand modules apart changes nothing outside and takes 0.65 s of CPU: 20 s when it is busy."""
+    """Exit with status 0 at once. Unloading 2000 modules has no outside effect and takes 0.65 s of CPU: 20 s on a busy machine."""
     atexit._run_exitfuncs()
-    with suppress(OSError):  # nobody reads them any more
+    with suppress(OSError):  # their reader has closed them
         sys.stdout.flush()
         sys.stderr.flush()
     os._exit(0)
@@ -209,7 +207,7 @@ def _run(
     from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
     from mapserver.serving.webhook import Webhook
 
-    # An operator's request passes from thread to thread several times, and at each waits so long for robots' answers.
+    # An operator's request passes between threads several times, and each time waits up to this long for robots' replies.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     log_to_stderr(logging.INFO)
     if guard.warning:
@@ -240,16 +238,16 @@ def _run(
     api = ApiSettings(guard, settings.gate, settings.canary, settings.resurvey)
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
-    # Around the middleware that puts the client's address in the place of the proxy's.
+    # Outside the middleware that replaces the proxy's address by the client's.
     served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
     config = uvicorn.Config(
         served,
-        loop="asyncio",  # uvloop would not ask the listener
-        http="h11",  # httptools takes heads of any size
+        loop="asyncio",  # uvloop bypasses the listener
+        http="h11",  # httptools accepts headers of any size
         h11_max_incomplete_event_size=MAX_HEAD_BYTES,
         backlog=BACKLOG,
         log_config=None,
-        log_level="error",  # each request that is none would be a warning
+        log_level="error",  # every invalid request would log a warning
         access_log=False,
         timeout_graceful_shutdown=_STOP_WITHIN_S,
         ws="none",
@@ -263,14 +261,14 @@ def _run(
 
         config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
         renew = partial(certificate.renew, config.ssl)
-        tasks.append(BackgroundTask("looking at the certificate of HTTP", _WARN_EVERY_S, certificate.warn))
+        tasks.append(BackgroundTask("checking the certificate of HTTP", _WARN_EVERY_S, certificate.warn))
         tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
-    # uvicorn stops on these signals by itself and afterwards raises them again for the handlers that were there before:
-    # the default ones would end the process with a status that says it was killed.
+    # uvicorn stops on these signals and afterwards raises them again for the previous handlers:
+    # the default handlers would end the process with a status of being killed.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: None)
     server = uvicorn.Server(config)
-    # The bus last: whoever answers before this program does could be heard in its place.
+    # The bus last: a query that another program answers first could be answered in this one's place.
     bus.open()
     try:
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
@@ -283,9 +281,9 @@ def _run(
 
 
 def _bound_the_end(fleet: "Fleet") -> None:
-    """Ends the process if a thread keeps it from ending by itself.
+    """End the process if a thread prevents it from ending.
 
-    Reports of robots are kept first; a write of the store is whole or none.
+    Reports of robots are stored first; a write to the store is atomic.
     """
 
     def end() -> None:

@@ -41,7 +41,7 @@ def verify(store: StoreFolder, json: Json = False) -> None:
                 f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc --store {shlex.quote(str(store))}` removes them"
             )
         if found.open_to_others:
-            typer.echo(f"other users of this machine may read the store; `chmod -R go= {store}` ends that")
+            typer.echo(f"other users of this machine can read the store; `chmod -R go= {store}` prevents that")
         for fault in found.faults:
             typer.echo(f"fault: {fault}")
         typer.echo("clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore")
@@ -81,7 +81,7 @@ def gc(
     try:
         garbage = collect()
     except StoreError:
-        # A store of another format is refused for that, and keeps its reserve.
+        # A store of another format raises its own error, and its disk reserve is kept.
         is_ours = LAST_UNNAMED <= format_of(store / "store.sqlite3") <= FORMAT
         if dry_run or not is_ours or not release_reserve(store):
             raise
@@ -105,10 +105,10 @@ def export(
     store: StoreFolder,
     version: Annotated[int | None, typer.Option(min=1, help="Version; default: the current one.")] = None,
     without_archive: Annotated[
-        bool, typer.Option("--without-archive", help="Leave out the data that only later surveys need.")
+        bool, typer.Option("--without-archive", help="Leave out data needed only by later surveys.")
     ] = False,
 ) -> None:
-    """Write a version into FILE, which `mapserver import` takes into another store."""
+    """Write a version into FILE; `mapserver import` reads it into another store."""
     check_output("FILE", file)
     with open_store(store, read_only=True) as maps:
         version = version_named(maps, site, version)
@@ -118,11 +118,11 @@ def export(
 
 @expand_options
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="File that `mapserver export` wrote.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File written by `mapserver export`.")],
     store: NewStoreFolder,
     by: ActorOptions,
 ) -> None:
-    """Take the version in FILE into a store, as a draft of its site under its own number."""
+    """Import the version in FILE into a store, as a draft of its site with the same number."""
     with open_store(store, create=True) as maps:
         info = maps.import_version(file, actor=by.named())
     typer.echo(f"site {info.site}: version {info.version} is in the store ({info.state})")
@@ -130,7 +130,7 @@ def import_(
 
 def audit(
     store: StoreFolder,
-    verify: Annotated[bool, typer.Option("--verify", help="Check the chain of lines; status 3 for a fault.")] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Check the hash chain; status 3 for a fault.")] = False,
     last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
     json: Json = False,
 ) -> None:
@@ -162,7 +162,7 @@ def _print(lines: "list[AuditLine]", *, json: bool) -> None:
 
 
 def _words(line: "AuditLine") -> str:
-    """A line on one line: what came from elsewhere is quoted."""
+    """Return an entry as one line; text from outside is quoted."""
     when = datetime.fromtimestamp(line.stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
     proved = " (signed in)" if line.operator else ""
     parts = [f"{line.id} {when} {line.kind}", line.site and f"site {line.site}", repr(line.detail)]

@@ -1,4 +1,4 @@
-"""`mapserver map`: what a version knows of how its site looks, for other programs."""
+"""`mapserver map`: the surfels of a version, for other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from fleetmap.cli_options import Group, TopicNames
 from fleetmap.errors import StateError, UsageError
 from mapserver.commands.options import SiteName, StoreFolder, check_output, open_store, write_output
 
-SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version that was built with the setting surfel_map.")]
+SurfelVersion = Annotated[int, typer.Argument(min=1, help="Version built with the setting surfel_map.")]
 SplatFile = Annotated[Path, typer.Argument(metavar="FILE", help="File to write, .ply; replaced if it exists.")]
 
 
@@ -40,7 +40,7 @@ def changes(
     site: SiteName,
     store: StoreFolder,
 ) -> None:
-    """Write what appeared and what vanished between two versions, as a plan in the frame of the map or as GeoJSON."""
+    """Write appeared and vanished surfels between two versions, as a plan in the frame of the map or as GeoJSON."""
     check_output("FILE", file, ".png", ".geojson")
     from fleetmap.encoding import to_json
     from mapserver.serving.expected_views import SurfelChanges
@@ -64,15 +64,15 @@ def changes(
 
 def refine(
     version: SurfelVersion,
-    recording: Annotated[Path, typer.Argument(help="Recording that this version was built from.")],
+    recording: Annotated[Path, typer.Argument(help="Recording used to build this version.")],
     file: SplatFile,
     site: SiteName,
     store: StoreFolder,
     steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order of the views.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the views.")] = 0,
     topic: TopicNames = None,
 ) -> None:
-    """Write the surfels as `map splats` does, with colours, sizes and opacities fitted to the pictures of their recording."""
+    """Write the surfels as in `map splats`, with colours, sizes and opacities fitted to the pictures of their recording."""
     check_output("FILE", file, ".ply")
     import numpy as np
 
@@ -88,7 +88,7 @@ def refine(
         surfels, archive = surfels_of(manifest, maps.blob), maps.archive(site, version)
     if archive is None:
         raise StateError(
-            f"version {version} of site {site} has no archive here, which tells where its pictures were taken"
+            f"version {version} of site {site} has no archive, which holds the poses of its pictures; name a version built in this store"
         )
     with open_recording(recording, OpenOptions(topics=named_topics(topic))) as opened:
         if opened.content_hash() not in {entry.sha256 for entry in manifest.recordings}:
@@ -111,4 +111,4 @@ def refine(
     typer.echo(f"{said}, from {done.learned} other views; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
 
 
-MAP = Group("What a version knows of how its site looks.", {"splats": splats, "changes": changes, "refine": refine})
+MAP = Group("Surfels of a version.", {"splats": splats, "changes": changes, "refine": refine})

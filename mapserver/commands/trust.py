@@ -1,4 +1,4 @@
-"""`mapserver trust`: which keys sign maps, and what is signed."""
+"""`mapserver trust`: signing keys of maps, and the signed lists."""
 
 import getpass
 import socket
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 KeyFile = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE", help="The root key, asked for its passphrase; default: root.pem in keys/ of the store."
+        metavar="FILE", help="Root key; its passphrase is asked for; default: root.pem in keys/ of the store."
     ),
 ]
 Hosts = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Name or address by which robots reach this machine; repeat it."),
+    typer.Option(metavar="NAME", help="Name or address of this machine for robots; repeat it."),
 ]
 SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]
 
 
 class Rotated(StrEnum):
-    """What `trust rotate` replaces."""
+    """Key or certificate that `trust rotate` replaces."""
 
     ONLINE = "online"
     ROOT = "root"
@@ -44,26 +44,26 @@ def init(
     here: Annotated[bool, typer.Option("--here", help="Keep all keys on this machine, without passphrases.")] = False,
     stick: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR", help="Folder for the root key, such as a stick, which this machine then lacks."),
+        typer.Option(metavar="DIR", help="Folder for the root key, such as a USB stick; no copy stays here."),
     ] = None,
     host: Hosts = None,
 ) -> None:
-    """Make the keys of a store: its maps are signed from now on, and its server can tell robots apart by certificates."""
+    """Create the keys of a store: its maps are signed from now on, and its server authenticates robots by certificates."""
     from mapserver.trust import SignedLists, init_here
     from mapserver.trust.enrolment import RobotRegister
     from mapserver.trust.keys import make_passphrase
     from mapserver.trust.signing import init_offline
 
     if here == bool(stick):
-        raise UsageError("say where the root key is: --here for this machine, or --stick DIR for a folder of its own")
-    if stick and len(stick) > 1:
         raise UsageError(
-            f"--stick names {len(stick)} folders, and there is one root key; name one, and copy the key yourself"
+            "choose the place of the root key: --here for this machine, or --stick DIR for a folder of its own"
         )
+    if stick and len(stick) > 1:
+        raise UsageError(f"--stick names {len(stick)} folders for one root key; name one, and copy the key yourself")
     folder, hosts, made = _not_a_token(stick[0]) if stick else None, host or [socket.gethostname()], []
     with open_store(store) as maps:
         authorities = RobotRegister(maps).authorities
-        # A store that was served on loopback has lists already, and no certificates.
+        # A store that was served on loopback already has lists but no certificates.
         if authorities.are_there or not SignedLists(maps.folder).are_there:
             if folder is None:
                 init_here(maps)
@@ -79,7 +79,7 @@ def init(
 
 
 def admit(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
-    """Make a key of this server that signs the lists of SITE, in the place of the one that did."""
+    """Create a key of this server that signs the lists of SITE, replacing the previous one."""
     from mapserver.trust.signing import admit_site
 
     with open_store(store) as maps:
@@ -92,20 +92,20 @@ def rotate(
         Rotated,
         typer.Argument(
             help="online: the key of the lists; root: root and targets, for two and one more years; server: its certificate; "
-            "robots-ca: who signs robots."
+            "robots-ca: the authority that signs robots."
         ),
     ],
     store: StoreFolder,
     key: KeyFile = None,
     stick: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Of root: folder for another root key, in the place of this one.")
+        Path | None, typer.Option(metavar="DIR", help="For root: folder of a new root key that replaces this one.")
     ] = None,
     host: Hosts = None,
     stolen: Annotated[
-        bool, typer.Option("--stolen", help="Of robots-ca: nothing that it signed counts; all robots enrol again.")
+        bool, typer.Option("--stolen", help="For robots-ca: invalidate all that it signed; all robots enrol again.")
     ] = False,
 ) -> None:
-    """Replace keys, or sign root and targets anew before they expire."""
+    """Replace keys, or sign root and targets again before they expire."""
     if (stick and what is not Rotated.ROOT) or (host and what is not Rotated.SERVER):
         raise UsageError("--stick is for `trust rotate root`, --host for `trust rotate server`")
     if stolen and what is not Rotated.ROBOTS_CA:
@@ -121,7 +121,7 @@ def rotate(
             signing.rotate_online(maps, root_key)
         elif made := signing.rotate_root(maps, root_key, None if stick is None else _not_a_token(stick)):
             _show(*made)
-    typer.echo("done; robots follow with their next question")
+    typer.echo("done; robots follow with their next query")
 
 
 def _rotate_certificates(
@@ -130,10 +130,10 @@ def _rotate_certificates(
     from mapserver.trust.enrolment import RobotRegister
 
     register = RobotRegister(maps)
-    _ = register.tls  # raises where there is nothing to rotate
+    _ = register.tls  # raises if there is nothing to rotate
     if what is Rotated.SERVER:
         register.authorities.rotate_server(key, None if key is None else _passphrase(key), hosts)
-        typer.echo("done; a server that runs takes it within two seconds")
+        typer.echo("done; a running server loads it within two seconds")
         return
     register.authorities.rotate_robots_ca(is_stolen=is_stolen)
     if is_stolen:
@@ -143,16 +143,16 @@ def _rotate_certificates(
 
 
 def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
-    """Replace the keys of SITE and the server's together, after a theft of the key that signs its maps."""
+    """Replace the keys of SITE and of the server together, after theft of the key that signs its maps."""
     from mapserver.trust.signing import revoke_site
 
     with open_store(store) as maps:
         revoke_site(maps, site, _root_key(maps, key))
-    typer.echo(f"site {site}: the old keys sign nothing any more; robots follow with their next question")
+    typer.echo(f"site {site}: the old keys are revoked; robots follow with their next query")
 
 
 def status(store: StoreFolder, json: Json = False) -> None:
-    """Show every role with its keys and the days that it lasts; status 1 where robots take no new maps, now or soon."""
+    """Show every role with its keys and days until expiry; status 1 if robots cannot accept new maps, now or soon."""
     from rich.table import Table
 
     from fleetmap.console import plain_console
@@ -185,13 +185,13 @@ def _root_key(maps: "MapStore", path: Path | None) -> "Signer":
     keys = KeyFolder(maps.folder / "keys")
     root = keys.signer("root")
     if root is None:
-        raise UsageError(f"{keys.path('root')} is not there; name the file of the root key by --key")
+        raise UsageError(f"{keys.path('root')} is missing; name the file of the root key by --key")
     return root
 
 
 def _not_a_token(path: Path) -> Path:
     if str(path).startswith("pkcs11:"):
-        raise UsageError(f"{path}: keys on PKCS#11 tokens are no longer supported; the root key is a file on a stick")
+        raise UsageError(f"{path}: keys on PKCS#11 tokens are no longer supported; use a root key file")
     return path
 
 
@@ -200,10 +200,10 @@ def _passphrase(path: Path) -> str:
 
 
 def _show(path: Path, passphrase: str) -> None:
-    typer.echo(f"{path}: {passphrase}   (shown once: write it down, apart from the stick)")
+    typer.echo(f"{path}: {passphrase}   (shown once: write it down and keep it apart from the key)")
 
 
 TRUST = Group(
-    "Which keys sign maps, and what is signed.",
+    "Signing keys of maps, and the signed lists.",
     {"init": init, "admit": admit, "rotate": rotate, "revoke": revoke, "status": status},
 )

@@ -1,8 +1,8 @@
-"""The accelerometer against the images: signs and order of its axes, and the metres of the images by it.
+"""The accelerometer against the images: signs and order of its axes, and the metric scale of the images.
 
-Places of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the integral
-of the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, whatever the velocity was. The same integral of
-the specific force, turned as the images say, is that change in true metres, and gravity, and the accelerometer's bias.
+Positions of the body at times t0, t1 and t2 give a change of velocity, (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0). It is the
+integral of the acceleration with a weight that rises from 0 at t0 to 1 at t1 and falls to 0 at t2, for any velocity. The same integral of
+the specific force, rotated by the images, is that change in true metres, plus gravity, plus the accelerometer's bias.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ NAME = "accelerometer axes"
 _HALF_WINDOW_S = 0.3
 _MIN_WINDOWS = 8
 _BIAS_SIGMA_MPS2 = 0.3
-_NOISE_MPS = 0.03  # of a change of velocity by the images: weighs the bias' sigma; windows tell their own
-_FLOOR_MPS = 0.02  # of the same: half a degree of tilt by the images. Windows that agree better than this say no more
-_REACH = 4.0  # windows that are further off than so many typical ones are outliers: someone walked through the picture
-# What the best order of axes must explain better than another that is ruled out: in squares of the windows' scatter, and times as well.
+_NOISE_MPS = 0.03  # of a change of velocity by the images: weights the bias prior; the windows estimate their own
+_FLOOR_MPS = 0.02  # of the same: half a degree of tilt by the images. A smaller scatter is not trusted
+_REACH = 4.0  # in typical deviations; windows beyond are outliers, such as people in the picture
+# Margin by which the best order of axes must fit better to exclude another: in squares of the windows' scatter, and as a factor.
 _SURE_SQUARES, _SURE_RATIO = 40.0, 2.0
 _SURE_SIGMAS = 5.0
 _UPRIGHT = 0.7  # cosine of the angle between the base's up and the accelerometer's: ramps are far within
@@ -30,9 +30,9 @@ _UPRIGHT = 0.7  # cosine of the angle between the base's up and the acceleromete
 
 @dataclass(frozen=True, slots=True)
 class AxesFit:
-    """The images explained under one order and sign of the axes.
+    """Fit of the images under one order and sign of the axes.
 
-    body_from_accel: signed permutation (3, 3). squares: sum of squares that is left. metres, sigma: true metres in one of the images.
+    body_from_accel: signed permutation (3, 3). squares: residual sum of squares. metres, sigma: true metres in one of the images.
     up_body (3,): unit vector against gravity, in the body's axes at the first frame.
     """
 
@@ -44,23 +44,23 @@ class AxesFit:
 
     @property
     def is_given(self) -> bool:
-        """True for the axes that the recording states."""
+        """True for the axes stated by the recording."""
         return bool((self.body_from_accel == np.eye(3)).all())
 
     @property
     def is_reversed(self) -> bool:
-        """True for all axes of the wrong sign."""
+        """True if all axes have the wrong sign."""
         return bool((self.body_from_accel == -np.eye(3)).all())
 
 
 def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[AxesFit]:
-    """All orders and signs of the axes that may be right, the best first; none with too few images to tell."""
+    """Return all possible orders and signs of the axes, the best first; empty with too few images."""
     windows = _windows(turns, imu, imu_minus_cam_s)
     if len(windows) < _MIN_WINDOWS:
         return []
     runs = np.array([window.run for window in windows])
     changes, forces, biases = (np.array([getattr(w, name) for w in windows]) for name in ("change", "force", "bias"))
-    # metres, bias, gravity in the axes where each run of frames begins
+    # metres, bias, gravity in the axes at the start of each run of frames
     design = np.zeros((len(windows), 3, 7 + 3 * int(runs.max())))
     design[:, :, 0], design[:, :, 1:4] = changes, biases
     for axis in range(3):
@@ -83,7 +83,7 @@ def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: floa
             up = unknowns[4:7] / max(float(np.linalg.norm(unknowns[4:7])), 1e-9)
             if squares < least:
                 least, reach = squares, np.linalg.norm(off, axis=1)
-            if unknowns[0] > -_SURE_SIGMAS * sigma:  # a metre of the images is no negative one
+            if unknowns[0] > -_SURE_SIGMAS * sigma:  # the scale of the images must be positive
                 fits.append(AxesFit(axes, squares, float(unknowns[0]), sigma, up))
         kept = reach <= _REACH * max(float(np.median(reach)), 1e-9)
     limit = max(least + _SURE_SQUARES * max(least / freedom, _FLOOR_MPS**2), _SURE_RATIO * least)
@@ -91,32 +91,32 @@ def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: floa
 
 
 def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Finding:
-    """Whether the given axes may be right. base_from_body (4, 4): of a robot that stands on its wheels, None for one that need not."""
-    limit = "fail where other signs or another order of the axes explain the images, and the given ones do not"
+    """Judge the given axes. base_from_body (4, 4): for a robot upright on its wheels, None if it need not be upright."""
+    limit = "fail if other signs or another order of the axes fit the images, and the given ones do not"
     if not fits:
-        reason = "too few frames follow each other, or they show no metres"
+        reason = "too few consecutive frames, or frames without metric scale"
         return not_judged(NAME, reason, "record every frame of a pair")
     ups = [None if base_from_body is None else base_from_body[:3, :3] @ fit.up_body for fit in fits]
     possible = [fit for fit, up in zip(fits, ups, strict=True) if up is None or up[2] > _UPRIGHT]
     if any(fit.is_given for fit in possible):
-        return Finding(NAME, Verdict.OK, None, limit, "the images accelerate as the accelerometer says")
+        return Finding(NAME, Verdict.OK, None, limit, "the accelerations of images and accelerometer agree")
     given = next((up for fit, up in zip(fits, ups, strict=True) if fit.is_given), None)
     if not possible:
         words = "no order of the accelerometer's axes lets a robot on wheels stand upright"
     else:
-        # All axes reversed is one fault, of a driver that reports gravity; it goes before two or three of them.
+        # All axes reversed is one fault, a driver that reports gravity; it is likelier than two or three wrong axes.
         likely = max(possible, key=lambda fit: 0.5 if fit.is_reversed else float(np.trace(fit.body_from_accel)))
-        words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: so the images accelerate"
+        words = f"the accelerometer {axes_in_words(likely.body_from_accel)}: that fits the accelerations of the images"
     if given is not None:
         words += f"; as given, up is {np.round(given, 1) + 0.0} of the base"
-    words += "; mend its driver's signs, or how the calibration mounts it (T_cam_imu)"
+    words += "; correct its driver's signs, or T_cam_imu in the calibration"
     return Finding(NAME, Verdict.FAIL, None, limit, words)
 
 
 @dataclass(frozen=True, slots=True)
 class _Window:
     """One change of velocity: by the images (3,); by the specific force, (3, 3, 3) to be summed with body_from_accel over the last two;
-    what a bias adds to that (3, 3); run: number of the run of frames; span_s: what gravity adds is this much of it."""
+    the effect of a bias on that (3, 3); run: number of the run of frames; span_s: factor of gravity in it."""
 
     change: Array
     force: Array
@@ -126,7 +126,7 @@ class _Window:
 
 
 def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> list[_Window]:
-    """The windows of all runs of frames that follow each other, in the axes of the body where their run begins."""
+    """Return the windows of all runs of consecutive frames, in the axes of the body at the start of their run."""
     known = np.isfinite(turns.ways_m).all(axis=1)
     if len(imu) < 10 or known.sum() < 2:
         return []

@@ -1,8 +1,8 @@
-"""Findings about the calibration: what a self-calibrating adjustment measured, against what an error of it would cost.
+"""Findings about the calibration: the result of a self-calibrating adjustment, against the effect of each error.
 
 A limit is the error that displaces something by 3 cm: a map of 20 m seen from its middle (its scale), a point at 3 m (bearings), or at 25
-baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file describes another rig. To an estimate's own sigma comes
-what the adjustment cannot know: lens distortion that the model leaves, bias of sub-pixel matching, a gyro's scale.
+baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file describes another rig. To an estimate's own sigma are added
+errors outside the adjustment: remaining lens distortion, bias of sub-pixel matching, a gyro's scale.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _LONGER = "record a longer drive, with turns, starts and stops"
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Of one parameter: systematic sigma, error that costs 3 cm, error of another rig; whether a build may correct it."""
+    """Of one parameter: systematic sigma, error that costs 3 cm, error of another rig; True if a build may correct it."""
 
     floor: float
     warn_above: float
@@ -66,25 +66,25 @@ TOLERANCES = {
     P.GYRO_NOISE: _NOISE,
     P.ACCEL_NOISE: _NOISE,
 }
-# Which way a principal point's shift looks like a turn against the IMU.
+# Directions in which a shift of the principal point resembles a rotation against the IMU.
 _SAME_BEARING = {P.CAMERA_IMU_X: (P.PRINCIPAL_Y, 1.0), P.CAMERA_IMU_Y: (P.PRINCIPAL_X, -1.0)}
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCalibration:
-    """Findings of all parameters, and the estimate behind them; None where nothing could be estimated."""
+    """Findings of all parameters, and their estimate; None if nothing could be estimated."""
 
     findings: list[Finding]
     estimate: CalibrationEstimate | None
 
     def wrong(self) -> list[CalibrationParameter]:
-        """Parameters that are off by more than their error costs, for sure, and by how much is known: those a build may correct."""
+        """Parameters whose error certainly exceeds its tolerance and is known accurately: those a build may correct."""
         bad = {f.name for f in self.findings if f.verdict is Verdict.WARN and not f.missing}
         return [p for p in TOLERANCES if p.value in bad and TOLERANCES[p].correctable]
 
 
 def followed_frames(recording: Recording) -> int:
-    """How many frames `measure_calibration` reads; 0 where it judges nothing."""
+    """Return the number of frames read by `measure_calibration`; 0 if it judges nothing."""
     is_judged = len(recording.calibration.cameras) > 1 and median_period_s(recording.frame_stamps_ns) <= SPARSE_S
     return len(busiest_frames(recording.frame_stamps_ns, recording.imu)) if is_judged else 0
 
@@ -92,9 +92,9 @@ def followed_frames(recording: Recording) -> int:
 def measure_calibration(
     recording: Recording, on_frame: Callable[[], None], executor: Executor, follow: Follow | None = None
 ) -> MeasuredCalibration:
-    """What a recording with a pair of cameras says about every parameter of its calibration, as `estimate_calibration` follows it.
+    """Measure every parameter of the calibration of a recording with a camera pair, tracked as in `estimate_calibration`.
 
-    Where nothing is wrong the calibration is used as it is: a finer measure would change nothing.
+    If nothing is wrong the calibration is not refined further: it would be used unchanged.
     """
     period_s = median_period_s(recording.frame_stamps_ns)
     if period_s > SPARSE_S:
@@ -106,24 +106,24 @@ def measure_calibration(
         estimate = estimate_calibration([recording], SurveySettings(), tools, enough, follow)
     except (RecordingError, SurveyError, np.linalg.LinAlgError) as error:
         return unknown_calibration(
-            f"the frames could not be followed: {error}", "record a drive in the light, with every frame"
+            f"the frames could not be tracked: {error}", "record a drive in the light, with every frame"
         )
     return MeasuredCalibration(findings_of(estimate, focal_px), estimate)
 
 
 def _is_good(focal_px: float, estimate: CalibrationEstimate, moved: Sequence[CalibrationParameter]) -> bool:
-    """Whether nothing is wrong, and what has moved far is near enough for sure."""
+    """True if nothing is wrong, and parameters far from the start are certainly accurate enough."""
     bad, found = (Verdict.WARN, Verdict.FAIL), findings_of(estimate, focal_px)
     return all(f.verdict is Verdict.OK if f.name in moved else f.verdict not in bad for f in found)
 
 
 def findings_of(estimate: CalibrationEstimate, focal_px: float) -> list[Finding]:
-    """One finding for each parameter; focal_px: of the rectified pair."""
+    """Return one finding per parameter; focal_px: of the rectified pair."""
     return [_finding(p, estimate, focal_px) for p in estimate.parameters]
 
 
 def corrected(rig: RigCalibration, measured: MeasuredCalibration) -> tuple[RigCalibration, dict[str, float]]:
-    """`rig` with what is wrong in it corrected, given that the rest is right; the corrections by parameter, in its unit."""
+    """Return `rig` with its wrong parameters corrected, given the others; the corrections by parameter, in its unit."""
     wrong = measured.wrong()
     if measured.estimate is None or not wrong:
         return rig, {}
@@ -134,13 +134,13 @@ def corrected(rig: RigCalibration, measured: MeasuredCalibration) -> tuple[RigCa
 
 
 def in_words(name: str, value: float) -> str:
-    """A correction as people read it, such as `-4.65 %`."""
+    """Return a correction as text, such as `-4.65 %`."""
     factor, shown, digits = SHOWN[RANGES[P(name)].unit]
     return f"{factor * value:+.{digits}f} {shown}"
 
 
 def unknown_calibration(reason: str, missing: str) -> MeasuredCalibration:
-    """No parameter judged, for the same reason."""
+    """Return all parameters as not judged, for the same reason."""
     return MeasuredCalibration([not_judged(p.value, reason, missing) for p in P], None)
 
 
@@ -158,16 +158,16 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
     if tolerance is _NOISE:
         words = f"{1 + value:.1f} times the data sheet, sigma {sigma_all:.1f}"
-    if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # dear if it is true: neither sure nor silent
+    if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # large but uncertain: worth a warning
         return replace(not_judged(name.value, f"{words}: that may be chance", _LONGER), value=value)
     if is_bad:
-        words += "; calibrate again (`mapserver calibrate` writes what it finds), or name the matching file with --calibration"
+        words += "; calibrate again (with `mapserver calibrate`), or name the matching file with --calibration"
     limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"
     return Finding(name.value, verdict, value, limits, words, _LONGER if is_bad and is_coarse else "")
 
 
 def _net(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> tuple[float, float]:
-    """Estimate and sigma; of a turn against the IMU what a shifted principal point, which looks the same, does not take back."""
+    """Return estimate and sigma; for a rotation against the IMU the part not cancelled by an equivalent shift of the principal point."""
     if parameter.name not in _SAME_BEARING:
         return parameter.estimate, parameter.sigma
     other, sign = _SAME_BEARING[parameter.name]

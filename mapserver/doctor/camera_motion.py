@@ -20,9 +20,9 @@ _STEREO = StereoSettings()
 
 @dataclass(frozen=True, slots=True)
 class CameraTurns:
-    """Motion seen by the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
+    """Motion from the images. Intervals from starts_ns to ends_ns (K,), rates_body_radps (K, 3) mean in body axes.
 
-    ways_m (K, 3): where the body was at the end, in its axes at the start and the calibration's metres; NaN with one camera.
+    ways_m (K, 3): position of the body at the end, in its axes at the start, at the calibration's scale; NaN with one camera.
     """
 
     starts_ns: Stamps
@@ -32,7 +32,7 @@ class CameraTurns:
 
     @classmethod
     def of(cls, motions: Iterable[tuple[int, int, Array | None]]) -> "CameraTurns":
-        """Of what `body_motion` found."""
+        """Collect results of `body_motion`."""
         found = [each for each in motions if each[2] is not None]
         spans = np.array([[start_ns, end_ns] for start_ns, end_ns, _ in found], np.int64).reshape(-1, 2)
         moved = np.array([motion for *_, motion in found]).reshape(-1, 4, 4)
@@ -40,25 +40,25 @@ class CameraTurns:
         return cls(spans[:, 0], spans[:, 1], rates, moved[:, :3, 3])
 
     def only(self, kept: AnyArray) -> "CameraTurns":
-        """Those of a mask or of numbers."""
+        """Return the intervals of a mask or of numbers."""
         return CameraTurns(self.starts_ns[kept], self.ends_ns[kept], self.rates_body_radps[kept], self.ways_m[kept])
 
 
 def body_motion(
     rig: tuple[StereoCamera, Array], pair: tuple[RectifiedFrame, RectifiedFrame]
 ) -> tuple[int, int, Array | None]:
-    """Stamps of two frames and the body's motion (4, 4) between them, earlier_from_later. rig: the camera, and body_from_cam."""
+    """Return stamps of two frames and the body's motion (4, 4) between them, earlier_from_later. rig: the camera, and body_from_cam."""
     (camera, body_from_cam), (before, after) = rig, pair
     motion = motion_between(before, after, camera)
     if motion is None:
         return before.stamp_ns, after.stamp_ns, None
     axes, place = body_from_cam[:3, :3], body_from_cam[:3, 3]
-    turn = axes @ motion[:3, :3] @ axes.T  # known, where the way may not be
+    turn = axes @ motion[:3, :3] @ axes.T  # known even if the translation is not
     return before.stamp_ns, after.stamp_ns, se3(turn, axes @ motion[:3, 3] + place - turn @ place)
 
 
 def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> Array | None:
-    """(4, 4) before_from_after in camera axes, None where too little can be tracked.
+    """Return (4, 4) before_from_after in camera axes, None with too few tracked points.
 
     With a second camera or depth by perspective-n-point from the first frame's points, which is exact in pure rotation
     too, else the rotation of the essential matrix, and a translation of NaN.
@@ -97,8 +97,8 @@ def _turn_of_rays(before: Array, after: Array, camera: StereoCamera) -> Array | 
     essential, inliers = cv2.findEssentialMat(before, after, camera.matrix, cv2.RANSAC, 0.999, 1.0)
     if essential is None or essential.shape != (3, 3) or int(inliers.sum()) < _MIN_POINTS:
         return None
-    # Its two rotations are half a turn about the baseline apart. Which one puts points in front of both cameras is left open where the
-    # camera hardly moves; from one frame to the next it does not turn round.
+    # Its two rotations differ by half a turn about the baseline. Points in front of both cameras do not decide between them if the
+    # camera hardly moves; between consecutive frames it does not turn round.
     first, second, _ = cv2.decomposeEssentialMat(essential)
     after_from_before = first if np.trace(first) > np.trace(second) else second
     return se3(np.asarray(after_from_before.T, np.float64), np.full(3, np.nan))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Verdict(StrEnum):
-    """How bad a finding is, the best first. NOT_JUDGED is no OK. Only FAIL ends the command with another exit status."""
+    """Severity of a finding, the best first. NOT_JUDGED is not OK. Only FAIL ends the command with another exit status."""
 
     OK = "ok"
     NOT_JUDGED = "not judged"
@@ -17,10 +17,10 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One check: its name, what was measured against which limit (in words of the unit), and what to do next.
+    """One check: its name, the measured value, its limit (with unit, as text), and the next step.
 
-    missing: for a check that is not judged, or whose value is not known well enough to be corrected, the motion or sensor that would make
-    it observable. A check that is not judged has a value only where one was measured that may be chance.
+    missing: for a check that is not judged, or whose value is too uncertain to be corrected, the motion or sensor that would make
+    it observable. A check that is not judged has a value only if one was measured that may be due to chance.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Finding:
 
 
 class Limits(NamedTuple):
-    """Above which values a check warns and fails, and their unit in words."""
+    """Values above which a check warns and fails, and their unit as text."""
 
     warn_above: float
     fail_above: float
@@ -40,7 +40,7 @@ class Limits(NamedTuple):
 
 
 def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Finding:
-    """A finding about a value that should be small. `good` is its sentence when it is, `bad` (with the next step) when not."""
+    """Return a finding on a value that should be small. `good` is its sentence if it is, `bad` (with the next step) if not."""
     warn_above, fail_above, unit = limits
     verdict = Verdict.FAIL if value > fail_above else Verdict.WARN if value > warn_above else Verdict.OK
     limit = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()
@@ -48,18 +48,18 @@ def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Findi
 
 
 def not_judged(name: str, reason: str, missing: str) -> Finding:
-    """A check that this recording gives no ground for, and what it lacks."""
+    """Return a check that this recording cannot judge, with the missing data."""
     return Finding(name, Verdict.NOT_JUDGED, None, "", f"not judged: {reason}; {missing}", missing)
 
 
 def worst(findings: Sequence[Finding]) -> Verdict:
-    """The worst verdict of all; NOT_JUDGED without any."""
+    """Return the worst verdict; NOT_JUDGED for an empty list."""
     order = list(Verdict)
     return max((f.verdict for f in findings), key=order.index, default=Verdict.NOT_JUDGED)
 
 
 def grouped(findings: Sequence[Finding]) -> list[tuple[list[Finding], str]]:
-    """Findings with one sentence each; those that could not be judged for want of the same, without any figure, share one."""
+    """Group findings under one sentence each; checks without a value that lack the same data share one."""
     groups: dict[tuple[str, ...], list[Finding]] = {}
     for finding in findings:
         is_unknown = finding.verdict is Verdict.NOT_JUDGED and finding.value is None and finding.missing
@@ -71,7 +71,7 @@ def grouped(findings: Sequence[Finding]) -> list[tuple[list[Finding], str]]:
 
 
 def summary(findings: Sequence[Finding], decisive: Container[str]) -> str:
-    """All findings in one line, such as `24 ok, 2 not judged: good enough to build`; decisive: checks whose failure a build refuses."""
+    """Return all findings as one line, such as `24 ok, 2 not judged: good enough to build`; decisive: checks that a build requires."""
     counts = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
     shown = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     failed = [finding.name for finding in findings if finding.verdict is Verdict.FAIL]

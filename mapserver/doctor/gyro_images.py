@@ -17,16 +17,16 @@ _SEARCH_S, _STEP_S = 0.2, 0.002
 _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
-_REACH, _NOISE_RADPS = 4.0, 0.01  # intervals further off than so many typical ones: someone stood in the picture
-_PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not move by half a frame within seconds
+_REACH, _NOISE_RADPS = 4.0, 0.01  # in typical deviations; intervals beyond are outliers, such as people in the picture
+_PARTS, _UNSTEADY_S = 5, 0.02  # stamps of one clock do not drift by half a frame within seconds
 
 
 @dataclass(frozen=True, slots=True)
 class GyroFit:
-    """What explains the images' rates best: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images.
+    """Best fit of gyro to the images' rates: body_from_gyro (3, 3) orthogonal, perhaps a mirror. Scale gyro over images.
 
-    signed: the order and signs of the axes (3, 3) that explain them about as well and change least, None where none does.
-    offsets_s: of stretches of the run that show it each for itself, empty where fewer than two do.
+    signed: the order and signs of the axes (3, 3) with a similar fit and the least change, None if absent.
+    offsets_s: of stretches of the run that determine it separately, empty if fewer than two do.
     """
 
     offset_s: float
@@ -39,14 +39,14 @@ class GyroFit:
 
     @property
     def is_unsteady(self) -> bool:
-        """True for stamps that move against each other within the run."""
+        """True if the two clocks drift against each other within the run."""
         return len(self.offsets_s) > 1 and float(np.ptp(self.offsets_s)) > _UNSTEADY_S
 
 
 def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None, bool]:
-    """Time offset (beyond the calibrated one), scale and axes of the gyro; not judged without turns to judge by.
+    """Return time offset (beyond the calibrated one), scale and axes of the gyro; not judged with too little rotation.
 
-    With them the offset in seconds, where images and gyro agree well enough to correct the calibration by it, and whether it changes.
+    Also return the offset in seconds if images and gyro agree well enough to correct the calibration by it, and whether it changes.
     """
     unknown = _why_not(turns, imu, imu_minus_cam_s)
     if unknown:
@@ -69,7 +69,7 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
 
 
 def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float, body_from_cam: Array) -> bool | None:
-    """True if the images turn as if each were rotated by 180 degrees in its plane, False if as given; None where nothing tells."""
+    """True if the images turn as if each were rotated by 180 degrees in its plane, False if as given; None if unknown."""
     if _why_not(turns, imu, imu_minus_cam_s):
         return None
     gyro, seen = _gyro_rates(turns, imu, imu_minus_cam_s), turns.rates_body_radps
@@ -79,10 +79,10 @@ def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float
 
 
 def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> GyroFit:
-    """The offset (beyond imu_minus_cam_s), rotation or mirror, and scale that make the gyro fit the images' rates best.
+    """Return the offset (beyond imu_minus_cam_s), rotation or mirror, and scale with the best fit of the gyro to the images' rates.
 
-    First the offset by the magnitudes, which know no axes, then the axes by orthogonal Procrustes, then the offset by the vectors; then
-    all of it again without the minority of intervals in which the images turn otherwise.
+    First the offset by the magnitudes, which are independent of axes, then the axes by orthogonal Procrustes, then the offset by the
+    vectors; then all of it again without the minority of intervals that disagree.
     """
     offsets_s = np.arange(-_SEARCH_S, _SEARCH_S + _STEP_S / 2, _STEP_S)
     all_seen = turns.rates_body_radps
@@ -116,12 +116,12 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
 
 
 def _scores(gyro: Array, seen: Array, body_from_gyro: Array) -> Array:
-    """Correlation with the images' rates (K, 3) of the gyro's at every offset (D, K, 3)."""
+    """Return the correlation of the gyro's rates at every offset (D, K, 3) with the images' rates (K, 3)."""
     return np.array([_correlation(rates @ body_from_gyro.T, seen) for rates in gyro])
 
 
 def _inliers(seen: Array, turned: Array) -> Array:
-    """(K,) mask of the intervals in which the gyro turns as the images, by a scale and a bias that the median shows."""
+    """Return (K,) mask of the intervals in which gyro and images agree, up to a scale and a bias estimated by medians."""
     squares = (turned * turned).sum(axis=1)
     moving = squares > _LEAST_RATE_RADPS**2
     share = float(np.median((turned * seen).sum(axis=1)[moving] / squares[moving])) if moving.any() else 1.0
@@ -137,14 +137,14 @@ def _signed_axes(seen: Array, gyro: Array, best: Array) -> Array | None:
 
 
 def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[str, str] | None:
-    """Why the gyro cannot be judged and what recording could; None where it can."""
+    """Return the reason why the gyro cannot be judged and the recording needed; None if it can."""
     if len(imu) < 10:
         return NO_IMU
     pairs = len(turns.starts_ns)
     if pairs < _MIN_PAIRS:
         return f"{pairs} pairs of consecutive frames could be compared, {_MIN_PAIRS} are needed", "record every frame"
     rates = turns.rates_body_radps, _gyro_rates(turns, imu, imu_minus_cam_s)
-    spreads = [float(np.sqrt(seen.var(axis=0).sum())) for seen in rates]  # an IMU that turns alone is another robot's
+    spreads = [float(np.sqrt(seen.var(axis=0).sum())) for seen in rates]  # an IMU that turns alone: another robot
     if max(spreads) < _LEAST_RATE_RADPS:
         hardly = f"the camera hardly turns (rates vary by {spreads[0]:.3f} rad/s)"
         return hardly, "drive curves, to the left and to the right"
@@ -152,7 +152,7 @@ def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tup
 
 
 def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shift_s: float) -> Array:
-    """(K, 3) mean gyro rates over the intervals, moved by `shift_s` on the IMU's clock."""
+    """Return (K, 3) mean gyro rates over the intervals, shifted by `shift_s` on the IMU's clock."""
     origin_ns = int(imu.stamps_ns[0])
     times_s = (imu.stamps_ns - origin_ns) * 1e-9
     steps = np.diff(times_s)[:, None] * 0.5 * (imu.gyro_radps[1:] + imu.gyro_radps[:-1])
@@ -169,10 +169,10 @@ def _correlation(first: Array, second: Array) -> float:
 
 
 def _axes(seen: Array, gyro: Array) -> tuple[Array, int]:
-    """Orthogonal body_from_gyro (3, 3) and about how many axes both turn. Where one axis is not seen it completes a rotation."""
+    """Return orthogonal body_from_gyro (3, 3) and the number of axes of common rotation. With an unobserved axis it is a rotation."""
     u, singular, vt = np.linalg.svd(seen.T @ (gyro - gyro.mean(axis=0)))
     axes_seen = int((singular > 0.03 * singular[0]).sum())
-    if axes_seen < 2:  # the smallest rotation that brings the two axes together, or its reverse
+    if axes_seen < 2:  # the smallest rotation that aligns the two axes, or its reverse
         return rotation_between_vectors(vt[0], u[:, 0]), axes_seen
     sign = 1.0 if axes_seen == 3 else float(np.sign(np.linalg.det(u @ vt)))
     return u @ np.diag([1.0, 1.0, sign]) @ vt, axes_seen
@@ -190,12 +190,12 @@ def _offset_finding(fit: GyroFit, imu_minus_cam_s: float) -> Finding:
     if fit.is_unsteady:
         low_ms, high_ms = 1e3 * fit.offsets_s.min(), 1e3 * fit.offsets_s.max()
         words = (
-            f"the IMU's stamps move against those of the images, from {low_ms:+.0f} to {high_ms:+.0f} ms beyond the calibration: no "
-            "timeshift mends that; stamp both by one clock, each image at its exposure"
+            f"the IMU's stamps drift against those of the images, from {low_ms:+.0f} to {high_ms:+.0f} ms beyond the calibration: no "
+            "timeshift corrects that; stamp both by one clock, each image at its exposure"
         )
-        limit = f"fail where it changes by more than {1e3 * _UNSTEADY_S:g} ms"
+        limit = f"fail if it changes by more than {1e3 * _UNSTEADY_S:g} ms"
         return Finding(OFFSET, Verdict.FAIL, float(high_ms - low_ms), limit, words)
-    words = f"the IMU's stamps are {fit.offset_s * 1e3:+.1f} ms from what the calibration says"
+    words = f"the IMU's stamps are {fit.offset_s * 1e3:+.1f} ms from the calibration"
     advice = f"set timeshift_cam_imu to {imu_minus_cam_s + fit.offset_s:+.4f} s, or stamp both by one clock"
     return judge(OFFSET, abs(fit.offset_s) * 1e3, Limits(6.0, 25.0, "ms"), words, f"{words}; {advice}")
 
@@ -216,7 +216,7 @@ def _axes_finding(fit: GyroFit) -> Finding:
     about = f"judged about {fit.axes_seen} of 3 axes"
     if fit.signed is not None and np.trace(fit.signed) < 3.0:
         words = f"the gyro {axes_in_words(fit.signed)}: so the images turn, {about}"
-        advice = "mend its driver's signs, or how the calibration mounts it (T_cam_imu)"
+        advice = "correct its driver's signs, or T_cam_imu in the calibration"
         return Finding(AXES, Verdict.FAIL, None, limit, f"{words}; {advice}")
     if np.linalg.det(fit.body_from_gyro) < 0:
         axes = in_axes(fit.body_from_gyro)

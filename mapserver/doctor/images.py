@@ -1,4 +1,4 @@
-"""Checks of single images and of short runs of them: sharpness, flicker, what stays in its place, depths, and the lens."""
+"""Checks of single images and of short runs of them: sharpness, flicker, fixed patterns, depths, and the lens."""
 
 from collections.abc import Callable, Sequence
 
@@ -20,12 +20,12 @@ _BLURRED_SHARE_OF_MEDIAN, _MANY = 0.25, 0.25
 
 
 def laplacian_variance(image: Image) -> float:
-    """Variance of the Laplacian after a light smoothing that takes pixel noise away, in grey levels squared."""
+    """Return the variance of the Laplacian after a light smoothing that removes pixel noise, in grey levels squared."""
     return float(cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F).var())
 
 
 def sharpness(variances: Sequence[float]) -> Finding:
-    """Judges some frames by their `laplacian_variance`: the median, and how many fall far below it. Source: Pech-Pacheco et al. 2000."""
+    """Judge some frames by their `laplacian_variance`: the median, and the share far below it. Source: Pech-Pacheco et al. 2000."""
     if not variances:
         return not_judged("sharpness", "no frame could be read", "copy the recording again")
     values = np.array(variances)
@@ -37,7 +37,7 @@ def sharpness(variances: Sequence[float]) -> Finding:
     words = f"variance of the Laplacian: median {median:.0f}, tenth percentile {np.percentile(values, 10):.0f}"
     verdict = Verdict.OK
     if median < _BLIND:
-        verdict, words = Verdict.FAIL, f"{words}; the images show next to nothing, look at the lens"
+        verdict, words = Verdict.FAIL, f"{words}; the images show almost nothing, check the lens"
     elif median < _FLAT or blurred > _MANY:
         verdict = Verdict.WARN
         words += f"; {blurred:.0%} are blurred; shorten the exposure, clean and focus the lens"
@@ -45,13 +45,13 @@ def sharpness(variances: Sequence[float]) -> Finding:
 
 
 _RUNS, _RUN_FRAMES, _BANDS = 6, 4, 8
-_FLICKER_LIMITS = Limits(0.03, 0.15, "of the brightness (median)")  # scenes that a camera drives past reach 0.01
+_FLICKER_LIMITS = Limits(0.03, 0.15, "of the brightness (median)")  # changing scenes reach 0.01
 
 
 def flicker_check(recording: Recording, read: ReadFrame) -> Finding:
-    """Amplitude by which bands of rows are brighter and darker in turn, in short runs of frames.
+    """Judge the amplitude of alternating brightness of bands of rows, in short runs of frames.
 
-    Bands, because a rolling shutter shows the light of the mains as stripes that wander.
+    Bands, because under mains lighting a rolling shutter shows moving stripes.
     """
     amplitudes = []
     for first in np.unique(np.linspace(0, max(len(recording) - _RUN_FRAMES, 0), _RUNS).astype(int)):
@@ -64,11 +64,11 @@ def flicker_check(recording: Recording, read: ReadFrame) -> Finding:
             bends = np.abs(means[:-2] - 2.0 * means[1:-1] + means[2:])
             amplitudes.append(bends / np.maximum(4.0 * means.mean(axis=0), 1.0))
     if not amplitudes:
-        return not_judged("flicker", "no frames follow each other closely", "record every frame")
+        return not_judged("flicker", "no closely spaced frames", "record every frame")
     amplitude = float(np.median(np.concatenate(amplitudes)))
     bad = (
-        f"the images are {amplitude:.0%} brighter and darker in turn from frame to frame; set the exposure to a whole number of the "
-        "light's periods (10 ms where the mains have 50 Hz, 8.33 ms with 60 Hz), switch on the driver's power line frequency, and "
+        f"the images are {amplitude:.0%} alternately brighter and darker from frame to frame; set the exposure to a whole number of the "
+        "light's periods (10 ms with 50 Hz mains, 8.33 ms with 60 Hz), switch on the driver's power line frequency, and "
         "switch off lamps that flash"
     )
     return judge("flicker", amplitude, _FLICKER_LIMITS, "the brightness is steady from frame to frame", bad)
@@ -82,7 +82,7 @@ _MIN_SCENES = 5
 
 
 def fine_structure(image: Image) -> tuple[Array, Array]:
-    """What of an image is finer than a few pixels, and the image coarsely: both at one size for all cameras of a shape."""
+    """Return the image's details finer than a few pixels, and the coarse image: both at one size for all cameras of a shape."""
     size = _WIDTH_PX, max(_CELL_PX, round(image.shape[0] * _WIDTH_PX / image.shape[1]) // _CELL_PX * _CELL_PX)
     small: Array = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64)
     coarse = cv2.resize(small, (size[0] // _CELL_PX, size[1] // _CELL_PX), interpolation=cv2.INTER_AREA)
@@ -90,9 +90,9 @@ def fine_structure(image: Image) -> tuple[Array, Array]:
 
 
 def fixed_pattern(structures: Sequence[tuple[Array, Array]]) -> Finding:
-    """The share of the image whose `fine_structure` is the same in images of different scenes: dots of a projector, dirt, the robot.
+    """Judge the share of the image whose `fine_structure` is equal in different scenes: projector dots, dirt, the robot itself.
 
-    Structures that have nothing in common leave 1 / n of their energy in the mean of n.
+    Independent structures leave 1 / n of their energy in the mean of n.
     """
     kept: list[tuple[Array, Array]] = []
     for fine, coarse in structures:
@@ -100,19 +100,17 @@ def fixed_pattern(structures: Sequence[tuple[Array, Array]]) -> Finding:
             kept.append((fine, coarse))
     count = len(kept)
     if count < _MIN_SCENES:
-        return not_judged(
-            FIXED_PATTERN, f"{count} of the images that were looked at show different scenes", "drive further"
-        )
+        return not_judged(FIXED_PATTERN, f"{count} of the checked images show different scenes", "drive further")
     cells = np.array([_cells(fine) for fine, _ in kept])  # (n, cells, pixels)
     contrast = cells.std(axis=2)
     textured = np.median(contrast, axis=0) > _LEAST_CONTRAST
     if textured.sum() < 0.1 * len(textured):
-        return not_judged(FIXED_PATTERN, "the images show next to nothing", "drive in the light")
+        return not_judged(FIXED_PATTERN, "the images show almost nothing", "drive in the light")
     unit = cells[:, textured] / np.maximum(contrast[:, textured, None], 1e-6)
     alike = (count * (unit.mean(axis=0) ** 2).mean(axis=1) - 1.0) / (count - 1)
     share = float((alike > _LEAST_SHARE).sum()) / len(textured)
     bad = (
-        f"{share:.0%} of the image shows the same while the camera moves; switch a projector of infrared dots off or record the images "
+        f"{share:.0%} of the image stays the same while the camera moves; switch a projector of infrared dots off or record the images "
         "between its flashes, clean the lens, and keep the robot itself out of the image"
     )
     limits = Limits(0.2, 0.5, "of the image stays in its place")
@@ -135,14 +133,14 @@ _RANGE_M = (0.05, 100.0)
 
 
 def depth_share(depth_m: NDArray[np.float32]) -> float:
-    """Share of the pixels (H, W) that have a depth which a sensor can measure."""
+    """Return the share of the pixels (H, W) with a depth within the range of sensors."""
     return float(((depth_m > _RANGE_M[0]) & (depth_m < _RANGE_M[1])).mean())
 
 
 def measured_depth(shares: Sequence[float]) -> Finding:
-    """Whether frames, by their `depth_share`, have depths.
+    """Judge frames by their `depth_share`.
 
-    A wall at arm's length or a hall without end leaves a sensor little; one that is covered, off or read in a wrong unit gives nothing.
+    A wall at arm's length or a very long hall leaves few depths; a sensor that is covered, off or read in a wrong unit none.
     """
     missing = 1.0 - float(np.median(shares)) if shares else 1.0
     bad = (
@@ -154,10 +152,10 @@ def measured_depth(shares: Sequence[float]) -> Finding:
 
 
 def lens_check(recording: Recording, read: ReadFrame) -> Finding:
-    """Whether another lens than the calibration's fits the images far better."""
+    """Judge whether another lens than the calibration's fits the images far better."""
     fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, read)
     if fit is None:
-        reason = "too few points were followed from frame to frame, or hardly moved"
+        reason = "too few points were tracked from frame to frame, or hardly moved"
         return not_judged(LENS, reason, "drive, with a pair or depth")
     if fit.best_px2 > FITS_PX2:
         reason = f"no lens fits the points (error {np.sqrt(fit.best_px2):.1f} px)"

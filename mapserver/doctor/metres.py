@@ -1,6 +1,6 @@
-"""Who is right about metres: the images by their baseline or depths, the accelerometer by gravity, the wheels by their radius.
+"""Metric scale compared: images (baseline or depths), accelerometer (gravity), wheels (radius).
 
-Two that agree contradict the third. Wheels also have a direction and a yaw rate, which no baseline explains.
+Two that agree contradict the third. Wheels also have a direction and a yaw rate, which no error of the baseline explains.
 """
 
 from collections.abc import Sequence
@@ -15,23 +15,23 @@ from mapserver.doctor.camera_motion import CameraTurns
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 
 WHEELS, METRES = "wheels", "metric scale"
-_RESTS_MPS = 0.05  # images of a camera at rest show less, by their noise
-_OFF = 1.3  # a ratio beyond this contradicts; what is nearer to 1 is measured with the calibration
+_RESTS_MPS = 0.05  # the noise of images at rest is below
+_OFF = 1.3  # a ratio beyond contradicts; smaller errors are measured with the calibration
 _SURE_SIGMAS = 3.0
-_KNOWN_SHARE = 0.2  # a ratio that is not known to a fifth decides nothing
+_KNOWN_SHARE = 0.2  # a ratio with a larger sigma decides nothing
 _UNITS = {1000.0: "mm/s", 100.0: "cm/s", 3.6: "km/h", 2.237: "miles per hour"}
-# What no robot has: cameras that far apart (m), a median depth (m), a speed of cameras and of wheels (m/s)
+# Implausible for any robot: distance of cameras (m), median depth (m), speed of cameras and of wheels (m/s)
 _BASELINES_M, _DEPTHS_M, _FASTEST_MPS, _FASTEST_WHEELS_MPS = (0.005, 3.0), (0.05, 500.0), 70.0, 25.0
-_LIMIT = f"fail where a ratio is beyond {_OFF:g} for sure, or its sign is wrong"
+_LIMIT = f"fail if a ratio is certainly beyond {_OFF:g}, or its sign is wrong"
 
 
 @dataclass(frozen=True, slots=True)
 class WheelFit:
-    """Wheels over images: medians, which a minority of slips and of people in the pictures does not move.
+    """Wheels over images: medians, robust to a minority of slips and of people in the pictures.
 
-    speed: complex, forward and left: -1 for wheels that count backwards, 1j for a base that is turned by 90 degrees. yaw: of the rates.
-    Both 0 for wheels that rest while the images move, infinite for images that rest, None where too little moves. speed_sigma: of its size.
-    image_mps, wheel_mps: median speeds where one of them moves.
+    speed: complex, forward and left: -1 for wheels that count backwards, 1j for a base rotated by 90 degrees. yaw: of the rates.
+    Both 0 for wheels at rest with moving images, infinite for images at rest, None with too little motion. speed_sigma: of its magnitude.
+    image_mps, wheel_mps: median speeds while one of them moves.
     """
 
     speed: complex | None
@@ -42,7 +42,7 @@ class WheelFit:
 
     @property
     def size(self) -> float | None:
-        """Wheels over images where both drive in about one direction."""
+        """Wheels over images if both drive in about one direction."""
         speed = self.speed
         if speed is None or not np.isfinite(speed) or speed.real <= abs(speed.imag) or abs(speed) < 1e-6:
             return None
@@ -50,13 +50,13 @@ class WheelFit:
 
     @property
     def is_unsteady(self) -> bool:
-        """True for images that move by their own metres, but in no ratio to the wheels, as with depths ten times too small."""
+        """True if the images move but in no constant ratio to the wheels, as with depths ten times too small."""
         return self.speed is not None and not np.isfinite(self.speed) and self.image_mps > _RESTS_MPS
 
 
 @dataclass(frozen=True, slots=True)
 class ImageMetres:
-    """What the images' metres rest on. baseline_m: of a pair, None for depth images; the median depth and speed that are seen with it."""
+    """Source of the images' scale. baseline_m: of a pair, None for depth images; the resulting median depth and speed."""
 
     baseline_m: float | None
     depth_m: float
@@ -64,12 +64,12 @@ class ImageMetres:
 
     @property
     def source(self) -> str:
-        """In words."""
+        """The source as text."""
         return "the unit of the depth images" if self.baseline_m is None else f"the baseline of {self.baseline_m:.4g} m"
 
     @property
     def implausible(self) -> str:
-        """Which of them no robot has; empty if all may be."""
+        """The implausible value; empty if all are plausible."""
         checks = [
             ("a baseline", self.baseline_m, _BASELINES_M, "m"),
             ("a median depth", self.depth_m, _DEPTHS_M, "m"),
@@ -85,9 +85,9 @@ class ImageMetres:
 def judge_metres(
     wheels: WheelFit | None, given: AxesFit | None, images: ImageMetres | None, *, has_imu: bool
 ) -> tuple[Finding, Finding]:
-    """Whether the wheels drive as the images move (a failure says that they are left out), and whether a metre of the images may be one.
+    """Judge the wheels' motion against the images' (on failure they are left out), and the scale of the images.
 
-    given: the accelerometer's axes as given, None where those may be wrong; images: None for one camera.
+    given: fit with the given accelerometer axes, None if those may be wrong; images: None for one camera.
     """
     by_gravity = given if given is not None and given.sigma < _KNOWN_SHARE * abs(given.metres) else None
     blamed = _blamed(wheels, by_gravity, images)
@@ -95,7 +95,7 @@ def judge_metres(
 
 
 def _blamed(fit: WheelFit | None, by_gravity: AxesFit | None, images: ImageMetres | None) -> str:
-    """Which of wheels and images is wrong about metres: `either` where nothing tells, empty where they agree or one is not known."""
+    """Return the wrong one of wheels and images: `either` if undecided, empty if they agree or one is unknown."""
     if fit is None:
         return ""
     if fit.is_unsteady:
@@ -124,7 +124,7 @@ def _wheels_finding(fit: WheelFit | None, blamed: str) -> Finding:
     if fit.speed is None and fit.yaw is None:
         return not_judged(WHEELS, "nothing moves, or one camera shows no metres", "drive, and record a pair")
     value = None if fit.speed is None else abs(fit.speed)
-    return Finding(WHEELS, Verdict.OK, value, _LIMIT, "the wheels drive as the images move")
+    return Finding(WHEELS, Verdict.OK, value, _LIMIT, "wheels and images move alike")
 
 
 def _speed_fault(fit: WheelFit, blamed: str) -> str:
@@ -132,14 +132,14 @@ def _speed_fault(fit: WheelFit, blamed: str) -> str:
     if speed is None or fit.is_unsteady:
         return ""
     if not np.isfinite(speed):
-        return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: see whether the pictures change"
+        return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: check that the pictures change"
     if abs(speed) < 0.01 and fit.wheel_mps < 0.01 * fit.image_mps:
-        return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: see whether odometry is published"
+        return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: check that odometry is published"
     angle_deg = float(np.degrees(np.angle(speed)))
     if abs(angle_deg) > 135.0:
-        return "the wheels drive backwards while the images move forwards: negate their speed, or mend base_from_body"
+        return "wheels drive backwards while the images move forwards: negate their speed, or correct base_from_body"
     if abs(angle_deg) > 45.0:
-        return f"the wheels drive {angle_deg:+.0f} degrees away from where the images move: mend base_from_body"
+        return f"the wheels drive {angle_deg:+.0f} degrees away from the motion of the images: correct base_from_body"
     if blamed != WHEELS:
         return ""
     units = (f": they are in {unit}" for factor, unit in _UNITS.items() if abs(abs(speed) / factor - 1.0) < 0.1)
@@ -176,23 +176,23 @@ def _metres_finding(
         is_off = is_off and _is_off(ratio, fit.speed_sigma)
     if blamed in ("images", "either") or (is_off and blamed != WHEELS):
         if blamed == "either":
-            advice += " and the wheels' unit and radius: nothing tells which of them is wrong"
+            advice += " and the wheels' unit and radius: the data do not show which is wrong"
         return Finding(METRES, Verdict.FAIL, value, _LIMIT, f"{measured}; {advice}")
     if odd := images.implausible:
         words = f"by {images.source} there is {odd}; {advice}"
-        return Finding(METRES, Verdict.FAIL, None, "fail for what no robot has", words)
+        return Finding(METRES, Verdict.FAIL, None, "fail for implausible values", words)
     if said:
         return Finding(METRES, Verdict.OK, value, _LIMIT, measured)
-    shown = f"nothing but {images.source} tells metres: by it things are {images.depth_m:.2g} m away in the median"
+    shown = f"only {images.source} gives the scale: with it objects are {images.depth_m:.2g} m away in the median"
     shown += f" and the cameras move at {images.speed_mps:.2g} m/s" if images.speed_mps else ""
     if has_imu:
         return not_judged(
-            METRES, shown, "start, stop and turn more often, so that the IMU tells them, or record wheel odometry"
+            METRES, shown, "start, stop and turn more often, so that the IMU gives the scale, or record wheel odometry"
         )
     return not_judged(METRES, shown, "record an IMU, with starts, stops and turns, or wheel odometry")
 
 
-_LEAST_MPS, _LEAST_RADPS = 0.1, 0.1  # below, a robot may as well rest
+_LEAST_MPS, _LEAST_RADPS = 0.1, 0.1  # below, a robot counts as at rest
 _MIN_MOVING = 5
 _SAMPLES = 5  # of an interval
 _STEADY_SIGMAS = 5.0
@@ -201,7 +201,7 @@ _STEADY_SIGMAS = 5.0
 def fit_wheels(
     turns: CameraTurns, wheel: Sequence[WheelSample], base_from_body: Array, imu_minus_cam_s: float
 ) -> WheelFit:
-    """The wheels over what the images say of the same intervals; wheels are on the IMU's clock."""
+    """Fit the wheels to the images' motion in the same intervals; wheels are on the IMU's clock."""
     seen: list[Array] = []
     rolled: list[Array] = []
     stamps_s = (np.array([sample.stamp_ns for sample in wheel], np.int64) - wheel[0].stamp_ns) * 1e-9
@@ -229,7 +229,7 @@ def fit_wheels(
 
 
 def _ratio(seen: Array, rolled: Array, least: float) -> tuple[complex | None, float]:
-    """Wheels over images, and the sigma of its size: where the wheels move, or else where the images do."""
+    """Return wheels over images, and the sigma of its magnitude: while the wheels move, or else while the images do."""
     known = np.isfinite(seen)
     drives, moves = known & (np.abs(rolled) > least), known & (np.abs(seen) > least)
     if drives.sum() >= _MIN_MOVING:

@@ -1,4 +1,4 @@
-"""Reads the frames that the checks need and runs all of them."""
+"""Reads the frames for the checks and runs all checks."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,15 +30,15 @@ from mapserver.survey.executor import SERIAL, Executor
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)
 SAMPLED_FRAMES = 40
-_STEP_S = 0.045  # between two frames that show a speed: a step of 20 Hz
+_STEP_S = 0.045  # between two frames for a speed: one step at 20 Hz
 TURN_FRAMES = 200
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResults:
-    """All findings, in a fixed order, and the time offset that gyro and images show beyond the calibration's.
+    """All findings, in a fixed order, and the time offset of gyro and images beyond the calibration's.
 
-    measured_offset_s is None where it was not measured, or hardly. calibration: what was measured of it, nothing without a pair.
+    measured_offset_s is None if unknown or uncertain. calibration: its measurement, empty without a pair.
     """
 
     findings: list[Finding]
@@ -47,7 +47,7 @@ class CheckResults:
 
 
 class _Frames:
-    """Reads frames and remembers which could not be."""
+    """Reads frames and records the unreadable ones."""
 
     def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
         self._recording, self._on_frame = recording, on_frame
@@ -66,7 +66,7 @@ class _Frames:
 
 
 def frames_to_check(recording: Recording, sampled: int = SAMPLED_FRAMES, turn_frames: int = TURN_FRAMES) -> int:
-    """How often `run_checks` calls `on_frame`, about."""
+    """Return the approximate number of `on_frame` calls by `run_checks`."""
     turns = min(turn_frames, len(recording)) if len(recording.imu) else 0
     return min(sampled, len(recording)) + turns + followed_frames(recording)
 
@@ -81,10 +81,10 @@ def run_checks(
     follow: Follow | None = None,
     before_calibration: Callable[[Sequence[Finding]], None] = lambda _: None,
 ) -> CheckResults:
-    """Everything the checks say about a recording.
+    """Return the findings of all checks of a recording.
 
-    Reads at most `sampled` frames, spread over the recording, a run of `turn_frames`, and with a pair what `follow` reads, the busiest
-    30 s without it; `on_frame` is called after each. before_calibration: told the findings so far, before the drive is followed.
+    Reads up to `sampled` frames over the recording, a run of `turn_frames`, and with a pair the frames of `follow`, by default the 30 s
+    with the most motion; `on_frame` is called after each. before_calibration: called with the findings before the drive is tracked.
     """
     imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
@@ -116,7 +116,7 @@ def run_checks(
     before_calibration(findings)
     calibration = MeasuredCalibration([], None)
     if has_pair and is_unsteady:
-        reason = "the stamps of images and IMU move against each other"
+        reason = "the stamps of images and IMU drift against each other"
         calibration = unknown_calibration(reason, "stamp both by one clock, each image at its exposure")
     elif has_pair:
         used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
@@ -130,7 +130,7 @@ def run_checks(
 
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
-    """Those of `run_checks` for which the IMU and `sampled` frames will do: what can be said before a long drive begins."""
+    """Return the findings of `run_checks` that need only the IMU and `sampled` frames: for use before a long drive begins."""
     rectifier, frames = _rectifier(recording), _Frames(recording, lambda: None)
     return _soon_seen(recording, rectifier, _sampled(recording, frames, rectifier, sampled, SERIAL), frames)
 
@@ -141,9 +141,9 @@ def _rectifier(recording: Recording) -> Rectifier:
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """What frames all over the recording show.
+    """Results of frames all over the recording.
 
-    depth_shares: of pixels that have a depth. wheels: against the images, None without wheels; images: None for one camera.
+    depth_shares: of pixels with a depth. wheels: against the images, None without wheels; images: None for one camera.
     """
 
     pairs: list[StereoMatches]
@@ -195,7 +195,7 @@ _Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None]
 
 
 def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
-    """Frames spread over the recording, as recorded and rectified, and the next ones where they are near and a speed is wanted."""
+    """Yield frames spread over the recording, raw and rectified, and the next ones if they are near and a speed is needed."""
     stamps_ns, needs_speed = recording.frame_stamps_ns, bool(recording.wheel) or not len(recording.imu)
     for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
         frame = frames.read(int(index))
@@ -210,7 +210,7 @@ def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count:
 
 @dataclass(frozen=True, slots=True)
 class _Look:
-    """What one moment shows. depth_m: median, NaN if unknown. motion: as `body_motion`, None where it was not looked for."""
+    """Results of one moment. depth_m: median, NaN if unknown. motion: as `body_motion`, None if not computed."""
 
     variance: float
     pair: StereoMatches | None
@@ -239,7 +239,7 @@ def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
 def _consecutive(
     recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
 ) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
-    """Pairs of rectified frames close in time, from the run of frames in which the gyro is busiest."""
+    """Yield pairs of rectified frames close in time, from the run of frames with the fastest rotation by the gyro."""
     if len(recording.imu) == 0:
         return
     stamps_ns = recording.frame_stamps_ns
@@ -255,7 +255,7 @@ def _consecutive(
         current = None if frame is None else rectifier.rectify(frame)
         if previous is not None and current is not None and is_close:
             is_same, was_same = np.array_equal(previous.left, current.left), is_same
-            if is_same:  # a camera at rest repeats for long, and no sensor without noise repeats at all
+            if is_same:  # long repeats are a camera at rest; sensor noise excludes exact repeats
                 frames.repeats += not was_same
                 continue
             yield previous, current
@@ -275,16 +275,16 @@ def _busiest_start(recording: Recording, count: int) -> int:
 
 
 def _repeated_images(repeats: int, count: int) -> Finding:
-    """How often among `count` frames an image is the one before, and the next one is another."""
-    bad = f"an image is that of the frame before, {repeats} times in {count} frames; record each image once, with its own stamp"
+    """Count the images among `count` frames that equal the previous one and differ from the next."""
+    bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
     limits, good = Limits(0.02, 0.1, "of the frames"), "every frame has an image of its own"
     return judge("repeated images", repeats / count, limits, good, bad)
 
 
 def _readable(frames: _Frames) -> Finding:
-    limit = "every frame that was looked at must be readable"
+    limit = "every checked frame must be readable"
     tried, errors = len(frames.tried), list(frames.errors.values())
     if not errors:
-        return Finding("images", Verdict.OK, 0.0, limit, f"all {tried} frames that were looked at are whole")
+        return Finding("images", Verdict.OK, 0.0, limit, f"all {tried} checked frames are readable")
     sentence = f"{len(errors)} of {tried} cannot be read; {errors[0]}"
     return Finding("images", Verdict.FAIL, float(len(errors)), limit, sentence)

@@ -1,4 +1,4 @@
-"""Checks of stamps and samples alone: rates, gaps, order, whether camera and IMU ran together, gravity, and a rolling shutter."""
+"""Checks of stamps and samples alone: rates, gaps, order, overlap of camera and IMU, gravity, and a rolling shutter."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ GRAVITY = "gravity magnitude"
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 NO_IMU = ("there is no IMU", "record an IMU")
 _SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
-# Ends of issues of recordings that have all of their data
+# Ends of issues about recordings with complete data
 _NOT_LOST = (
     "stamps uncertain",
     "Bayer pattern",
@@ -32,12 +32,12 @@ _NOT_LOST = (
 
 
 def median_period_s(stamps_ns: Stamps) -> float:
-    """Median step between stamps (N,); inf for fewer than two."""
+    """Return the median step between stamps (N,); inf for fewer than two."""
     return float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else float("inf")
 
 
 def stream_checks(recording: Recording) -> list[Finding]:
-    """Rates, gaps and order of the stamps, and whether the IMU's noise is known."""
+    """Check rates, gaps and order of the stamps, and whether the IMU's noise is known."""
     frames_ns, imu_ns = recording.frame_stamps_ns, recording.imu.stamps_ns
     return [
         *camera_checks(frames_ns),
@@ -48,10 +48,10 @@ def stream_checks(recording: Recording) -> list[Finding]:
 
 
 def camera_checks(stamps_ns: Stamps) -> tuple[Finding, Finding]:
-    """Frames per second by the median step, and the longest time without a frame."""
+    """Judge frames per second by the median step, and the longest time without a frame."""
     period_s = median_period_s(stamps_ns)
     if period_s > SPARSE_S:
-        lacking = f"frames are {period_s:.2f} s apart, this is no video", "record every frame of the camera"
+        lacking = f"frames are {period_s:.2f} s apart, too far for a video", "record every frame of the camera"
         return not_judged("camera rate", *lacking), not_judged("camera gaps", *lacking)
     return (
         _rate("camera rate", 1 / period_s, _SLOWEST_CAMERA_HZ, "record with a higher frame rate"),
@@ -60,7 +60,7 @@ def camera_checks(stamps_ns: Stamps) -> tuple[Finding, Finding]:
 
 
 def imu_checks(stamps_ns: Stamps) -> tuple[Finding, Finding]:
-    """Inertial samples per second by the median step, and the longest time without one."""
+    """Judge inertial samples per second by the median step, and the longest time without one."""
     if len(stamps_ns) < 2:
         return not_judged("imu rate", *NO_IMU), not_judged("imu gaps", *NO_IMU)
     period_s = median_period_s(stamps_ns)
@@ -83,41 +83,41 @@ def _gaps(name: str, stamps_ns: Stamps, warn_s: float, fail_s: float, what: str)
     count = int((steps_s > warn_s).sum())
     at_s = float(stamps_ns[longest] - stamps_ns[0]) * 1e-9
     limits = Limits(round(warn_s, 4), max(fail_s, round(warn_s, 4)), "s")
-    advice = "look at the recorder's disk and the driver's queue"
-    if steps_ns[longest] > PAUSE_NS:  # no queue holds samples back for so long
+    advice = "check the recorder's disk and the driver's queue"
+    if steps_ns[longest] > PAUSE_NS:  # too long for a full queue
         advice = (
-            "the recorder was paused or its clock was set: what the robot drove meanwhile is unknown; pause where it stands, or "
-            "record what lies before and after as recordings of their own"
+            "the recorder was paused or its clock was set: the motion meanwhile is unknown; pause only at standstill, or "
+            "split the recording at the pause"
         )
     bad = f"{count} gaps without {what}, the longest {steps_s[longest]:.3f} s, {at_s:.1f} s after the start; {advice}"
     return judge(name, float(steps_s[longest]), limits, f"the longest step is {steps_s[longest]:.3f} s", bad)
 
 
 def imu_noise(calibration: RigCalibration) -> list[Finding]:
-    """That the IMU's noise is assumed, where it is."""
+    """Report assumed IMU noise."""
     if calibration.imu is None or "imu" not in calibration.assumed:
         return []
     noise = calibration.imu
     words = (
-        f"nothing tells it; {noise.gyro_noise_radps_rthz:g} rad/s/sqrt(Hz) and {noise.accel_noise_mps2_rthz:g} m/s^2/sqrt(Hz) are taken, "
+        f"unknown; assumed: {noise.gyro_noise_radps_rthz:g} rad/s/sqrt(Hz) and {noise.accel_noise_mps2_rthz:g} m/s^2/sqrt(Hz), "
         "twice those of an ADIS16448"
     )
     return [not_judged("imu noise", words, "give imu0 with its noise densities in a --calibration FILE")]
 
 
 def stamp_order(issues: Sequence[DataIssue]) -> Finding:
-    """Whether stamps that do not increase were left out when the recording was opened."""
+    """Report stamps that do not increase and were dropped when the recording was opened."""
     found = [issue for issue in issues if "stamps not increasing" in issue.what]
     limit = "none may be out of order"
     if not found:
         return Finding("stamp order", Verdict.OK, 0.0, limit, "all stamps increase")
     words = "; ".join(f"{issue.what}, {issue.detail}" for issue in found)
-    sentence = f"{words}; look for a clock that is set while recording, or for a driver that sends late"
+    sentence = f"{words}; check for a clock that is set while recording, or for a driver that sends late"
     return Finding("stamp order", Verdict.FAIL, float(len(found)), limit, sentence)
 
 
 def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
-    """A warning for each thing that could not be read, or is not what it should be."""
+    """Return a warning for each unreadable or unexpected item."""
     odd = [issue for issue in issues if issue.what.endswith(_NOT_LOST)]
     lost = [issue for issue in issues if issue not in odd and "stamps not increasing" not in issue.what]
     return [
@@ -136,7 +136,7 @@ def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
 
 
 def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus_cam_s: float) -> Finding:
-    """The share of frames during which the IMU ran."""
+    """Judge the share of the frames within the time of the IMU."""
     if len(imu_stamps_ns) == 0:
         return not_judged("camera-imu overlap", *NO_IMU)
     moments_ns = frame_stamps_ns + round(imu_minus_cam_s * 1e9)
@@ -145,12 +145,12 @@ def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus
     outside_share = 1 - float(inside.mean())
     start_s = float(imu_stamps_ns[0] - moments_ns[0]) * 1e-9
     bad = f"{outside_share:.0%} of the frames have no IMU at their time, which starts {start_s:+.3f} s after them"
-    limits, good = Limits(0.01, 0.5, "of the frames without IMU"), "the IMU ran while the camera did"
+    limits, good = Limits(0.01, 0.5, "of the frames without IMU"), "the IMU covers all frames"
     return judge("camera-imu overlap", outside_share, limits, good, f"{bad}; stamp both sensors by one clock")
 
 
 _GRAVITY_MPS2, _CALM_WINDOW_S = 9.81, 0.5
-# What a calm accelerometer shows instead, by a tenth: what that is
+# Wrong magnitudes of a calm accelerometer, within a tenth: their cause
 _ODD_GRAVITIES = {
     0.0: "gravity has been taken out of it: record the raw accelerometer, not the linear acceleration",
     1.0: "it is in g: multiply it by 9.80665",
@@ -161,7 +161,7 @@ _ODD_GRAVITIES = {
 
 
 def gravity_magnitude(imu: ImuSamples) -> Finding:
-    """The magnitude of the specific force in the calmest tenth of half-second windows."""
+    """Judge the magnitude of the specific force in the calmest tenth of half-second windows."""
     if len(imu) < 100:
         return not_judged(GRAVITY, f"{len(imu)} inertial samples are too few", NO_IMU[1])
     width = max(10, round(_CALM_WINDOW_S / median_period_s(imu.stamps_ns)))
@@ -181,7 +181,7 @@ def gravity_magnitude(imu: ImuSamples) -> Finding:
 
 
 def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]:
-    """By how much turns skew an image whose rows are read one after another; nothing for a global shutter."""
+    """Judge the skew of images by a rolling shutter during rotation; empty for a global shutter."""
     readout_s = camera.line_delay_s * camera.height_px
     if not readout_s:
         return []
@@ -190,7 +190,7 @@ def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]
         return [not_judged("rolling shutter", told, "record an IMU, or use a camera with a global shutter")]
     rate_radps = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 95))
     skew_px = rate_radps * readout_s * float(camera.intrinsics_px[0])
-    words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is {skew_px:.1f} px from where the first would be"
+    words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is shifted by {skew_px:.1f} px against the first"
     if skew_px <= 1.0:
         return [Finding("rolling shutter", Verdict.OK, skew_px, "warn above 1 px", words)]
     words += "; turn more slowly, or use a camera with a global shutter"

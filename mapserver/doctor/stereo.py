@@ -1,4 +1,4 @@
-"""Left and right image against the calibration. Is the right one the right one, and do rows match after rectification?"""
+"""Left and right image against the calibration: checks for exchanged images, and for equal rows after rectification."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.doctor.findings import Finding, Limits, judge, not_judged
 
 _MIN_MATCHES = 40
-_ALIKE = 47  # bits of 256 by which two descriptors may differ
-_NEAR = "drive in the light where both cameras see the same things, some of them near"
+_ALIKE = 47  # bits of 256 that may differ between two descriptors
+_NEAR = "drive in the light where both cameras see the same objects, some of them near"
 SWAPPED = "left and right"
 ROTATE_BACK = "switch the driver's rotation (flip) off, or calibrate the rig with these images"
 _SEARCH_ROWS_PX = 25.0
@@ -37,7 +37,7 @@ _NOTHING = StereoMatches(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 def match_stereo(frame: RectifiedFrame) -> StereoMatches:
-    """Matches that do not presume the calibration. ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px."""
+    """Return matches independent of the calibration. ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px."""
     empty = _NOTHING
     if frame.right is None:
         return empty
@@ -56,9 +56,9 @@ def match_stereo(frame: RectifiedFrame) -> StereoMatches:
 
 
 def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None = None) -> Finding:
-    """Points lie further left in the right image; where they do not, the images are swapped, or both rotated by 180 degrees.
+    """Judge the order of the images: points lie further left in the right image, unless images are swapped or both rotated by 180 degrees.
 
-    upside_down: whether they turn as if rotated, None where nothing tells.
+    upside_down: True if they turn as if rotated, None if unknown.
     """
     name = SWAPPED
     disparities = np.concatenate([p.disparities_px for p in pairs]) if pairs else np.zeros(0)
@@ -76,7 +76,7 @@ def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None 
 
 
 def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
-    """How far matches are from their row after rectification: median judged, 90 % and the angles that explain it named."""
+    """Judge distances of matches from their row after rectification: the median; names the 90 % quantile and the fitting angles."""
     name = "epipolar error"
     errors = np.concatenate([p.row_errors_px for p in pairs]) if pairs else np.zeros(0)
     if len(errors) < _MIN_MATCHES:
@@ -107,7 +107,7 @@ def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
 
 
 def _without_strays(matches: StereoMatches) -> StereoMatches:
-    """Wrong matches fall on any row; right ones gather around the median."""
+    """Remove wrong matches: they fall on any row, right ones near the median."""
     if len(matches.row_errors_px) < 8:
         return matches
     centre = np.median(matches.row_errors_px)

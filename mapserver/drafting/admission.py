@@ -18,7 +18,7 @@ from mapserver.doctor.run_checks import run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
-# Wrong units, axes or cameras: a survey would not fail on them but be wrong. Gaps, blur and damage it can cope with.
+# Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
 DECISIVE |= {
     "gyro scale",
@@ -30,22 +30,22 @@ DECISIVE |= {
     images.LENS,
     *(parameter.value for parameter in TOLERANCES),
 }
-# What nothing but the calibration tells a map, and the checks that judge it.
+# Properties of a map that depend on the calibration only, and the checks that judge them.
 SUBJECTS = {
     "metric scale": ("baseline", "focal length"),
     "images against IMU": ("gyro axes",),  # a mirrored video, and another run's IMU
     "pair geometry": ("left and right", "epipolar error", "focal ratio", "pair pitch", "pair yaw", "pair roll"),
 }
 SAMPLED_FRAMES, TURN_FRAMES = 20, 120
-_CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, it finds the rest itself
+_CORRECTED_FROM_S = 0.004  # two of the odometry's own sigmas: below, odometry estimates it itself
 
 
 @dataclass(frozen=True)
 class CheckedRecording:
     """A recording fit to be surveyed.
 
-    rig: its calibration, corrected where that was needed. findings: all that the doctor said. calibration: what they say of the calibration
-    that the recording came with. corrections: by parameter, in its unit.
+    rig: its calibration, corrected if needed. findings: all findings of the doctor. calibration: those on the calibration that
+    came with the recording. corrections: by parameter, in its unit.
     """
 
     rig: RigCalibration
@@ -55,15 +55,15 @@ class CheckedRecording:
 
     @property
     def leaves_wheels_out(self) -> bool:
-        """True if everything else contradicts the wheels."""
+        """True if all other sensors contradict the wheels."""
         return leaves_wheels_out(self.findings)
 
     def statements(self) -> list[str]:
-        """Each finding that is not good or could not be judged, in words, and what was done about them."""
+        """Each finding that is not good or not judged, as text, with the correction made."""
         return self._with_corrections(f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK)
 
     def remarks(self) -> list[str]:
-        """The statements, with one remark for all checks that lack the same; one that was measured keeps its figure."""
+        """The statements, with one remark for all checks that lack the same data; measured ones keep their value."""
         bad = [finding for finding in self.findings if finding.verdict is not Verdict.OK]
         return self._with_corrections(
             f"not judged: {', '.join(f.name for f in same)}: {same[0].missing}"
@@ -79,17 +79,17 @@ class CheckedRecording:
 
 
 def leaves_wheels_out(findings: Sequence[Finding]) -> bool:
-    """True if everything else contradicts the wheels."""
+    """True if all other sensors contradict the wheels."""
     return any(f.name == WHEELS and f.verdict is Verdict.FAIL for f in findings)
 
 
 def fingerprint(calibration: RigCalibration) -> str:
-    """A short name of the calibration: equal for equal files."""
+    """Return a short hash of the calibration: equal for equal files."""
     return hashlib.sha256(format_calibration(calibration).encode()).hexdigest()[:12]
 
 
 def rig_evidence(rig: str, findings: Sequence[Finding]) -> RigEvidence:
-    """A subject is judged where all of its checks are good, doubted where one warns, and else lacks what they lack."""
+    """Return evidence per subject: judged if all of its checks are good, doubted if one warns, else with their missing data."""
     judged, lacking, doubted = [], {}, {}
     for subject, names in SUBJECTS.items():
         found = [finding for finding in findings if finding.name in names]
@@ -110,10 +110,10 @@ def checked(
     executor: Executor = SERIAL,
     follow: Follow | None = None,
 ) -> CheckedRecording:
-    """What is found in the recording, and the calibration to survey it with. RecordingError where a check that decides failed.
+    """Return the findings of the recording, and the calibration for its survey. RecordingError if a decisive check failed.
 
-    A parameter that is wrong for sure is corrected, and the recording measured again: where that finds something wrong still, the
-    evidence conflicts, and a person must look at it.
+    A certainly wrong parameter is corrected, and the recording measured again: if that finds another error, the
+    evidence conflicts and an operator must check it.
     """
     limits = {"sampled": SAMPLED_FRAMES, "turn_frames": TURN_FRAMES}
     refuse = partial(_refuse, recording)
@@ -135,7 +135,7 @@ def checked(
 
 
 def refuse_hopeless(recording: Recording) -> None:
-    """RecordingError for what `checked` would refuse, as far as that is seen within a second: before a drive that would be in vain."""
+    """Raise RecordingError for what `checked` would refuse, as far as a check within a second shows it, before a useless drive."""
     _refuse(recording, run_cheap_checks(recording, SAMPLED_FRAMES))
 
 
@@ -149,6 +149,6 @@ def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:
 
 
 def _with_clock(rig: RigCalibration, correction_s: float) -> RigCalibration:
-    """The calibration with so much added to the time between IMU and cameras."""
+    """Return the calibration with this added to the time between IMU and cameras."""
     moved = tuple(replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + correction_s) for camera in rig.cameras)
     return replace(rig, cameras=moved)

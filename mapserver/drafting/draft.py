@@ -1,4 +1,4 @@
-"""A build: surveys recordings, joins them to the site's map, stores the draft, writes report and pictures."""
+"""A build: surveys recordings, merges them into the site's map, stores the draft, writes report and pictures."""
 
 import resource
 import time
@@ -78,14 +78,14 @@ _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "s
 
 @dataclass(frozen=True, slots=True)
 class BuildOptions:
-    """Choices of a build. Files that are not named are not written.
+    """Options of a build. Files without a name are not written.
 
-    frames: an A:B:C slice of each recording. use: only the sensors of a poorer set. trajectory: another system's poses to begin
-    with. trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
-    looked for in the draft.
-    threads, scheduler: see worker.py. settings: those of the survey; for None the preset of the first recording's sensors with the [survey]
+    frames: an A:B:C slice of each recording. use: only the sensors of a smaller set. trajectory: start poses of another system.
+    trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
+    localized in the draft.
+    threads, scheduler: see worker.py. settings: those of the survey; None for the preset of the first recording's sensors with the [survey]
     section of the file `config` over it. job: its number, for the draft.
-    look_at: told which recordings are worked on.
+    look_at: called with the recordings in work.
     """
 
     frames: str = "::"
@@ -109,13 +109,13 @@ class BuildOptions:
 
     @property
     def reading(self) -> RecordingOptions:
-        """How the recordings are read."""
+        """Options for reading the recordings."""
         return RecordingOptions(self.frames, OpenOptions(self.calibration, self.topics), self.use, self.trajectory)
 
 
 @dataclass(frozen=True, slots=True)
 class BuildRequest:
-    """Recordings that become a draft of a site in a store."""
+    """Recordings for a draft of a site in a store."""
 
     recordings: tuple[Path, ...]
     site: str
@@ -125,7 +125,7 @@ class BuildRequest:
 
 @dataclass(frozen=True)
 class _Run:
-    """One build under way, with what all of its steps need."""
+    """A running build, with the data for all of its steps."""
 
     request: BuildRequest
     reading: OpenRecordings
@@ -138,7 +138,7 @@ class _Run:
     images: MappedImageStore
 
     def tools(self, executor: Executor, view: ProgressView, told: JobProgress | None = None) -> SurveyTools:
-        """With progress that is shown and timed, and told to those who look at the job."""
+        """Return tools with displayed and timed progress, also reported to viewers of the job."""
 
         def progress(stage: str, done: int, total: int) -> None:
             self.times(stage, done, total)
@@ -160,13 +160,13 @@ class Built:
 
     @property
     def taken(self) -> list[Surveyed]:
-        """The recordings that found their place in the map."""
+        """The recordings that were joined to the map."""
         return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A stored draft: its version, a sentence about it, its report, and by content hash why recordings were left out."""
+    """A stored draft: its version, a summary sentence, its report, and the reasons for left-out recordings by content hash."""
 
     version: int
     sentence: str
@@ -177,14 +177,14 @@ class Draft:
 def build_draft(
     request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, recorded: bool = False
 ) -> tuple[Draft, Built]:
-    """Builds a draft; raises FleetmapErrors, before the survey where possible.
+    """Build a draft; raises FleetmapErrors, before the survey if possible.
 
-    With `unusable` a recording that cannot be surveyed goes in there with its reason, and the others are taken. recorded: as
+    With `unusable` a recording that cannot be surveyed is added there with its reason, and the others are used. recorded: as
     a job of the store.
     """
     options, started_s = request.options, time.perf_counter()
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
-        raise UsageError(f"{given.file} is of one recording, {len(request.recordings)} are named; build each alone")
+        raise UsageError(f"{given.file} is for one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
@@ -225,26 +225,26 @@ def _admitted(run: _Run) -> dict[Path, Admission]:
 
 
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
-    """The site's current version, to build on; None for a site without one."""
+    """Return the site's current version, to build on; None if absent."""
     site = request.site
     if site not in {info.site for info in maps.sites()} or (current := maps.current(site)) is None:
         return None
     if request.options.frame_from_ground_truth:
         raise UsageError(
-            f"site {site} has version {current.version}, whose frame stays; build without --frame-from-ground-truth, "
+            f"site {site} has version {current.version}, whose frame is fixed; build without --frame-from-ground-truth, "
             "or name another --site"
         )
     check_base(maps, current)
     archive = maps.archive(site, current.version)
     if archive is None:
         raise StoreError(
-            f"version {current.version} of site {site} has no archive to build on; survey the site anew under another name"
+            f"version {current.version} of site {site} has no archive to build on; survey the site again under another name"
         )
     return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
 
 
 def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, told: JobProgress) -> Built:
-    """Surveys all recordings and joins them to the current map."""
+    """Survey all recordings and join them to the current map."""
     options, settings = run.request.options, run.settings
     with (
         ProgressView(run.console) as view,
@@ -282,7 +282,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
 
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
-    """Cuts the map into tiles, measures them, stores the draft and writes the files that were asked for."""
+    """Cut the map into tiles, measure them, store the draft and write the requested files."""
     site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
@@ -323,7 +323,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         recordings=tuple(s.entry for s in built.taken),
         configuration=_configuration(run, parent),
         libraries=library_versions(),
-        # A robot downloads the manifest: what it says about the build is short.
+        # A robot downloads the manifest: its part about the build is short.
         report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
         | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None))},
     )
@@ -346,11 +346,11 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     return draft
 
 
-_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: stamps before are no calendar's, but count from a start
+_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
 
 
 def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, float]:
-    """By id of each open request the share of its places that these recordings drove past; what is older counts for nothing."""
+    """Return by id of each open request the covered share of its places; recordings older than the request do not count."""
     places = joined.map.map_from_body[:, :2, 3]
     drives = map_trajectories(joined)
     found = {}
@@ -380,7 +380,7 @@ def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None)
 
 
 def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
-    """What the map depends on besides the recordings; no paths, which mean nothing elsewhere."""
+    """Return the inputs of the map besides the recordings; no paths, which are meaningless elsewhere."""
     options = run.request.options
     kept = parent is not None and bool(parent.manifest.configuration.get("frame_from_ground_truth"))
     given: dict[str, Any] = {} if options.trajectory is None else {"trajectory": options.trajectory.file.name}
@@ -399,10 +399,10 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
 
 
 def picture_png(site: str, draft: Draft, built: Built) -> bytes:
-    """The map from above as a PNG."""
+    """Return the map from above as a PNG."""
     from mapserver.drafting.plots import draw_survey
 
-    # Loops name keyframes of their own survey, which are the map's only where nothing was joined or culled.
+    # Loops name keyframes of their own survey; these are the map's only if nothing was joined or culled.
     loops = built.taken[0].survey.loops if built.is_first and len(built.taken) == 1 else Loops()
     report = msgspec.convert(draft.report, BuildReport)
     return draw_survey(f"{site}, version {draft.version}", built.joined.map, loops, built.accuracy, report)

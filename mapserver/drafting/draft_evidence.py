@@ -1,4 +1,4 @@
-"""Evidence about a draft: frames read from recordings, relocalized in the tiles as robots get them."""
+"""Evidence about a draft: frames of recordings, relocalized in the tiles in their final form."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -31,12 +31,12 @@ from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap, history_of
 
-PROBES = 40  # of each kind: one wrong or missing frame weighs 2.5 %
+PROBES = 40  # of each kind: one wrong or missing frame counts 2.5 %
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """A frame of a recording that the build did not use: its number among the selected ones, its camera and what that saw."""
+    """A frame of a recording not used by the build: its number among the selected ones, its camera and features."""
 
     number: int
     camera: StereoCamera
@@ -44,12 +44,12 @@ class HeldOut:
     features: FrameFeatures
 
     def probe(self, map_from_body: Array) -> Probe:
-        """It as a probe; map_from_body (F, 4, 4) of all selected frames."""
+        """Return it as a probe; map_from_body (F, 4, 4) of all selected frames."""
         return Probe(self.camera, self.features, map_from_body[self.number] @ self.body_from_cam)
 
 
 class JudgedSession(NamedTuple):
-    """A recording in the map: where its frames are in `map` now, frames that the build left out, and its survey."""
+    """A recording in the map: poses of its frames in `map`, frames that the build left out, and its survey."""
 
     trajectory: Trajectory
     held_out: Sequence[HeldOut]
@@ -63,7 +63,7 @@ def held_out_of(
     survey: Survey,
     orb: OrbSettings,
 ) -> list[HeldOut]:
-    """Frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
+    """Return frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
     return _read(recording, selected, numbers, rectifier, orb)
@@ -89,7 +89,7 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """The version that a draft is built on: its manifest, survey, tiles and grid, and the calibrations judged up to it."""
+    """The parent version of a draft: its manifest, survey, tiles and grid, and the calibrations judged up to it."""
 
     manifest: Manifest
     survey: SurveyMap
@@ -99,7 +99,7 @@ class Before:
 
     @classmethod
     def of(cls, maps: MapStore, manifest: Manifest, survey: SurveyMap) -> "Before":
-        """The version of this manifest and archive, with its tiles from the store."""
+        """Return the version of this manifest and archive, with its tiles from the store."""
         evidence = maps.evidence(manifest.site, manifest.version)
         known = () if evidence is None else evidence.calibrations or ()
         judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
@@ -107,17 +107,17 @@ class Before:
         return cls(manifest, survey, tiles, judged, known_grid(manifest, maps.blob))
 
     def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:
-        """Landmarks that come before others in the budget: those that robots have, and those that the map has just gained.
+        """Return landmarks with priority in the budget: those on the robots, and those new in the map.
 
-        The new ones compete with the published ones; what else the archive knows would only take the place of its like.
+        The new ones compete with the published ones; others of the archive would only replace similar ones.
         """
         new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(self.survey).next_landmark_id]
         return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in self.tiles)])).astype(np.uint32)
 
     def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
-        """(F, 4, 4) map_from_body of a recording's frames when this version was made of it, and which (F,) may be offered.
+        """Return (F, 4, 4) map_from_body of a recording's frames from the build of this version, and a mask (F,) of usable ones.
 
-        Keyframes are left out; None where the version was made without it.
+        Keyframes are excluded; None if the version was built without it.
         """
         start = 0
         for known in self.manifest.recordings:
@@ -138,7 +138,7 @@ def replayed_probes(
     use: SensorSet | None,
     seen_by: tuple[StereoCamera, OrbSettings],
 ) -> list[Probe]:
-    """Frames of earlier recordings where the version that was made of them says they are; none of recordings it knows not.
+    """Return frames of earlier recordings with their poses in the version built from them; none of unknown recordings.
 
     seen_by: the camera to which they are resampled, and the survey's features.
     """
@@ -161,14 +161,14 @@ def replayed_probes(
 
 
 class DraftMap(NamedTuple):
-    """What robots would get of a draft; camera: that of the map."""
+    """The draft in its form for robots; camera: that of the map."""
 
     tiles: Sequence[Tile]
     vocabulary: Vocabulary
     camera: StereoCamera
 
     def view(self) -> MapView:
-        """It as robots see it."""
+        """Return the robots' view of it."""
         return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
 
 
@@ -179,7 +179,7 @@ def examine_draft(
     replayed: Sequence[Probe],
     executor: Executor = SERIAL,
 ) -> Evidence:
-    """The findings of probes in the tiles as they are stored; `sessions` are the map's recordings."""
+    """Return the findings of probes in the tiles as stored; `sessions` are the map's recordings."""
     held_out = [
         x.probe(session.trajectory.frame_from_body) for session in sessions for x in session.held_out[:: len(sessions)]
     ]
@@ -199,7 +199,7 @@ def examine_draft(
 
 
 def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
-    """All recordings together; a single camera's odometry knows no metres to compare with."""
+    """Return the breaks of all recordings together; a single camera's odometry has no scale to compare."""
     found = []
     for trajectory, _, survey in sessions:
         if survey.state.camera.baseline_m > 0:

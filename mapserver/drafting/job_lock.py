@@ -14,15 +14,15 @@ from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from mapserver.store import JobInfo, MapStore
 
 INTERRUPTED = "interrupted"
-"""Key of the report of a job that was ended here."""
+"""Key in the report of a job that was ended as interrupted."""
 
 _TOLD_EVERY_S = 2.0
-_YOUNG_S = 60.0  # a job is noted before it holds its lock
+_YOUNG_S = 60.0  # a job is recorded before it holds its lock
 
 
 @contextmanager
 def held(store: Path, job: int) -> Iterator[None]:
-    """Shows that a job runs, for the block. Raises StoreError where the disk refuses."""
+    """Mark a job as running, for the block. Raises StoreError if the lock cannot be written."""
     path = _path(store, job)
     with _opened(path) as descriptor:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -35,23 +35,23 @@ def held(store: Path, job: int) -> Iterator[None]:
 
 @contextmanager
 def only_one(store: Path, site: str) -> Iterator[None]:
-    """Holds the site's night for the block; raises BusyError where another process does, StoreError where the disk refuses."""
+    """Hold the site's nightly lock for the block; raises BusyError if another process holds it, StoreError on a disk error."""
     path = store / f"nightly-{site}.lock"
     with _opened(path) as descriptor:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise BusyError(f"another nightly run of site {site} holds {path}; it ends by itself, try later") from error
+            raise BusyError(f"another nightly run of site {site} holds {path}; it ends by itself; try later") from error
         yield
 
 
 def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
-    """Notes as failed what stands as running though nobody runs it; returns the numbers of those jobs."""
+    """Mark jobs as failed that are recorded as running without a process; return their numbers."""
     ended, store = [], maps.folder
     for job in maps.running_jobs():
         if _is_young(job, now_ns) or _is_held(store, job.id):
             continue
-        message = "was interrupted: its process is gone; run it again, a night goes on by itself the next time"
+        message = "was interrupted: its process has ended; run it again, a nightly run resumes at the next start"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
         with suppress(OSError):
             _path(store, job.id).unlink()
@@ -64,7 +64,7 @@ def _is_young(job: JobInfo, now_ns: int) -> bool:
 
 
 def _is_held(store: Path, job: int) -> bool:
-    """Whether a living process holds the job's lock; also where that cannot be told."""
+    """True if a living process holds the job's lock, or if that is unknown."""
     try:
         descriptor = os.open(_path(store, job), os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -96,7 +96,7 @@ def _opened(path: Path) -> Iterator[int]:
 
 @dataclass(slots=True)
 class Job:
-    """What a job says at its end. number: None for one that no row of the store stands for."""
+    """Result of a job. number: None if the store has no row for it."""
 
     message: str = ""
     report: dict[str, Any] = field(default_factory=dict)
@@ -104,14 +104,14 @@ class Job:
 
 
 class JobProgress:
-    """Tells the store how far a job is, from calls (stage, done, total), at most every two seconds."""
+    """Stores the progress of a job, from calls (stage, done, total), at most every two seconds."""
 
     def __init__(self, maps: MapStore, job: int | None, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._maps, self._job, self._clock_s = maps, job, clock_s
         self._stage, self._begun_s, self._told_s = "", 0.0, -_TOLD_EVERY_S
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Notes it. A store that is busy costs the page a look, not the build."""
+        """Store it. With a busy store this update is skipped; the build continues."""
         now_s = self._clock_s()
         if stage != self._stage:
             self._stage, self._begun_s = stage, now_s
@@ -126,9 +126,9 @@ class JobProgress:
 
 @contextmanager
 def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
-    """Notes a job as running, then as done, or as failed with the error that ended it.
+    """Record a job as running, then as done, or as failed with the error that ended it.
 
-    One that is killed stands as running until the server, or the next job, finds that nobody holds its lock.
+    A killed job stays recorded as running until the server, or the next job, finds its lock released.
     """
     end_interrupted(maps, time.time_ns())
     number = maps.begin_job(site, kind)

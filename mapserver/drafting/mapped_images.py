@@ -1,4 +1,4 @@
-"""Pictures of keyframes, and what is found in them, in a temporary file that is read where it lies: long surveys do not fit in memory."""
+"""Pictures and features of keyframes in a memory-mapped temporary file: long surveys do not fit in memory."""
 
 import mmap
 import os
@@ -20,18 +20,18 @@ from mapserver.survey.state import MemoryImageStore, Pictures
 if TYPE_CHECKING:
     from fleetmap.recordings import FrameSource
 
-_HELD = 64  # keyframes whose pictures stay in memory: more than one is compared with
-_SEGMENT_BYTES, _SEGMENTS_HELD = 1 << 24, 4  # of the file; those that were written leave memory
+_HELD = 64  # keyframes whose pictures stay in memory: more than are compared with one keyframe
+_SEGMENT_BYTES, _SEGMENTS_HELD = 1 << 24, 4  # of the file; written segments leave memory
 _KEPT_BYTES = 1_000_000_000  # the first minute of a pair of 752 x 480 at 20 Hz
 _ALIGNED_BYTES = 64
 
 
 class MappedImageStore:
-    """An ImageStore over an unnamed file in `folder`, which the system removes with the process. Methods may be called from any thread."""
+    """An ImageStore over an unnamed file in `folder`, deleted by the system with the process. Methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        with disk_errors(f"{folder} takes no temporary file", "check its rights and space"):
+        with disk_errors(f"{folder} accepts no temporary file", "check its rights and space"):
             self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed with its owner
         self._lock = threading.Lock()
         self._segments: list[mmap.mmap] = []
@@ -48,7 +48,7 @@ class MappedImageStore:
     def put(self, pictures: Pictures) -> int:
         """See ImageStore."""
         frame = pictures.frame
-        with disk_errors("a picture of the survey cannot be set aside", "make space beside the store"), self._lock:
+        with disk_errors("a temporary picture cannot be stored", "free space beside the store"), self._lock:
             left, half, quarter = (self._mapped(level) for level in pictures.pyramid)
             right, disparity = (None if a is None else self._mapped(a) for a in (frame.right, frame.disparity_px))
             kept = replace(frame, left=left, right=right, disparity_px=disparity)
@@ -64,7 +64,7 @@ class MappedImageStore:
 
     def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
         """See ImageStore."""
-        with disk_errors("what a keyframe shows cannot be set aside", "make space beside the store"), self._lock:
+        with disk_errors("temporary features cannot be stored", "free space beside the store"), self._lock:
             return [self._mapped(array) for array in arrays]
 
     def release(self) -> None:
@@ -77,29 +77,29 @@ class MappedImageStore:
         return MappedImageStore(self._folder)
 
     def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
-        """As what an empty one is in another process, which need not have the folder."""
+        """Pickle as an empty in-memory store: another process may lack the folder."""
         return MemoryImageStore, ()
 
     def note(self, number: int) -> None:
-        """Something is read; after some of it all leaves memory."""
+        """Record a read; after a number of reads the file leaves memory."""
         self._read.add(number)
         if len(self._read) > _HELD:
             self._leave_memory()
 
     def _leave_memory(self) -> None:
-        """Takes the file out of this process's memory; what is read again comes back from the system's own, or from the disk."""
+        """Unmap the file from this process; later reads come from the system's cache or the disk."""
         self._read = set()
         for segment in self._segments:
             segment.madvise(mmap.MADV_DONTNEED)
 
     def _mapped(self, array: AnyArray) -> AnyArray:
-        """The same array in the file; OSError where the disk has no room."""
+        """Return the same array in the file; OSError if the disk is full."""
         data = np.ascontiguousarray(array)
         if not data.size:
             return data
         if not self._segments or self._used + data.nbytes > len(self._segments[-1]):
             length = -(-max(data.nbytes, _SEGMENT_BYTES) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
-            # Room is taken before it is written to: a full disk would end the process then.
+            # Space is allocated before writing: a full disk would kill the process during a mapped write.
             os.posix_fallocate(self._file.fileno(), self._size, length)
             self._segments.append(mmap.mmap(self._file.fileno(), length, offset=self._size))
             self._size, self._used = self._size + length, 0
@@ -112,7 +112,7 @@ class MappedImageStore:
 
 
 class KeptFrames:
-    """Frames of another source, each decoded once: a temporary file in `folder` has them, up to a GB."""
+    """Frames of another source, each decoded once: stored in a temporary file in `folder`, up to a GB."""
 
     def __init__(self, source: "FrameSource", folder: Path) -> None:
         self._source, self._store = source, MappedImageStore(folder)
@@ -134,7 +134,7 @@ class KeptFrames:
                 self._frames[index] = CameraFrame(frame.stamp_ns, *kept)
                 self._bytes += sum(image.nbytes for image in images if image is not None)
                 self._keeps = self._bytes < _KEPT_BYTES
-            except StoreError:  # no room: what is not kept is decoded again
+            except StoreError:  # disk full: the frame is decoded again next time
                 self._keeps = False
         return frame
 

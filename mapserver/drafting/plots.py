@@ -24,12 +24,12 @@ _GOOD, _BAD, _GUESS, _ERROR = "#14924b", "#d1342f", "#c77700", "#2563eb"
 _TIME = LinearSegmentedColormap.from_list("time", ["#9cc9ff", "#2563eb", "#0b1f5c"])
 _MIN_ASPECT, _MAX_ASPECT = 0.7, 2.2
 _DPI = 150
-# The two axes of the map that lie flat, right and up on the page, by the axis and sense that points up.
+# The two horizontal axes of the map, right and up on the page, by the axis and sign of the vertical one.
 _FLAT_AXES = {(2, 1): (0, 1), (2, -1): (1, 0), (1, 1): (2, 0), (1, -1): (0, 2), (0, 1): (1, 2), (0, -1): (2, 1)}
 
 
 def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy, report: BuildReport) -> bytes:
-    """A PNG: the map from above and, where the truth is known, position errors over time beside it."""
+    """Return a PNG: the map from above and, with ground truth, position errors over time beside it."""
     with mpl.rc_context({"font.size": 9, "axes.edgecolor": _GRID, "axes.labelcolor": _INK, "text.color": _INK}):
         flat = _flat_axes(survey_map)
         landmarks = survey_map.points_map[:: len(survey_map.points_map) // _MAX_LANDMARKS + 1, flat]
@@ -53,7 +53,7 @@ def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy
 
 
 def _flat_axes(survey_map: SurveyMap) -> list[int]:
-    """By the axis of the map that points up in most images, as an IMU has it too."""
+    """Return them from the map axis that points up in most images, also without an IMU."""
     map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
     up_map = -map_from_cam[:, :3, 1].mean(axis=0)
     axis = int(np.argmax(np.abs(up_map)))
@@ -61,9 +61,9 @@ def _flat_axes(survey_map: SurveyMap) -> list[int]:
 
 
 def _view(path: Array, landmarks: Array) -> tuple[Array, Array]:
-    """Corners (2,) that show the path and most landmarks, neither tall and narrow nor wide and low."""
+    """Return corners (2,) that contain the path and most landmarks, with a limited aspect ratio."""
     low, high = path.min(axis=0), path.max(axis=0)
-    if len(landmarks):  # not the few that are far: they would shrink everything else
+    if len(landmarks):  # without a few distant ones, which would shrink the rest
         reach_m = 8.0 + 0.25 * float(max(high - low))
         low = np.maximum(np.minimum(low, np.percentile(landmarks, 3, axis=0)), low - reach_m)
         high = np.minimum(np.maximum(high, np.percentile(landmarks, 97, axis=0)), high + reach_m)
@@ -100,7 +100,7 @@ def _draw_map(axes: "Axes", survey_map: SurveyMap, flat: list[int], landmarks: A
 
 
 def _draw_loops(axes: "Axes", places: Array, loops: Loops) -> None:
-    """Accepted ones, and of the refused ones those that looked most alike."""
+    """Draw accepted loops, and the most similar refused ones."""
     accepted = [r for r in loops.records if r.verdict is LoopVerdict.ACCEPTED]
     refused = [r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED]
     refused.sort(key=lambda r: (-r.score, r.i, r.j))

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 class StageTimes:
     """Seconds of each stage, from calls (stage, done, total) and the time between them.
 
-    The time before a call belongs to the stage of the call before, unless that was finished and another one has begun.
+    The time before a call counts for the previous call's stage, unless that was finished and another one has begun.
     """
 
     def __init__(self, clock_s: Callable[[], float]) -> None:
@@ -20,12 +20,12 @@ class StageTimes:
         self._stage, self._finished = "", True
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Notes that `done` of `total` parts of a stage are done."""
+        """Record that `done` of `total` parts of a stage are done."""
         self._spend(stage if self._finished and done > 0 else self._stage or stage)
         self._stage, self._finished = stage, done >= total
 
     def begin(self, stage: str) -> None:
-        """Ends the stage that runs and begins another, of which nothing more is heard."""
+        """End the current stage and begin another one without further calls."""
         self._spend(self._stage or stage)
         self._stage, self._finished = stage, False
 
@@ -55,7 +55,7 @@ class ProgressView:
             self._bars.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Shows that `done` of `total` parts of a stage are done."""
+        """Show that `done` of `total` parts of a stage are done."""
         if self._bars is not None:
             self._show_bar(self._bars, stage, done, total)
         elif stage != self._shown:
@@ -65,7 +65,7 @@ class ProgressView:
     def _show_bar(self, bars: Progress, stage: str, done: int, total: int) -> None:
         if stage not in self._tasks:
             self._tasks[stage] = bars.add_task(stage, total=total)
-        if self._shown and stage != self._shown:  # "matching again" comes twice: begin anew, close the one before
+        if self._shown and stage != self._shown:  # "matching again" occurs twice: close the previous bar
             last = bars.tasks[self._tasks[self._shown]]
             bars.update(last.id, completed=last.total)
         bars.update(self._tasks[stage], completed=done, total=total)

@@ -27,14 +27,14 @@ from mapserver.survey.survey_map import SurveyMap
 if TYPE_CHECKING:
     from mapserver.drafting.survey_recordings import Surveyed
 
-MAX_REFUSED = 300  # loops of a build, the most alike first: they are what could have made a wrong map
-MIN_MATCHED = 3  # stamps with a truth, below which no alignment is defined
+MAX_REFUSED = 300  # loops of a build, the most alike first: those could have made a wrong map
+MIN_MATCHED = 3  # stamps with ground truth needed for an alignment
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
 
 class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The stable keys, in the order in which docs/reports.md explains them. map_bytes is None until the draft is stored."""
+    """The stable keys, in the order of docs/reports.md. map_bytes is None until the draft is stored."""
 
     recordings: list[str]
     duration_s: float
@@ -66,7 +66,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Accuracy(msgspec.Struct, frozen=True):
-    """A survey against ground truth; all None without one, or where too few stamps have both (see MIN_MATCHED)."""
+    """A survey against ground truth; all None without one, or if too few stamps have both (see MIN_MATCHED)."""
 
     rigid: AteResult | None = None
     similarity: AteResult | None = None
@@ -74,13 +74,13 @@ class Accuracy(msgspec.Struct, frozen=True):
 
 
 def estimated_trajectory(survey_map: SurveyMap) -> Trajectory:
-    """The selected frames that something measured ties to the map."""
+    """Return the selected frames whose poses are measured in the map."""
     chosen = survey_map.trajectory_estimated
     return Trajectory(survey_map.trajectory.stamps_ns[chosen], survey_map.trajectory.frame_from_body[chosen])
 
 
 def accuracy(survey_map: SurveyMap, truth: Trajectory | None) -> Accuracy:
-    """Errors of all estimated frames at which the truth is known; guesses between them are left out and counted."""
+    """Return errors of all estimated frames with a known truth; interpolated poses are left out and counted."""
     if truth is None:
         return Accuracy()
     estimate, frames = estimated_trajectory(survey_map), len(survey_map.trajectory)
@@ -93,7 +93,7 @@ def accuracy(survey_map: SurveyMap, truth: Trajectory | None) -> Accuracy:
 
 
 def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
-    """Raises RecordingError unless enough of the stamps (F,) have a truth to place a survey in its frame."""
+    """Raise RecordingError unless enough of the stamps (F,) have a truth to align a survey to its frame."""
     if truth is None:
         raise RecordingError(f"{what} carries no ground truth; build it without --frame-from-ground-truth")
     known = sum(truth.at(int(stamp)) is not None for stamp in stamps_ns)
@@ -105,7 +105,7 @@ def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
 
 
 def path_length_m(trajectory: Trajectory) -> float:
-    """Metres along the positions."""
+    """Return the length along the positions, in metres."""
     return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
 
 
@@ -118,7 +118,7 @@ def make_report(
     seconds: float,
     peak_rss_mb: float,
 ) -> BuildReport:
-    """The report of surveyed recordings, map_bytes still unknown. peak_rss_mb: most memory that the build held, in 10^6 bytes."""
+    """Return the report of surveyed recordings, map_bytes still unknown. peak_rss_mb: peak memory of the build, in 10^6 bytes."""
     survey_map = joined.map
     taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
@@ -153,7 +153,7 @@ def make_report(
 
 
 def sessions_report(names: list[str], joined: MergedMap) -> list[dict[str, Any]]:
-    """What became of every recording, in their order."""
+    """Return the result of every recording, in their order."""
     return [
         {"recording": names[o.number], "joined": o.joined, "verdict": o.verdict.value, "reason": o.reason}
         | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
@@ -165,12 +165,12 @@ def sessions_report(names: list[str], joined: MergedMap) -> list[dict[str, Any]]
 def report_details(
     surveyed: "Sequence[Surveyed]", joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
 ) -> dict[str, Any]:
-    """Keys of the full report beside the stable ones, which help to understand those; they may change.
+    """Return keys of the full report beside the stable ones, for diagnosis; they may change.
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
-    and decoding images are part of odometry. frames_seen_in_map: frames that points of the map place; odometry or the IMU carries the
-    others. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
-    components of each survey, of which the kept one is in the map.
+    and decoding images are part of odometry. frames_seen_in_map: frames located by points of the map; the others by odometry or the
+    IMU. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    components of each survey; the kept one is in the map.
     """
     survey_map, first = joined.map, surveyed[0]
     return {
@@ -195,7 +195,7 @@ def report_details(
 
 
 def sentence(site: str, version: int, parent: int | None, report: BuildReport, store: Path) -> str:
-    """A draft stored in the folder `store`, in words; parent: the version that it was built on."""
+    """Return text on a draft stored in the folder `store`; parent: the version that it was built on."""
     ate = "" if report.ate_rmse_m is None else f", ATE {report.ate_rmse_m:.4f} m"
     sizes = f"{report.map_bytes} bytes, {report.loops['accepted']} loops{ate}, in {report.seconds:.1f} s"
     built_on = "" if parent is None else f" on version {parent}"
@@ -216,9 +216,9 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
 
 
 def loop_places(taken: "Sequence[Surveyed]", joined: MergedMap) -> list[dict[str, Any]]:
-    """Loops of the recordings that are in the map, accepted ones and the refused ones that looked most alike.
+    """Return loops of the recordings in the map: accepted ones and the most similar refused ones.
 
-    Of each the recording, both ends (x, y) in `map`, verdict, reason and score.
+    Each has its recording, both ends (x, y) in `map`, verdict, reason and score.
     """
     ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
     parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
@@ -227,7 +227,7 @@ def loop_places(taken: "Sequence[Surveyed]", joined: MergedMap) -> list[dict[str
     for recording, map_from_body in zip(taken, parts, strict=True):
         survey = recording.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
-        # Records keep the numbers of keyframes from before components were left out: then their places are unknown.
+        # Records have keyframe numbers from before components were left out: then their places are unknown.
         for record in survey.loops.records if all(c.kept for c in survey.components) else ():
             place = _place(recording.entry.name, record, map_from_body[:, :2, 3], frames)
             (accepted if record.verdict is LoopVerdict.ACCEPTED else refused).append(place)
@@ -250,17 +250,17 @@ def _place(name: str, record: LoopRecord, places_map: Array, frames: list[int]) 
 
 
 def library_versions() -> dict[str, str]:
-    """Of what a map depends on besides settings."""
+    """Return versions of the libraries that affect a map."""
     versions = {}
     for name in _LIBRARIES:
         try:
             versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:  # a source tree that is not installed, or a library by another name
+        except metadata.PackageNotFoundError:  # not installed, or installed under another name
             versions[name] = "not installed as a package"
     return versions
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Writes a result of a build; StoreError where the disk refuses."""
-    with disk_errors(f"{path} cannot be written", "the draft is stored all the same"):
+    """Write a result of a build; StoreError if the disk refuses."""
+    with disk_errors(f"{path} cannot be written", "the draft is stored nevertheless"):
         path.write_bytes(data)

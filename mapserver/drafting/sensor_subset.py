@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fleetmap.recordings.images import StoredFrame
     from fleetmap.recordings.recording import FrameSource
 
-# What each set can be reduced to, itself included.
+# Sensor sets to which each set can be reduced, itself included.
 REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
     SensorSet.STEREO_INERTIAL: (SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.MONO_INERTIAL, SensorSet.MONO),
     SensorSet.STEREO: (SensorSet.STEREO, SensorSet.MONO),
@@ -30,23 +30,23 @@ _SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
 
 
 def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
-    """What the recording at `path` carries; errors as of `open_recording`."""
+    """Return the sensor set of the recording at `path`; errors as of `open_recording`."""
     with open_recording(path, options) as recording:
         return recording.sensor_set
 
 
 def named_sensor_set(name: str) -> SensorSet:
-    """The sensor set of that name; UsageError for any other."""
+    """Return the sensor set of that name; UsageError for an invalid name."""
     try:
         return SensorSet(name)
     except ValueError as error:
-        raise UsageError(f"--use {name}: the sensor sets are {', '.join(SensorSet)}") from error
+        raise UsageError(f"--use {name}: unknown sensor set; choose one of {', '.join(SensorSet)}") from error
 
 
 def reduced(recording: Recording, use: SensorSet | None) -> Recording:
-    """The recording without the sensors that `use` does not have; the same one without `use`.
+    """Return the recording without the sensors missing from `use`; unchanged without `use`.
 
-    Raises RecordingError where the recording lacks a sensor that `use` has.
+    Raises RecordingError if the recording lacks a sensor of `use`.
     """
     if use is None or use is recording.sensor_set:
         return recording
@@ -67,7 +67,7 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
 
 @dataclass(frozen=True)
 class _Reduced:
-    """Frames of another source, of one camera where `single`. What was recorded stays what it was: stored and hashed whole."""
+    """Frames of another source, of one camera if `single`. Stored data and hashes are unchanged and complete."""
 
     source: "FrameSource"
     single: bool

@@ -1,4 +1,4 @@
-"""Surveys of recordings: each is opened, checked, surveyed and closed, one after the other."""
+"""Surveys of recordings: each is opened, checked, surveyed and closed in turn."""
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -51,7 +51,7 @@ class Surveyed:
     """One recording and its survey.
 
     map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements; checks: all of them in one line.
-    calibration: what it says of the calibration. corrections: of that, by parameter. held_out: frames that the survey did not use.
+    calibration: those on the calibration. corrections: of that, by parameter. held_out: frames not used by the survey.
     """
 
     entry: RecordingEntry
@@ -68,31 +68,31 @@ class Surveyed:
     held_out: list[HeldOut]
 
     def remarks(self) -> list[str]:
-        """What was wanting in the recording, what was corrected and what was left out, in words."""
+        """Shortcomings of the recording, corrections and left-out parts, as text."""
         yaw = self.survey.stereo_yaw
         turned = [
-            f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, as the adjusted survey says"
+            f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by the adjusted survey"
         ]
         apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
-        whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with what comes before: {c.refused}" for c in apart]
+        whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with the part before: {c.refused}" for c in apart]
         left_out = [component.remark() for component in self.survey.components if not component.kept]
         return [*self.findings, *(turned if yaw.corrected else ()), *whole, *left_out]
 
     def evidence(self) -> RigEvidence:
-        """What is known of its calibration: the pair is doubted where the survey's disparities deny the angle that the doctor let pass."""
+        """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
         yaw, limit = self.survey.stereo_yaw, TOLERANCES[CalibrationParameter.PAIR_YAW]
         angle_rad = abs(yaw.correction_px) / self.survey.state.camera.focal_px
         if angle_rad <= limit.warn_above + SURE_SIGMAS * limit.floor:
             return self.calibration
-        words = f"the survey's disparities are {-yaw.shift_px:+.2f} px from what its motion says, which the doctor did not find"
+        words = f"the survey's disparities are {-yaw.shift_px:+.2f} px off by its motion; the doctor did not find this"
         return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
 
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """A recording fit to be surveyed, as the doctor found it.
+    """A recording accepted for a survey, with its findings.
 
-    given: its initial trajectory, None for our own odometry. begun: the first stages of its survey, where the doctor needed them.
+    given: its initial trajectory, None for fleetmap's odometry. begun: the first stages of its survey, if the doctor needed them.
     """
 
     checked: CheckedRecording
@@ -102,8 +102,8 @@ class Admission:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """How recordings are read: frames A:B:C, how they are opened, only the sensors of a poorer set, and the initial trajectory, our own
-    odometry for None.
+    """Options of reading: frames A:B:C, how recordings are opened, only the sensors of a smaller set, and the initial trajectory (None:
+    fleetmap's odometry).
     """
 
     frames: str = "::"
@@ -112,7 +112,7 @@ class RecordingOptions:
     trajectory: OtherTrajectory | None = None
 
     def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
-        """The recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
+        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
         recording = open_recording(path, self.opening)
         try:
             recording = reduced(recording, self.use)
@@ -127,16 +127,16 @@ class RecordingOptions:
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
-        """The recording at `path` while the block lasts, and the indices of its selected frames."""
+        """Open the recording at `path` for the block, and return it with the indices of its selected frames."""
         recording, indices = self.opened(path)
         with recording:
             yield recording, indices
 
 
 class OpenRecordings:
-    """Recordings opened as `options` say. The one used last stays open; frames that its first use decoded are decoded once.
+    """Recordings opened with `options`. The last used one stays open; frames decoded at its first use are not decoded again.
 
-    folder: takes their temporary file.
+    folder: for their temporary file.
     """
 
     def __init__(self, options: RecordingOptions, folder: Path) -> None:
@@ -166,7 +166,7 @@ class OpenRecordings:
 
 @dataclass(frozen=True, slots=True)
 class RecordedParts:
-    """The selected frames (F,) of a recording as FrameParts: each part reads files of its own, and carries nothing of the others."""
+    """The selected frames (F,) of a recording as FrameParts: each part reads its own files and holds no data of the others."""
 
     recording: Recording
     indices: NDArray[np.int64]
@@ -193,18 +193,18 @@ class _Frames:
 def survey_inputs_of(
     recording: Recording, indices: NDArray[np.int64], rectifier: Rectifier, given: Trajectory | None
 ) -> SurveyInputs:
-    """The selected frames (F,) of a recording, read ahead, and its samples."""
+    """Return the selected frames (F,) of a recording, read ahead, and its samples."""
     frames = read_ahead(rectifier.rectify(recording.read_frame(int(index))) for index in indices)
     samples = recording.imu, recording.calibration, rectifier, recording.wheel
     parts = RecordedParts(recording, indices)
     return SurveyInputs(frames, len(indices), *samples, given, parts, priors=recording.priors)
 
 
-_LONGEST_S = 120.0  # of a drive that is followed as a whole before it is judged: of a longer one its busiest stretch tells sooner
+_LONGEST_S = 120.0  # of a drive tracked as a whole; a longer one is judged by its stretch with the most motion
 
 
 class BegunSurvey:
-    """The first stages of a recording's survey, from which its calibration is measured: they are gone through once where that is right."""
+    """The first stages of a recording's survey, which also measure its calibration: they run only once if that is right."""
 
     def __init__(self, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools) -> None:
         """indices (F,): of the selected frames."""
@@ -212,7 +212,7 @@ class BegunSurvey:
         self._made: tuple[RigCalibration, AdjustedChain] | None = None
 
     def __call__(self, recording: Recording, rig: RigCalibration) -> CalibrationData:
-        """What the frames show under the calibration `rig`. SurveyError where they hold too little to be followed."""
+        """Return the data of the frames under the calibration `rig`. SurveyError if they are too few to be tracked."""
         rectifier, images = Rectifier(rig), self._tools.images
         inputs = survey_inputs_of(replace(recording, calibration=rig), self._indices, rectifier, None)
         is_believed = rig is recording.calibration
@@ -224,12 +224,12 @@ class BegunSurvey:
             return busiest_stretch(chain, (rig, rectifier), recording.wheel)
 
     def chain_of(self, rig: RigCalibration) -> AdjustedChain | None:
-        """What was made under a calibration; None where the last one believed was another."""
+        """Return the result under a calibration; None if the last one used was another."""
         return self._made[1] if self._made is not None and self._made[0] is rig else None
 
     @staticmethod
     def suits(recording: Recording, indices: NDArray[np.int64]) -> bool:
-        """Whether the selected frames follow each other, say as much as any stretch would, and are soon gone through."""
+        """True if the selected frames are consecutive, as informative as any stretch, and few."""
         stamps_ns = recording.frame_stamps_ns[indices]
         seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
         is_run, is_enough = len(indices) == np.ptp(indices) + 1, len(indices) == len(recording) or seconds >= LONGEST_S
@@ -247,9 +247,9 @@ def admit_recordings(
     tools: SurveyTools | None = None,
     look_at: Callable[[Sequence[Path]], None] = lambda _: None,
 ) -> dict[Path, Admission]:
-    """Checks all recordings, so that a hopeless one is refused before the work begins.
+    """Check all recordings, so that an unusable one is refused before the work begins.
 
-    unusable: takes those that are refused, with the reason; without it, or where all are, that is an error. look_at: told each path.
+    unusable: receives refused ones with the reason; without it, or if all are refused, an error is raised. look_at: called with each path.
     settings: of the surveys, which may be begun for the checks.
     """
     admitted: dict[Path, Admission] = {}
@@ -264,7 +264,7 @@ def admit_recordings(
 
 @contextmanager
 def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
-    """Notes in `unusable` why the block fails for a recording; raises where there is none, and what is no fault of the recording."""
+    """Record in `unusable` why the block fails for a recording; re-raises without it, and errors unrelated to the recording."""
     try:
         yield
     except (RecordingError, SurveyError) as error:
@@ -277,9 +277,7 @@ def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
         if unusable is None:
             raise
         _log.exception("%s", path)
-        unusable[path] = (
-            f"{path}: {type(error).__name__}: {str(error)[:200]}; a fault of the program, report it with the log"
-        )
+        unusable[path] = f"{path}: {type(error).__name__}: {str(error)[:200]}; a bug; report it with the log"
 
 
 def _admission(
@@ -320,7 +318,7 @@ def survey_recording(
     options: SurveyConfig,
     tools: SurveyTools,
 ) -> Surveyed:
-    """Surveys one recording as if `pinhole` (or the camera that suits it) had seen it. The caller lets go of what was begun."""
+    """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages."""
     found, given, chain = admission.checked, admission.given, admission.begun
     rig, said = found.rig, () if given is None else (given.words,)
     with reading.open(path) as (opened, indices):
@@ -332,7 +330,7 @@ def survey_recording(
         if chain is None or chain.state.camera != rectifier.camera:
             chain = begin_survey(inputs, options.settings, tools)
         held = [chain]
-        del admission, chain  # or it would be in memory twice
+        del admission, chain  # otherwise it would be in memory twice
         done = finish_survey(held.pop(), inputs, options, tools)
         done, map_from_survey = _aligned(done, recording)
         return Surveyed(
@@ -352,7 +350,7 @@ def survey_recording(
 
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
-    """The survey, in metres where its priors give a scale that was unknown, and map_from_survey (4, 4) by them, None without any."""
+    """Return the survey, in metres if its priors give an unknown scale, and map_from_survey (4, 4) by them, None without any."""
     priors, base_from_body = recording.priors, recording.calibration.base_from_body
     if done.map.scale_known:
         return done, map_from_survey_by_priors(done.map, priors, base_from_body)
@@ -369,9 +367,9 @@ def survey_all(
     pinhole: StereoCamera | None,
     unusable: dict[Path, str] | None = None,
 ) -> list[Surveyed]:
-    """Surveys of all recordings, resampled to one camera: `pinhole`, or that of the first one.
+    """Survey all recordings, resampled to one camera: `pinhole`, or that of the first one.
 
-    unusable: takes those that cannot be surveyed, with the reason; without it, or where none can be, that is an error.
+    unusable: receives failed ones with the reason; without it, or if all fail, an error is raised.
     """
     done: list[Surveyed] = []
     for path in paths:
@@ -384,7 +382,7 @@ def survey_all(
 
 
 def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: MergedMap) -> None:
-    """Names the recordings that could not be joined; raises SurveyError where none could."""
+    """Print the recordings that could not be joined; raises SurveyError if none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
     for recording, outcome in left:
         console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
@@ -397,14 +395,14 @@ def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: 
 
 
 def joined_truth(surveyed: list[Surveyed], joined: MergedMap) -> Trajectory | None:
-    """The truth of the joined recordings on one clock, None where one of them has none."""
+    """Return the ground truth of the joined recordings on one clock, None if one of them has none."""
     truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
     known = [truth for truth in truths if truth is not None]
     return chained(known, joined.trajectories) if len(known) == len(truths) else None
 
 
 def map_trajectories(joined: MergedMap) -> list[Trajectory]:
-    """The joined recordings' trajectories in the map's final frame, which the finished map has one after the other."""
+    """Return the joined recordings' trajectories in the map's final frame; the finished map stores them concatenated."""
     ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
     parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
     return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
@@ -415,5 +413,5 @@ class _ZonesFile(Section, frozen=True):
 
 
 def read_zones(path: Path | None) -> Zones:
-    """Zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError for anything else. None has no zones."""
+    """Read zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError if invalid. None gives no zones."""
     return Zones() if path is None else zones_of(load_toml(path, _ZonesFile).zones, str(path))

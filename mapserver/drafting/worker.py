@@ -1,7 +1,7 @@
 """Executors for surveys: threads of this process, or the processes of a dask cluster.
 
-Threads copy nothing, and the core runs without the interpreter's lock. What travels to a cluster are pickles, which run code where they
-are opened: it is reached by TLS with certificates on both sides.
+Threads copy nothing, and the core releases the interpreter's lock. Data for a cluster travel as pickles, which run code when they are
+loaded: the cluster is reached by TLS with certificates on both sides.
 """
 
 import os
@@ -20,12 +20,12 @@ from fleetmap.errors import UsageError
 from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared
 
 Item = TypeVar("Item")
-_AHEAD = 2  # batches for each thread or process that wait, so that long surveys are not in memory twice
+_AHEAD = 2  # waiting batches per thread or process; a limit, so that long surveys are not in memory twice
 _CONNECT_WITHIN_S = "20s"
 
 
 class Threads:
-    """An executor of threads; results are computed ahead of who asks for them."""
+    """An executor of threads; results are computed ahead of their use."""
 
     def __init__(self, pool: ThreadPoolExecutor, count: int) -> None:
         self._pool, self._ahead = pool, _AHEAD * count
@@ -39,12 +39,12 @@ class Threads:
 class Cluster:
     """An executor of the processes behind a dask client.
 
-    Everything travels as pickles of ours: arrays that dask unpacks itself cannot be written to.
+    Everything travels as fleetmap's pickles: arrays unpacked by dask itself are read-only.
     """
 
     def __init__(self, client: Any) -> None:
         self._client = client
-        self._shared: tuple[Any, Any] = (None, None)  # the last value that was shared, and where it is
+        self._shared: tuple[Any, Any] = (None, None)  # the last shared value, and its location
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
@@ -61,14 +61,14 @@ class Cluster:
         return _in_order(submit, lambda future: pickle.loads(future.result()), batches, ahead)
 
 
-_unpacked: dict[str, Any] = {}  # in a process of the cluster: what is shared now, by its name
+_unpacked: dict[str, Any] = {}  # in a process of the cluster: the shared value, by its name
 
 
 def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: bytes) -> bytes:
-    """One batch in a process of the cluster."""
+    """Run one batch in a process of the cluster."""
     name, data = packed
     if name not in _unpacked:
-        cv2.setNumThreads(1)  # as `single_threaded_libraries`, for good: this process does nothing else
+        cv2.setNumThreads(1)  # as `single_threaded_libraries`, permanently: this process has no other task
         threadpool_limits(1, user_api="blas")
         _unpacked.clear()
         _unpacked[name] = pickle.loads(data)
@@ -78,7 +78,7 @@ def _do(function: Callable[[Any, Any], Any], packed: tuple[str, bytes], batch: b
 def _in_order(
     submit: Callable[[Any], Any], result: Callable[[Any], Any], batches: Iterable[Any], ahead: int
 ) -> Iterator[Any]:
-    """Results in the batches' order, with at most `ahead` of them on their way."""
+    """Yield results in the batches' order, with at most `ahead` of them in progress."""
     waiting: deque[Any] = deque()
     for batch in batches:
         waiting.append(submit(batch))
@@ -90,9 +90,9 @@ def _in_order(
 
 @contextmanager
 def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
-    """Threads (as many as there are cores, without a number), or the cluster of a scheduler.
+    """Open threads (one per core by default), or the cluster of a scheduler.
 
-    Raises UsageError for a scheduler that is not reached by TLS, or that does not answer.
+    Raises UsageError for a scheduler without TLS, or one that does not answer.
     """
     count = threads or len(os.sched_getaffinity(0))
     if scheduler is not None:
@@ -107,10 +107,10 @@ def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Execut
 
 @contextmanager
 def single_threaded_libraries() -> Iterator[None]:
-    """OpenCV and linear algebra without threads of their own.
+    """Run OpenCV and linear algebra with one thread each for the block.
 
-    Where ours have work for every core, theirs would only wait for each other, and OpenBLAS's do so at full load: on two busy cores a
-    survey took four times the CPU seconds.
+    With a thread on every core, further threads of these libraries only wait for each other, OpenBLAS's at full load: on two busy
+    cores a survey took four times the CPU seconds.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -125,7 +125,7 @@ def single_threaded_libraries() -> Iterator[None]:
 def _client(scheduler: str) -> Iterator[Any]:
     if not scheduler.startswith("tls://"):
         raise UsageError(
-            f"--scheduler {scheduler}: whoever reaches a scheduler without TLS runs code in it; name one by "
+            f"--scheduler {scheduler}: anyone who can connect to a scheduler without TLS can run code in it; name one by "
             "tls://HOST:PORT, with its certificates in dask's configuration, or leave it out: threads use all cores here"
         )
     from distributed import Client
@@ -141,7 +141,7 @@ def _client(scheduler: str) -> Iterator[Any]:
 
 
 def read_ahead(items: Iterable[Item], ahead: int = 4) -> Iterator[Item]:
-    """The items of a generator, fetched by a thread while the ones before are used. Errors come where their item would."""
+    """Yield the items of a generator, fetched ahead by a thread. Errors are raised at the position of their item."""
     source = iter(items)
     end = object()
     with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:

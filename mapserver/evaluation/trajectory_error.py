@@ -11,7 +11,7 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
 _MAX_SHIFT_S = 0.05
-_OPEN_TURN_RAD = np.deg2rad(1.0)  # rotations of a motion capture system's bodies are as far off
+_OPEN_TURN_RAD = np.deg2rad(1.0)  # error of rotations in a motion capture system
 _KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 _SHORT_LENGTHS_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # for runs too short for KITTI's
 _POSITION_BOUND, _BOUND = 7.8147, 12.5916  # 0.95 of chi-square with 3 and 6 degrees of freedom
@@ -22,8 +22,8 @@ Summary = dict[str, float | int | None]
 class AteResult:
     """Position errors after one alignment.
 
-    frame_from_estimate (4, 4) and scale place the estimate in the truth's frame: scale * R @ p + t. matched stamps had
-    a truth; evaluated_share is their share of the frames that were asked for. stamps_ns and errors_m (matched,).
+    frame_from_estimate (4, 4) and scale align the estimate to the truth's frame: scale * R @ p + t. matched: number of stamps with
+    a truth; evaluated_share: their share of the expected frames. stamps_ns and errors_m (matched,).
     """
 
     rmse_m: float
@@ -39,7 +39,7 @@ class AteResult:
 
 
 def paired(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS) -> tuple[Trajectory, Trajectory]:
-    """Estimate and truth at those stamps of the estimate at which the truth is known.
+    """Return estimate and truth at those stamps of the estimate at which the truth is known.
 
     The truth is interpolated at constant twist; not outside it, nor inside a gap longer than `max_gap_ns`.
     """
@@ -53,10 +53,10 @@ def paired(estimate: Trajectory, truth: Trajectory, max_gap_ns: int = MAX_GAP_NS
 def absolute_trajectory_error(
     estimate: Trajectory, truth: Trajectory, *, with_scale: bool = False, frames: int | None = None
 ) -> AteResult:
-    """Position errors after the least-squares rigid (or similarity) alignment of all matched positions.
+    """Return position errors after the least-squares rigid (or similarity) alignment of all matched positions.
 
-    frames: how many frames should have had an estimate (default: as many as have one), the base of evaluated_share.
-    Raises SurveyError where fewer than three stamps have a truth. Source: Sturm et al. 2012 (ATE), Umeyama 1991.
+    frames: expected number of estimated frames (default: those estimated), the base of evaluated_share.
+    Raises SurveyError if fewer than three stamps have a truth. Source: Sturm et al. 2012 (ATE), Umeyama 1991.
     """
     mine, true = paired(estimate, truth)
     if len(mine) < 3:
@@ -81,9 +81,9 @@ def absolute_trajectory_error(
 
 
 def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
-    """(4, 4) least-squares alignment of positions, and of rotations where those lie on a line and leave the turn about it open.
+    """Return (4, 4) least-squares alignment of positions; rotations are added if a straight path leaves its roll undetermined.
 
-    Open is a turn that the positions' own errors, at the distance of the path's second width, could make. Rotations then count as
+    Undetermined is a rotation within the positions' own errors, at the distance of the path's second width. Rotations then count as
     points 0.1 m along either side of each axis of the body.
     """
     mine, true = paired(estimate, truth)
@@ -101,10 +101,10 @@ def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
 
 
 def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, float] | None:
-    """How many seconds later, within 0.05, the truth has to be read to fit best, and the rigid ATE that is left then.
+    """Return the delay of the truth, within 0.05 s, with the best fit, and the remaining rigid ATE.
 
-    A diagnosis beside the ATE, never in its place: a truth that was recorded by another clock costs speed times shift. Positions
-    of the truth are interpolated linearly. None where fewer than three stamps have a truth at every shift.
+    A diagnosis beside the ATE, never a replacement: a truth on another clock costs speed times shift. Positions
+    of the truth are interpolated linearly. None if fewer than three stamps have a truth at every shift.
     """
     mine, _ = paired(estimate, truth)
     if not len(mine):
@@ -122,7 +122,7 @@ def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, fl
 
     from scipy.optimize import minimize_scalar  # a build does not need it
 
-    # The error has one minimum for a smooth motion, but noise makes others: the best of a grid says around which to look.
+    # The error has one minimum for a smooth motion, but noise adds others: a grid search gives the interval.
     grid = np.linspace(-_MAX_SHIFT_S, _MAX_SHIFT_S, 21)
     middle, step = float(grid[np.argmin([rmse_m(shift) for shift in grid])]), float(grid[1] - grid[0])
     bounds = max(middle - step, -_MAX_SHIFT_S), min(middle + step, _MAX_SHIFT_S)
@@ -131,15 +131,15 @@ def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, fl
 
 
 def unaligned_errors(estimate: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
-    """Metres and radians (P,) between estimate and truth as they are, both already in one frame, at stamps that both know."""
+    """Return metres and radians (P,) between estimate and truth without alignment, both in one frame, at common stamps."""
     mine, true = paired(estimate, truth)
     return _split_errors(se3_inverse(true.frame_from_body) @ mine.frame_from_body)
 
 
 def relative_trajectory_error(estimate: Trajectory, truth: Trajectory, *, step: int = 1) -> tuple[float, float]:
-    """Root mean squares, metres and radians, of the errors of the motion over `step` matched stamps, for every start.
+    """Return root mean squares, metres and radians, of the errors of the motion over `step` matched stamps, for every start.
 
-    Needs no alignment. Raises SurveyError where no pair of stamps has a truth. Source: Sturm et al. 2012 (RPE).
+    Needs no alignment. Raises SurveyError if no pair of stamps has a truth. Source: Sturm et al. 2012 (RPE).
     """
     mine, true = paired(estimate, truth)
     if len(mine) <= step:
@@ -149,9 +149,9 @@ def relative_trajectory_error(estimate: Trajectory, truth: Trajectory, *, step: 
 
 
 def drift(estimate: Trajectory, truth: Trajectory) -> Summary:
-    """Mean errors over segments of the path, as shares of their length and radians a metre; None for paths below a metre.
+    """Return mean errors over segments of the path, as shares of their length and radians per metre; None for paths below a metre.
 
-    Segments have the benchmark's own lengths where the path is long enough for one, else 1 to 50 m. Source: Geiger et al. 2012 (KITTI).
+    Segments have the benchmark's own lengths if the path is long enough for one, else 1 to 50 m. Source: Geiger et al. 2012 (KITTI).
     """
     mine, true = paired(estimate, truth)
     for lengths_m, every in ((_KITTI_LENGTHS_M, 10), (_SHORT_LENGTHS_M, 1)):
@@ -171,7 +171,7 @@ def drift(estimate: Trajectory, truth: Trajectory) -> Summary:
 def _segment_errors(
     mine: Trajectory, true: Trajectory, lengths_m: tuple[float, ...], every: int
 ) -> list[tuple[float, float, float]]:
-    """Length, error as a share of it and radians a metre of every segment of the truth that begins at every `every`-th stamp."""
+    """Return length, relative error and radians per metre of every segment of the truth starting at every `every`-th stamp."""
     steps = np.linalg.norm(np.diff(true.positions_m, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     found = []
@@ -185,7 +185,7 @@ def _segment_errors(
 
 
 def at_first_stamp(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """The estimate placed in the truth's frame by the first stamp that both know, as odometry is judged."""
+    """Return the estimate moved to the truth's frame by the first common stamp, as usual for odometry."""
     mine, true = paired(estimate, truth)
     if len(mine) == 0:
         raise SurveyError("no stamp of the estimate has a truth; check that both are on the same clock")
@@ -194,11 +194,11 @@ def at_first_stamp(estimate: Trajectory, truth: Trajectory) -> Trajectory:
 
 
 def consistency(estimate: Trajectory, covariances: StampedCovariances | None, truth: Trajectory) -> Summary:
-    """Mean squared normalised errors of an estimate in the truth's frame: 1 where covariances are right, above where they are too small.
+    """Return mean squared normalised errors of an estimate in the truth's frame: 1 for right covariances, above if they are too small.
 
-    nees: over all 6 degrees of freedom, nees_position and nees_rotation over 3; shares of the stamps whose error lies in its own 95 %
-    bound; nees_stamps: how many were judged. All None without covariances, which are in the truth's axes. Errors of rotation (on the left)
-    and position are taken apart from each other. SurveyError where no stamp has estimate, covariance and truth.
+    nees: over all 6 degrees of freedom, nees_position and nees_rotation over 3; shares of the stamps with errors inside their own 95 %
+    bound; nees_stamps: number of judged stamps. All None without covariances, which are in the truth's axes. Errors of rotation (left)
+    and position are independent components. SurveyError if no stamp has estimate, covariance and truth.
     Source: Bar-Shalom, Li and Kirubarajan 2001 (NEES).
     """
     names = ("nees_position", "nees_rotation", "nees", "nees_inside_share", "nees_position_inside_share")
@@ -233,12 +233,12 @@ def summary(
     covariances: StampedCovariances | None = None,
     from_first: bool = False,
 ) -> Summary:
-    """All errors by name; raises SurveyError where too few stamps of the estimate have a truth.
+    """Return all errors by name; raises SurveyError if too few stamps of the estimate have a truth.
 
     ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; clock_shift_s, ate_at_clock_shift_m: of
-    `best_clock_shift`; unaligned_*: as they are, or with `from_first` after placing the first stamp on the truth; rpe_*: of the motion
-    between stamps that follow each other; drift_*: of `drift`; nees_*: of the unaligned errors by their covariances, of `consistency`.
-    frames: how many should have had an estimate, the base of evaluated_share.
+    `best_clock_shift`; unaligned_*: without alignment, or with `from_first` after aligning the first stamp; rpe_*: of the motion
+    between consecutive stamps; drift_*: of `drift`; nees_*: of the unaligned errors by their covariances, of `consistency`.
+    frames: expected number of estimated frames, the base of evaluated_share.
     """
     rigid = absolute_trajectory_error(estimate, truth, frames=frames)
     similarity = absolute_trajectory_error(estimate, truth, with_scale=True)
@@ -269,13 +269,13 @@ def summary(
 
 
 def _motion_errors(mine: Trajectory, true: Trajectory, starts: Stamps, step: int) -> Array:
-    """(S, 4, 4) true motion inverse times estimated motion from each start over `step` stamps."""
+    """Return (S, 4, 4) true motion inverse times estimated motion from each start over `step` stamps."""
     moved = [se3_inverse(t.frame_from_body[starts]) @ t.frame_from_body[starts + step] for t in (true, mine)]
     return np.asarray(se3_inverse(moved[0]) @ moved[1])
 
 
 def _split_errors(true_from_estimated: Array) -> tuple[Array, Array]:
-    """Metres and radians (S,) of errors (S, 4, 4)."""
+    """Return metres and radians (S,) of errors (S, 4, 4)."""
     turns = [rotation_angle_rad(error[:3, :3]) for error in true_from_estimated]
     return np.linalg.norm(true_from_estimated[:, :3, 3], axis=1), np.array(turns)
 

@@ -1,1 +1,1 @@
-"""The robots that a server knows: what they run, what they report, what follows from it."""
+"""Robots known to a server: their versions, reports and derived results."""

@@ -1,4 +1,4 @@
-"""What somebody should be told at once: robots fail too often, one stays lost, a night failed, a version was rolled back."""
+"""Alerts for operators: robots fail too often, one stays lost, a nightly run failed, a version was rolled back."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,16 +16,16 @@ from mapserver.store import MapStore
 
 _HEARD_WITHIN_S = 60.0
 _RATE_HOURS = 24
-_TOLD_NS = 24 * HOUR_NS  # for so long a rolled back version is news
+_TOLD_NS = 24 * HOUR_NS  # duration of the alert for a rolled back version
 _LOST = {Status.LOST, Status.AMBIGUOUS, Status.INITIALISING}
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class AlertSettings(Section, frozen=True):
-    """webhook: address that is told, None for nobody; token_file: its content is sent as bearer token.
+    """webhook: notified address, None for none; token_file: its content is sent as bearer token.
 
-    failures_per_robot_day: the rate of the last 24 h that is too high, with 97.5 % confidence; lost_s: how long a robot may not know
-    where it is.
+    failures_per_robot_day: limit for the rate of the last 24 h, exceeded with 97.5 % confidence; lost_s: limit for the time that a robot
+    does not know its position.
     """
 
     webhook: str | None = None
@@ -36,10 +36,10 @@ class AlertSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """Something that holds now. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapNightFailed,
+    """A present condition. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapNightFailed,
     FleetmapCanaryRolledBack or FleetmapTrustFault.
 
-    about: the robot, job or version that it is about, empty for a site as a whole; since_ns: since when, nanoseconds since 1970.
+    about: its robot, job or version, empty for a site as a whole; since_ns: start, nanoseconds since 1970.
     """
 
     name: str
@@ -54,13 +54,13 @@ class Alert:
 
 
 def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
-    """All that hold now, by site, and behind them faults of lists and certificates; errors are the store's."""
+    """Return all active alerts, by site, then faults of lists and certificates; errors are the store's."""
     from mapserver.trust.status import (
         trust_status,
-    )  # late: zenoh comes with it, and builds, which read the settings, need none
+    )  # imported late: it needs zenoh, and builds, which read the settings, do not
 
     found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, info.site, now_ns)]
-    with suppress(StateError):  # a store that is not signed
+    with suppress(StateError):  # an unsigned store
         found += [
             Alert("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
             for fault in trust_status(store).faults
@@ -73,7 +73,7 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
     for robot in fleet.robots(site):
         yield from _lost(robot, settings, now_ns)
         if robot.is_copied:
-            ends = f"`mapserver robots revoke {robot.robot} --site {site}` ends it"
+            ends = f"`mapserver robots revoke {robot.robot} --site {site}` stops the copy"
             words = f"{robot.robot} of {site} was connected twice; was its certificate copied? {ends}"
             yield Alert("FleetmapRobotCopied", site, robot.robot, now_ns, words)
     night = store.last_night(site)
@@ -106,5 +106,5 @@ def _lost(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> Iterator[
         return
     if now_ns - since_ns >= settings.lost_s * 1e9:
         minutes = (now_ns - since_ns) / 60e9
-        words = f"{robot.robot} of {robot.site} has not known where it is for {minutes:.0f} min ({status})"
+        words = f"{robot.robot} of {robot.site} has had no known position for {minutes:.0f} min ({status})"
         yield Alert("FleetmapRobotLost", robot.site, robot.robot, since_ns, words)

@@ -1,4 +1,4 @@
-"""Runs a program over a stranger's file: with limits, without a network where the system allows that, and ended with its process group."""
+"""Runs a program on an untrusted file: with limits, without a network if possible, and killed with its process group."""
 
 import os
 import resource
@@ -16,7 +16,7 @@ _NO_NETWORK = ("--map-current-user", "--net", "--")
 
 @dataclass(frozen=True, slots=True)
 class ProcessLimits:
-    """Of one process: address space, processor time, time, each file that it writes (its output too), and open files."""
+    """Of one process: address space, CPU time, wall time, size of each written file (output included), and open files."""
 
     memory_bytes: int = 4 << 30
     cpu_s: int = 600
@@ -39,7 +39,7 @@ class ProcessLimits:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a program ended: its status, and what it wrote. has_network: the system let nobody take it away."""
+    """Result of a program: its status and its output. has_network: the system did not allow running without a network."""
 
     status: int
     output: str
@@ -48,7 +48,7 @@ class Ended:
 
 
 def without_network() -> list[str]:
-    """The words before a command that leave it without a network; none where the system refuses that to this account."""
+    """Return the command prefix that removes the network; empty if the system refuses it for this account."""
     unshare = shutil.which("unshare")
     if unshare is None:
         return []
@@ -58,7 +58,7 @@ def without_network() -> list[str]:
 
 
 def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
-    """Runs a command within limits. Raises FleetmapError, naming `what`, where it is ended by one of them or by a fault of its own."""
+    """Run a command within limits. Raises FleetmapError, naming `what`, if it is killed by a limit or crashes."""
     prefix = without_network()
     with TemporaryFile() as output, TemporaryFile() as errors:
         process = subprocess.Popen(
@@ -72,7 +72,7 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
         try:
             status = process.wait(limits.wall_s)
         except subprocess.TimeoutExpired as error:
-            raise FleetmapError(f"{what} was ended after {limits.wall_s:.0f} s; it is made to take long") from error
+            raise FleetmapError(f"{what} was ended after {limits.wall_s:.0f} s; report it with its file") from error
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -83,7 +83,7 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
     if status < 0:
         most = f"{limits.memory_bytes >> 20} MiB or {limits.cpu_s} s of processor time"
         raise FleetmapError(
-            f"{what} was ended by {signal.Signals(-status).name}: it took more than {most}, or broke the program; "
+            f"{what} was ended by {signal.Signals(-status).name}: it took more than {most}, or crashed the program; "
             "report it with the recording"
         )
     return Ended(status, said, complained, has_network=not prefix)

@@ -1,4 +1,4 @@
-"""Decides running canaries: promotes proven versions, takes back versions that are worse than the margin."""
+"""Decides running canaries: promotes proven versions, withdraws versions that are worse than the margin."""
 
 import logging
 
@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 def find(store: MapStore, canary: CanaryRow, settings: CanarySettings, now_ns: int) -> CanaryFinding:
-    """What both arms did since the canary began, and what follows from it."""
+    """Return the counts of both arms since the canary began, and the decision."""
     arms = store.fleet.counters(canary.site, "arm")
     ours = arms.get((canary.site, arm_key(canary.id, is_canary=True)), Counters())
     theirs = arms.get((canary.site, arm_key(canary.id, is_canary=False)), Counters())
@@ -23,7 +23,7 @@ def find(store: MapStore, canary: CanaryRow, settings: CanarySettings, now_ns: i
 
 
 def review(store: MapStore, settings: CanarySettings, now_ns: int) -> list[CanaryFinding]:
-    """Ends every canary that can be decided and returns the findings. One that cannot be ended stays and is logged."""
+    """End every decidable canary and return the findings. One that cannot be ended stays and is logged."""
     done = []
     for canary in store.canaries(running=True):
         finding = find(store, canary, settings, now_ns)
@@ -33,7 +33,7 @@ def review(store: MapStore, settings: CanarySettings, now_ns: int) -> list[Canar
             promote = finding.action == "promote"
             releases.end_canary(store, canary, promote=promote, outcome=finding.reason, actor=Actor(ACTOR))
         except FleetmapError as error:
-            _log.error("the canary of site %s, version %d, is not ended: %s", canary.site, canary.version, error)
+            _log.error("the canary of site %s, version %d, could not be ended: %s", canary.site, canary.version, error)
             continue
         _log.warning("site %s, version %d: %s, because %s", canary.site, canary.version, finding.action, finding.reason)
         done.append(finding)

@@ -21,7 +21,7 @@ _PAGE = 200
 
 
 def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[FailureDetail]:
-    """Failures with their context, in the order in which they happened."""
+    """Return failures with their context, in the order of their times."""
     rows, before = [], None
     while page := store.fleet.failures(wanted, before=before, limit=_PAGE):
         rows += [(row.happened_ns, row.number) for row in page]
@@ -31,7 +31,7 @@ def failures_oldest_first(store: MapStore, wanted: FailureFilter) -> Iterator[Fa
 
 
 def as_plain(found: FailureDetail) -> dict[str, Any]:
-    """A failure as plain values; pictures by kind and place, without their bytes."""
+    """Return a failure as plain values; pictures by kind and place, without their bytes."""
     report = report_dict(found.report)
     report.pop("thumbnails")
     pictures = [asdict(picture) for picture in found.pictures]
@@ -40,7 +40,7 @@ def as_plain(found: FailureDetail) -> dict[str, Any]:
 
 
 def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
-    """Writes one failure a line and returns their number; the file appears when it is whole."""
+    """Write one failure a line and return their number; the file is replaced atomically."""
     count = 0
     with appearing_file(path) as file:
         for found in failures_oldest_first(store, wanted):
@@ -50,7 +50,7 @@ def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
 
 
 def write_mcap(store: MapStore, wanted: FailureFilter, path: Path) -> int:
-    """Writes failures as MCAP in the channels of viewers, of one site with its current map; returns their number.
+    """Write failures as MCAP in the channels of viewers, of one site with its current map; return their number.
 
     Raises UsageError without the extra `foxglove`.
     """
@@ -69,7 +69,7 @@ def write_mcap(store: MapStore, wanted: FailureFilter, path: Path) -> int:
 
 
 def map_message(store: MapStore, site: str, version: int, stamp_ns: int) -> "ChannelMessage":
-    """A version's landmarks as viewers see them; errors as of `MapStore.manifest` and `blob`."""
+    """Return a version's landmarks for viewers; errors as of `MapStore.manifest` and `blob`."""
     from fleetmap.foxglove import channels
 
     manifest = store.manifest(site, version)
@@ -78,7 +78,7 @@ def map_message(store: MapStore, site: str, version: int, stamp_ns: int) -> "Cha
 
 
 def failure_messages(store: MapStore, found: FailureDetail) -> "list[ChannelMessage]":
-    """A failure as viewers see it, its pictures read."""
+    """Return a failure for viewers, with its pictures."""
     from fleetmap.foxglove import channels
 
     pictures = [(each.kind, store.fleet.picture(found.failure.number, each.place)) for each in found.pictures]

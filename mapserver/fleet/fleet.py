@@ -1,4 +1,4 @@
-"""State of the robots: the version that each should run, the one that it runs, its last messages."""
+"""State of the robots: wanted version, running version, last messages."""
 
 import math
 import threading
@@ -32,25 +32,24 @@ from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import CanaryRow, MapStore
 
 MAX_ROBOTS = 10_000
-MAX_STAMP_NS = 1 << 62  # what the store can hold
-MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with their words
-# A robot that fails more often than once a minute is broken; 60 are what one brings back from an hour without a network.
+MAX_STAMP_NS = 1 << 62  # limit of the store
+MAX_FAILURE_BYTES = 4 * MAX_THUMBNAIL_BYTES + (128 << 10)  # four pictures, and twenty fixes with text
+# A robot that fails more than once a minute is broken; 60 may be stored from an hour without a network.
 FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
 _FORGET_AFTER_NS = 600_000_000_000
-_GAP_NS = 60_000_000_000  # who was silent for longer begins anew
-_COPIED_NS = 3_600_000_000_000  # a copy that came for a minute is told for so long
+_GAP_NS = 60_000_000_000  # a longer silence starts a new sequence
+_COPIED_NS = 3_600_000_000_000  # time for which a detected copy is reported
 _USUAL = IngestSettings()
 
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """One robot. version: what it runs, None before it said so; seconds_since: since it said anything.
+    """One robot. version: running version, None before the first report; seconds_since: since its last message.
 
-    is_canary: whether it tries a version before the others. is_present: its liveliness token, None before the first look.
-    is_copied: whether its certificate was on two connections at once within the last hour. state_since_ns: since when, by the
-    server's clock, it is localised, unsure (DEGRADED) or not localised, whichever it is now; None before it reported. clock_ahead_s: by
-    how much its wall clock is ahead of the server's, None before it reported. last_ack, last_health and last_pose are its last messages
-    as plain values, None before the first.
+    is_canary: True if it runs a version before the others. is_present: its liveliness token, None before the first check. is_copied: True
+    if its certificate was on two connections at once within the last hour. state_since_ns: start of its present state (localised, DEGRADED
+    or not localised) by the server's clock; None before its first report. clock_ahead_s: offset of its wall clock against the server's,
+    None before its first report. last_ack, last_health and last_pose: its last messages as plain values, None if absent.
     """
 
     site: str
@@ -82,7 +81,7 @@ class _Robot:
 
 @dataclass(frozen=True, slots=True)
 class _Assignment:
-    """A site's current version, and the one that some robots try before the others."""
+    """A site's current version, and its canary version."""
 
     current: WantedVersion
     canary: CanaryRow | None = None
@@ -107,10 +106,10 @@ def _assignment(store: MapStore, site: str) -> _Assignment:
 
 
 class Fleet:
-    """Takes the robots' messages from any thread.
+    """Receives the robots' messages from any thread.
 
-    Acknowledgements and failures are on the disk when the method returns, health with the next `flush`; of poses the last one
-    is in memory. `storage_fault` says why reports cannot be stored now, if so. Messages for sites that the store does not have are
+    Acknowledgements and failures are on the disk when the method returns, health with the next `flush`; the last pose is only
+    in memory. `storage_fault`: why reports cannot be stored at present, empty otherwise. Messages for sites unknown to the store are
     refused, as are more than MAX_ROBOTS robots, so that invented names cannot fill the disk.
     """
 
@@ -131,19 +130,19 @@ class Fleet:
             self._robots[info.site, info.robot] = robot
 
     def wanted_version(self, site: str, robot: str) -> WantedVersion:
-        """The version that a robot should run: its site's current one, or that which it tries before the others.
+        """Return the version that a robot should run: its site's current one, or the canary version.
 
         Raises UsageError for an unknown site.
         """
         return _assignment(self._store, site).wanted(robot)
 
     def wanted_versions(self, site: str) -> dict[str, WantedVersion]:
-        """The same for all robots of a site that ever asked or said something."""
+        """Return the same for all robots of a site that ever sent a message or query."""
         assignment = _assignment(self._store, site)
         return {robot: assignment.wanted(robot) for robot in self.known_robots(site)}
 
     def take_question(self, site: str, robot: str) -> WantedVersion:
-        """As `wanted_version`, asked by the robot itself: from then on it is known, and hears of the next version."""
+        """As `wanted_version`, queried by the robot itself: it is then registered, and notified of the next version."""
         wanted = self.wanted_version(site, robot)
         with self._lock:
             if (site, robot) in self._robots or len(self._robots) < MAX_ROBOTS:
@@ -151,7 +150,7 @@ class Fleet:
         return wanted
 
     def take_ack(self, site: str, robot: str, ack: RobotAck) -> None:
-        """Keeps an acknowledgement; raises LinkError for one in another robot's name."""
+        """Store an acknowledgement; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, ack)
         now_ns = self._clock_ns()
         with self._lock:
@@ -162,7 +161,7 @@ class Fleet:
             self._store.record_robot_report(site, robot, report, version)
 
     def take_health(self, site: str, robot: str, health: RobotHealth) -> None:
-        """Counts a report and keeps it until the next `flush`; raises LinkError for one in another robot's name."""
+        """Count a report and buffer it until the next `flush`; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, health)
         now_ns = self._clock_ns()
         with self._lock:
@@ -171,7 +170,7 @@ class Fleet:
             entry = self._entry(site, robot, now_ns, health.version)
             last = entry.report.get("health") or {}
             since_ns = entry.report.get("state_since_ns")
-            is_gap = is_gap or since_ns is None or since_ns > now_ns  # from before the clock was set back
+            is_gap = is_gap or since_ns is None or since_ns > now_ns  # the clock was set back
             if is_gap or _state(last.get("status")) != _state(health.status):
                 entry.report["state_since_ns"] = now_ns
             if health.wall_ns is not None:
@@ -187,9 +186,9 @@ class Fleet:
             self._ingest.take_pose(site, robot, message)
 
     def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:
-        """Keeps a failure, once however often it comes; on the disk when this returns.
+        """Store a failure, once however often it arrives; it is on the disk when this returns.
 
-        What can never be kept is refused in the answer; StoreError where it may be later.
+        A permanent refusal is in the answer; StoreError if a later attempt may succeed.
         """
         now_ns = self._clock_ns()
         try:
@@ -205,18 +204,18 @@ class Fleet:
         return FailureAck(id=report.id)
 
     def take_failure_bytes(self, site: str, robot: str, payload: bytes) -> FailureAck:
-        """As `take_failure`, of an encoded report. One that is refused for good is set aside in the store's folder.
+        """As `take_failure`, of an encoded report. A permanently refused one is kept in the store's folder.
 
-        Raises LinkError for bytes that do not even say which report they are, and where the robot sends more than it may: it asks
-        again later; StoreError where it may be kept later.
+        Raises LinkError for bytes without a readable report id, and above the robot's rate limit: it
+        retries later; StoreError if a later attempt may succeed.
         """
         if not self._failures.admits((site, robot)):
             raise LinkError(
-                f"later: robot {robot[:80]!r} sent {FAILURE_BURST} failures, and now one a minute is taken; it keeps the others"
+                f"later: robot {robot[:80]!r} sent {FAILURE_BURST} failures; now one a minute is accepted; the robot keeps the others"
             )
         try:
             if len(payload) > MAX_FAILURE_BYTES:
-                raise LinkError(f"a failure of {len(payload)} bytes; the limit is {MAX_FAILURE_BYTES}")
+                raise LinkError(f"a failure report of {len(payload)} bytes; the limit is {MAX_FAILURE_BYTES}")
             ack = self.take_failure(site, robot, decode_message(payload, FailureReport))
         except LinkError as error:
             ack = rejection(payload, str(error))
@@ -226,14 +225,14 @@ class Fleet:
         return ack
 
     def take_presence(self, present: Iterable[tuple[str, str]]) -> None:
-        """Notes which robots (site, name) show their liveliness token now; those that were never heard stay unknown."""
+        """Record which robots (site, name) have a liveliness token now; robots never seen stay unknown."""
         there = set(present)
         stored = self._store.robot_names()
         now_ns = self._clock_ns()
         with self._lock:
             for key, robot in list(self._robots.items()):
                 robot.is_present = key in there
-                # Removed by a command, or a name that only ever asked.
+                # Removed by a command, or a name that only sent queries.
                 gone = robot.is_stored or (not robot.is_present and now_ns - robot.seen_ns > _FORGET_AFTER_NS)
                 if key not in stored and gone:
                     del self._robots[key]
@@ -241,20 +240,20 @@ class Fleet:
                 robot.is_stored = key in stored
 
     def take_copied(self, copied: Iterable[tuple[str, str]]) -> None:
-        """Notes robots (site, name) whose certificate is on two connections now."""
+        """Record robots (site, name) whose certificate is on two connections now."""
         with self._lock:
             for key in copied:
                 if key in self._robots:
                     self._robots[key].copied_ns = self._clock_ns()
 
     def flush(self) -> None:
-        """Brings what was counted to the disk; raises StoreError where it refuses, and keeps it for the next time."""
+        """Write the counts to the disk; on a disk error raises StoreError and keeps them for the next call."""
         if self._ingest.has_counted():
             with self._storing():
                 self._ingest.flush()
 
     def prune(self) -> int:
-        """Removes reports from the store that are too old or too many; returns how many rows went."""
+        """Remove reports from the store that are too old or too many; return the number of removed rows."""
         return self._ingest.prune()
 
     def known_robots(self, site: str) -> list[str]:
@@ -262,18 +261,18 @@ class Fleet:
             return sorted(robot for key_site, robot in self._robots if key_site == site)
 
     def robots(self, site: str | None = None) -> list[RobotStatus]:
-        """All robots (of a site), by site and name."""
+        """Return all robots (of a site), by site and name."""
         now_ns = self._clock_ns()
         with self._lock:
             for robot in self._robots.values():
-                robot.seen_ns = min(robot.seen_ns, now_ns)  # the clock was set back: from now on silence counts
+                robot.seen_ns = min(robot.seen_ns, now_ns)  # the clock was set back: silence counts from now
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
         assignments = {site: _assignment(self._store, site) for site in {key[0] for key, _ in chosen}}
         return [_status(key, robot, assignments[key[0]], now_ns) for key, robot in chosen]
 
     @contextmanager
     def _storing(self) -> Iterator[None]:
-        """Notes in `storage_fault` why reports cannot be stored; empty since the last one that was."""
+        """Set `storage_fault` to the reason why reports cannot be stored; empty after a successful write."""
         try:
             yield
         except StoreError as error:
@@ -282,13 +281,13 @@ class Fleet:
         self.storage_fault = ""
 
     def _entry(self, site: str, robot: str, now_ns: int, version: int | None) -> _Robot:
-        """The robot, seen now; `version` is what it says it runs. The caller holds the lock."""
+        """Return the robot, seen now; `version` is its reported version. The caller holds the lock."""
         entry = self._robots.get((site, robot))
         if entry is None:
             if site not in {info.site for info in self._store.sites()}:
-                raise LinkError(f"robot {robot!r} reports for site {site!r}, which this store does not have")
+                raise LinkError(f"robot {robot!r} reports for site {site!r}, which is not in this store")
             if len(self._robots) >= MAX_ROBOTS:
-                raise LinkError(f"robot {robot!r} is one more than the {MAX_ROBOTS} that this server keeps")
+                raise LinkError(f"robot {robot!r} exceeds the limit of {MAX_ROBOTS} robots of this server")
             entry = self._robots.setdefault((site, robot), _Robot())
         entry.version = version if version is not None else entry.version
         entry.seen_ns = now_ns
@@ -314,21 +313,21 @@ def _status(key: tuple[str, str], robot: _Robot, assignment: _Assignment, now_ns
 
 
 def _state(status: object) -> object:
-    """What counts as the same state: LOST, AMBIGUOUS and INITIALISING are one, in which the robot does not know where it is."""
+    """Return the state group: LOST, AMBIGUOUS and INITIALISING count as one, without a known position."""
     return status if status in {Status.TRACKING, Status.DEGRADED, None} else Status.LOST
 
 
 def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | FailureReport) -> None:
     if (message.site, message.robot) != (site, robot):
-        raise LinkError(f"robot {robot!r} of {site!r} speaks for {message.robot!r} of {message.site!r}")
+        raise LinkError(f"robot {robot!r} of {site!r} reports in the name of {message.robot!r} of {message.site!r}")
     if abs(message.stamp_ns) > MAX_STAMP_NS:
-        raise LinkError(f"robot {robot!r} of {site!r} says it is {message.stamp_ns} ns; check its clock")
+        raise LinkError(f"robot {robot!r} of {site!r} sent the stamp {message.stamp_ns} ns; check its clock")
 
 
 def _check_failure(report: FailureReport) -> None:
     if abs(report.wall_ns) > MAX_STAMP_NS or not 0 <= report.duration_s < math.inf:
-        raise LinkError(f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s; that cannot be")
+        raise LinkError(f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s: invalid time")
     if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
         raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
     if not all(thumb.jpeg.startswith(b"\xff\xd8") and thumb.jpeg.endswith(b"\xff\xd9") for thumb in report.thumbnails):
-        raise LinkError(f"failure {report.id!r} has a picture that does not begin and end as a JPEG does")
+        raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")

@@ -27,14 +27,14 @@ _DAY_NS = 86_400_000_000_000
 
 
 class IngestSettings(Section, frozen=True):
-    """How thinned robots' traces go to the disk, and how long what they report stays there."""
+    """Rate of the robots' stored traces, and retention of their reports."""
 
     trace_every_s: Positive = 10.0
     trace_days: Positive = 2.0
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
-    picture_bytes: PositiveInt = 1_000_000_000  # the oldest pictures go as new ones come
-    replay_bytes: PositiveInt = 2_000_000_000  # the oldest recordings of failures go as new ones come
+    picture_bytes: PositiveInt = 1_000_000_000  # above, the oldest pictures are deleted
+    replay_bytes: PositiveInt = 2_000_000_000  # above, the oldest recordings are deleted
 
     def retention(self) -> FleetRetention:
         return FleetRetention(self.tally_days, self.failure_days, self.picture_bytes, self.trace_days)
@@ -61,12 +61,12 @@ class _Grid:
         return self.cell_key((math.floor(x_m / self.size_m), math.floor(y_m / self.size_m)))
 
     def cell_key(self, cell: tuple[int, int]) -> str:
-        """Key of a tile, if the version has it: robots cannot make keys up."""
+        """Key of a tile, if the version has it: robots cannot invent keys."""
         return (tile_key(cell) or OUTSIDE) if cell in self.cells else OUTSIDE
 
 
 class Ingest:
-    """Counts in memory what `flush` brings to the disk; failures go there at once. Methods may be called from any thread."""
+    """Counts in memory until `flush` writes to the disk; failures are written at once. Methods may be called from any thread."""
 
     def __init__(self, store: MapStore, settings: IngestSettings) -> None:
         self._store = store
@@ -86,7 +86,7 @@ class Ingest:
             self._streams.setdefault((site, robot), _Stream()).health.take_pose(message)
 
     def forget(self, robot: tuple[str, str]) -> None:
-        """Drops what was kept of a robot (site, name) that went."""
+        """Drop the data of a removed robot (site, name)."""
         with self._lock:
             self._streams.pop(robot, None)
 
@@ -98,7 +98,7 @@ class Ingest:
         report: dict[str, Any],
         version: int | None,
     ) -> None:
-        """Counts a report; `report` and `version` are what the store shall show of the robot."""
+        """Count a report; `report` and `version` are shown by the store for the robot."""
         site, robot, hour = health.site, health.robot, hour_of(now_ns)
         grid = self._grid(site, health.version)
         canary, areas = self._canary(site, now_ns), self._areas_of(site, now_ns)
@@ -122,7 +122,7 @@ class Ingest:
                 self._batch.traces.append(_trace(health, place, now_ns))
 
     def take_failure(self, report: FailureReport, now_ns: int, ahead_s: float | None) -> bool:
-        """Brings a failure to the disk with its sums; False for one that is there already. Raises StoreError."""
+        """Write a failure with its sums; False for a duplicate. Raises StoreError."""
         oldest_ns = now_ns - int(self._settings.failure_days * _DAY_NS)
         happened_ns = server_time_ns(report.wall_ns, ahead_s, now_ns, oldest_ns)
         grid = self._grid(report.site, report.version)
@@ -147,7 +147,7 @@ class Ingest:
             return bool(self._batch.counters or self._batch.last_reports)
 
     def flush(self) -> None:
-        """Brings what was counted to the disk. Raises StoreError, and keeps it for the next time."""
+        """Write the counts to the disk. On error raises StoreError and keeps them for the next call."""
         with self._flushing:
             with self._lock:
                 batch, self._batch = self._batch, FleetBatch()
@@ -161,7 +161,7 @@ class Ingest:
                 raise
 
     def prune(self) -> int:
-        """Removes from the store what is too old or too much; returns how many rows went."""
+        """Remove old or excess data from the store; return the number of removed rows."""
         return self._store.fleet.prune(self._settings.retention())
 
     def _put_back(self, batch: FleetBatch) -> None:
@@ -173,7 +173,7 @@ class Ingest:
         batch.traces = list(kept)
 
     def _is_trace_due(self, stream: _Stream, health: RobotHealth, now_ns: int) -> bool:
-        """Thinned by time; a changed status is kept, but no more than one a second."""
+        """True if a trace row is due by time; a changed status also counts, but at most once a second."""
         quiet_ns = now_ns - stream.trace_ns
         if quiet_ns < 0:  # the clock was set back
             quiet_ns = _DAY_NS
@@ -184,14 +184,14 @@ class Ingest:
         return due
 
     def _grid(self, site: str, version: int | None) -> _Grid | None:
-        """The tiles of a version; None for one that the store does not have."""
+        """Return the tiles of a version; None if it is not in the store."""
         if version is None:
             return None
         if (site, version) not in self._grids:
             try:
                 manifest = self._store.manifest(site, version)
             except FleetmapError:
-                return None  # not remembered: it may be imported later
+                return None  # not cached: it may be imported later
             cells = frozenset((tile.x, tile.y) for tile in manifest.tiles)
             self._grids[site, version] = _Grid(manifest.tile_size_m, cells)
         return self._grids[site, version]
@@ -203,7 +203,7 @@ class Ingest:
         return self._canaries.get(site)
 
     def _areas_of(self, site: str, now_ns: int) -> Areas:
-        """The areas of a site; none where they cannot be read, so that reports are counted all the same."""
+        """Return the areas of a site; none if unreadable, so that reports are still counted."""
         known = self._areas.get(site)
         if known is None or not 0 <= now_ns - known[0] < _AREAS_KEPT_NS:
             try:
@@ -228,19 +228,19 @@ def _keys(robot: str, version: str, arm: str | None) -> list[tuple[str, str]]:
 
 
 def _version_key(version: int | None, grid: _Grid | None) -> str:
-    """Numbers of versions that the store has; robots cannot make keys up."""
+    """Return numbers of versions in the store; robots cannot invent keys."""
     return "none" if version is None else str(version) if grid is not None else "unknown"
 
 
 def _arm(canary: CanaryRow | None, version: int | None) -> str | None:
-    """The side of a canary's comparison that a robot is on; None for one that runs a third version."""
+    """Return the arm of a canary's comparison for a robot; None for one that runs a third version."""
     if canary is None or version not in {canary.version, canary.base_version}:
         return None
     return arm_key(canary.id, is_canary=version == canary.version)
 
 
 def arm_key(canary: int, *, is_canary: bool) -> str:
-    """Key of one side of a canary's comparison."""
+    """Return the key of one arm of a canary's comparison."""
     return f"{canary}:{'canary' if is_canary else 'others'}"
 
 

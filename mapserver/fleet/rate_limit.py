@@ -1,4 +1,4 @@
-"""Token buckets: how often something may happen for each of many keys."""
+"""Token buckets: a rate limit for each of many keys."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -8,9 +8,9 @@ _SEARCHED_EVERY_NS = 1_000_000_000
 
 
 class RateLimit:
-    """`burst` at once for each key, then `per_s` in a second; methods may be called from any thread.
+    """`burst` events at once per key, then `per_s` per second; methods may be called from any thread.
 
-    Keys whose bucket is full again are forgotten; of more keys than that none is admitted.
+    Keys with a full bucket are dropped; beyond the maximum number of keys, new ones are refused.
     """
 
     def __init__(self, burst: float, per_s: float, clock_ns: Callable[[], int]) -> None:
@@ -34,7 +34,7 @@ class RateLimit:
             return level >= 1.0
 
     def _forget(self, now_ns: int) -> None:
-        """Without a key a bucket is full: those that are full again need none."""
+        """Drop full buckets: a missing key counts as full."""
         self._buckets = {
             key: (level, then_ns)
             for key, (level, then_ns) in self._buckets.items()

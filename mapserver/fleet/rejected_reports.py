@@ -1,4 +1,4 @@
-"""Dead letters: failure reports that cannot be stored are kept as they came, with the reason."""
+"""Dead letters: failure reports that cannot be stored are kept unchanged, with the reason."""
 
 import logging
 from pathlib import Path
@@ -21,7 +21,7 @@ class _IdOnly(msgspec.Struct, frozen=True):
 
 
 def rejection(payload: bytes, reason: str) -> FailureAck:
-    """The answer after which a robot does not send an unreadable report again; raises LinkError where not even its id can be read."""
+    """Return the answer that stops a robot from resending an unreadable report; raises LinkError if its id is unreadable too."""
     try:
         known = msgspec.msgpack.decode(payload, type=_IdOnly)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -30,9 +30,9 @@ def rejection(payload: bytes, reason: str) -> FailureAck:
 
 
 def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes, reason: str) -> None:
-    """Keeps a rejected report beside its reason, the last ones alone. A full disk loses only these. robot: site and name."""
+    """Keep a rejected report with its reason; only the latest ones are kept. A full disk loses only these. robot: site and name."""
     site, name = robot
-    _log.warning("a failure of robot %r of site %r is refused for good: %s", name[:80], site[:80], reason)
+    _log.warning("a failure of robot %r of site %r is permanently refused: %s", name[:80], site[:80], reason)
     try:
         sender = f"{check_name(site, 'site')}-{check_name(name, 'robot')}"
     except UsageError:
@@ -47,4 +47,4 @@ def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes,
             old.unlink()
             old.with_suffix(".reason.txt").unlink(missing_ok=True)
     except (OSError, StoreError) as error:
-        _log.warning("it could not be kept in %s: %s", folder, error)
+        _log.warning("the refused report could not be kept in %s: %s", folder, error)

@@ -1,4 +1,4 @@
-"""Intake of failures' recordings: parts from robots are joined, judged as files of strangers, and kept beside their failure."""
+"""Intake of failures' recordings: parts from robots are joined, checked as untrusted files, and stored with their failure."""
 
 import logging
 import threading
@@ -13,9 +13,9 @@ from fleetmap.messages import FailureAck, decode_message
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.store import FailureReplay, MapStore
 
-# A robot that fails again and again sends ten recordings at once, then one in ten minutes.
+# A repeatedly failing robot sends ten recordings at once, then one in ten minutes.
 REPLAY_BURST, REPLAYS_PER_S = 10, 1 / 600
-MAX_UPLOADS = 4  # that go on at the same time, all of them in memory
+MAX_UPLOADS = 4  # simultaneous ones, all in memory
 _IDLE_NS = 60_000_000_000
 _MAX_PICTURES, _MAX_PICTURE_BYTES, _MAX_PIXELS = 64, 64 << 10, 1_000_000
 _log = logging.getLogger(__name__)
@@ -30,19 +30,19 @@ class _Upload:
 
 
 class ReplayIntake:
-    """Takes parts in their order. Methods may be called from any thread."""
+    """Receives parts in order. Methods may be called from any thread."""
 
     def __init__(self, store: MapStore, keep_bytes: int, clock_ns: Callable[[], int]) -> None:
-        """keep_bytes: of all recordings; the oldest go."""
+        """keep_bytes: limit for all recordings; the oldest are deleted."""
         self._store, self._keep_bytes, self._clock_ns = store, keep_bytes, clock_ns
         self._lock = threading.Lock()
         self._uploads: dict[tuple[str, str], _Upload] = {}
         self._rates = RateLimit(REPLAY_BURST, REPLAYS_PER_S, clock_ns)
 
     def take(self, site: str, robot: str, payload: bytes) -> FailureAck:
-        """How much of the recording has come; what can never be kept is refused in the answer.
+        """Return the received length of the recording; a permanent refusal is in the answer.
 
-        Raises LinkError for bytes that are no part, and where the robot shall ask again later.
+        Raises LinkError for an invalid part, and if the robot must retry later.
         """
         part = decode_message(payload, ReplayPart)
         if part.total_bytes > MAX_FILE_BYTES:
@@ -61,26 +61,26 @@ class ReplayIntake:
         return self._kept(site, robot, upload)
 
     def _upload(self, site: str, robot: str, part: ReplayPart) -> _Upload | FailureAck:
-        """The one that the part belongs to, or the answer to a part that begins none. The caller holds the lock."""
+        """Return the upload of the part, or the answer to a part without one. The caller holds the lock."""
         now_ns, key = self._clock_ns(), (site, robot)
         upload = self._uploads.get(key)
         if upload is not None and (upload.id, upload.total_bytes) == (part.id, part.total_bytes):
             return upload
         failure = self._store.fleet.failure_number(site, robot, part.id)
         if failure is None:
-            return FailureAck(id=part.id, refused="there is no such failure; its report must come first, and be kept")
+            return FailureAck(id=part.id, refused="unknown failure; send its report first")
         if self._store.fleet.replay_summary(failure) is not None:
             return FailureAck(id=part.id, received_bytes=part.total_bytes)
         if part.offset:
-            return FailureAck(id=part.id)  # it was forgotten: from the beginning
+            return FailureAck(id=part.id)  # the upload was dropped: restart it
         self._uploads = {
             k: each for k, each in self._uploads.items() if k != key and abs(now_ns - each.heard_ns) < _IDLE_NS
         }
         if len(self._uploads) >= MAX_UPLOADS:
-            raise LinkError(f"later: {MAX_UPLOADS} robots send recordings of failures already")
+            raise LinkError(f"later: {MAX_UPLOADS} robots are already sending recordings")
         if not self._rates.admits(key):
             raise LinkError(
-                f"later: robot {robot[:80]!r} sent {REPLAY_BURST} recordings; now one in ten minutes is taken"
+                f"later: robot {robot[:80]!r} sent {REPLAY_BURST} recordings; now one in ten minutes is accepted"
             )
         self._uploads[key] = _Upload(part.id, part.total_bytes, now_ns)
         return self._uploads[key]
@@ -90,7 +90,7 @@ class ReplayIntake:
         try:
             replay = _judged(bytes(upload.data), (site, robot, upload.id))
         except FleetmapError as error:
-            _log.warning("the recording of a failure of robot %r is refused for good: %s", robot[:80], error)
+            _log.warning("the recording of a failure of robot %r is permanently refused: %s", robot[:80], error)
             return FailureAck(id=upload.id, refused=str(error)[:2000])
         if failure is not None:
             self._store.fleet.add_replay(failure, replay, self._keep_bytes)
@@ -98,7 +98,7 @@ class ReplayIntake:
 
 
 def _judged(data: bytes, named: tuple[str, str, str]) -> FailureReplay:
-    """The recording with its summary and left pictures; named: site, robot and report. FleetmapError for what no robot writes."""
+    """Return the recording with its summary and number of pictures; named: site, robot and report. FleetmapError for invalid data."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "failure.mcap"
         path.write_bytes(data)
@@ -109,7 +109,7 @@ def _judged(data: bytes, named: tuple[str, str, str]) -> FailureReplay:
 
 
 def _read(path: Path, data: bytes, named: tuple[str, str, str]) -> FailureReplay:
-    # Recordings' readers bring OpenCV: every command that reads a configuration would load them.
+    # Recordings' readers import OpenCV: otherwise every command that reads a configuration would load it.
     from fleetmap.recordings import open_recording
     from fleetmap.recordings.failure_recording import SUMMARY, attachments_of
     from fleetmap.recordings.images import image_size
@@ -132,7 +132,7 @@ def _read(path: Path, data: bytes, named: tuple[str, str, str]) -> FailureReplay
     for stamp_ns, jpeg in [*pictures, *((frame.stamp_ns, frame.right.data) for frame in stored if frame.right)]:
         size = image_size(jpeg)
         if not (jpeg.startswith(b"\xff\xd8") and jpeg.endswith(b"\xff\xd9")) or len(jpeg) > _MAX_PICTURE_BYTES:
-            raise RecordingError(f"the picture at {stamp_ns} is no JPEG of at most {_MAX_PICTURE_BYTES} bytes")
+            raise RecordingError(f"the picture at {stamp_ns} is not a JPEG of at most {_MAX_PICTURE_BYTES} bytes")
         if size is None or size[0] * size[1] > _MAX_PIXELS:
-            raise RecordingError(f"the picture at {stamp_ns} is of size {size}; at most {_MAX_PIXELS} pixels are taken")
+            raise RecordingError(f"the picture at {stamp_ns} is of size {size}; the limit is {_MAX_PIXELS} pixels")
     return FailureReplay(summary_bytes, data, pictures)

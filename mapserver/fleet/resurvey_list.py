@@ -22,9 +22,9 @@ from mapserver.store import MapStore
 
 @dataclass(frozen=True, slots=True)
 class ResurveyList:
-    """Tiles to survey again, the worst first, and a way through them; version: the current one, None without.
+    """Tiles to resurvey, the most urgent first, and a route through them; version: the current one, None if absent.
 
-    requests: what people asked for; the tiles in which that lies come first.
+    requests: of operators; the tiles of requests come first.
     """
 
     site: str
@@ -35,7 +35,7 @@ class ResurveyList:
 
 
 def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns: int) -> ResurveyList:
-    """The list as of now; raises UsageError for an unknown site."""
+    """Return the list as of now; raises UsageError for an unknown site."""
     current = store.current(site)
     now_hour = hour_of(now_ns)
     recent_hour = now_hour - round(settings.recent_days * 24)
@@ -62,13 +62,13 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
 
 
 def _asked(requests: Sequence[SurveyRequest], size_m: float) -> dict[str, list[str]]:
-    """By tile: who asked for a survey of it, when and why."""
+    """Return by tile the requests for a survey of it: author, time and reason."""
     found: dict[str, list[str]] = {}
     for request in requests:
         day = f"{datetime.fromtimestamp(request.asked_ns / 1e9, UTC):%Y-%m-%d}"
         why = f": {request.reason}" if request.reason else ""
         for x, y in request.tiles(size_m):
-            found.setdefault(f"{x},{y}", []).append(f"{request.actor or 'somebody'} asked for it on {day}{why}")
+            found.setdefault(f"{x},{y}", []).append(f"{request.actor or 'unnamed'} asked for it on {day}{why}")
     return found
 
 
@@ -78,7 +78,7 @@ def _asked_first(
     recent: Mapping[str, Counters],
     before: Mapping[str, Counters],
 ) -> list[TileConcern]:
-    """A person's word is a reason of its own, and comes before what was counted."""
+    """Put requested tiles first; a request is a reason beside the statistical ones."""
     known = {concern.tile: concern for concern in found}
     first = [
         replace(known[tile], reasons=[*words, *known[tile].reasons])
@@ -90,10 +90,10 @@ def _asked_first(
 
 
 def _place(store: MapStore, entry: TileEntry, size_m: float) -> tuple[float, float]:
-    """Where the survey stood nearest to the tile's middle, which can be driven to; the middle where it never stood there."""
+    """Return the survey position nearest to the tile's middle, which is reachable; the middle if the survey never was in the tile."""
     middle = ((entry.x + 0.5) * size_m, (entry.y + 0.5) * size_m)
     try:
         stood = decode_tile(store.blob(entry.sha256)).map_from_cam[:, :2, 3]
     except FleetmapError:
-        return middle  # a damaged tile needs a survey most of all
+        return middle  # a damaged tile needs a survey most
     return min(((float(x), float(y)) for x, y in stood), key=lambda place: math.dist(place, middle), default=middle)

@@ -40,7 +40,7 @@ def summarise(
     canary: CanarySettings = CanarySettings(),  # noqa: B008  frozen
     resurvey: ResurveySettings = ResurveySettings(),  # noqa: B008
 ) -> FleetSummary:
-    """The last `hours` of a site beside as many before; raises UsageError for an unknown site. canary, resurvey: what judges both."""
+    """Return the last `hours` of a site beside as many before; raises UsageError for an unknown site. canary, resurvey: their settings."""
     current = store.current(site)
     until = hour_of(now_ns) + 1
     since = until - hours

@@ -1,4 +1,4 @@
-"""Places that people ask to survey again, drawn as polygons: kept with the site until a version surveyed them, or somebody says so."""
+"""Survey requests of operators, drawn as polygons: kept with the site until a version covers them or they are closed."""
 
 import hashlib
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ Corners = Sequence[tuple[float, float]]
 
 
 def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Actor) -> SurveyRequest:
-    """Keeps a request, and notes it in the site's history.
+    """Store a request, and log it in the site's history.
 
-    UsageError for an unknown site and what is no simple polygon of at most MOST_SIDE_M each way, StateError without a map and for too many.
+    UsageError for an unknown site or an invalid polygon (simple, at most MOST_SIDE_M each way), StateError without a map and for too many.
     """
     if store.current(site) is None:
-        raise StateError(f"site {site} has no published map that could be surveyed again; publish one first")
+        raise StateError(f"site {site} has no published map to resurvey; publish one first")
     if len(store.survey_requests(site)) >= MOST_REQUESTS:
-        raise StateError(f"site {site} has {MOST_REQUESTS} requests that are not done; say of some that they are")
+        raise StateError(f"site {site} has {MOST_REQUESTS} open requests; close some first")
     if not 3 <= len(corners_map_m) <= MOST_CORNERS:
-        raise UsageError(f"{len(corners_map_m)} corners; draw it with 3 to {MOST_CORNERS}")
+        raise UsageError(f"{len(corners_map_m)} corners; draw the polygon with 3 to {MOST_CORNERS}")
     ring = [[round(float(x), 2), round(float(y), 2)] for x, y in corners_map_m]
     asked_ns = store.now_ns()
     who = {"name": "survey", "asked_ns": asked_ns, "actor": actor.name, "reason": actor.reason}
     geometry = {"type": "Polygon", "coordinates": [[*ring, *ring[:1]]]}
     feature = {"type": "Feature", "geometry": geometry, "properties": who}
     data = to_json({"type": "FeatureCollection", "frame": "map", "features": [feature]})
-    (area,) = read_areas(data, None).areas  # refuses what is no simple polygon
+    (area,) = read_areas(data, None).areas  # refuses polygons that are not simple
     sides_m = np.ptp(np.array(ring), axis=0)
     if sides_m.max() > MOST_SIDE_M:
         raise UsageError(f"{sides_m[0]:.0f} x {sides_m[1]:.0f} m; draw several of at most {MOST_SIDE_M:g} m each way")
@@ -45,8 +45,8 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
 
 
 def end_request(store: MapStore, site: str, request: str, actor: Actor) -> None:
-    """Takes a request off the list: it was surveyed, or is not wanted any more. UsageError for one that is not there."""
-    store.current(site)  # an unknown site is not one without requests
+    """Remove a request from the list because it was surveyed or is no longer wanted. UsageError for an unknown one."""
+    store.current(site)  # raises for an unknown site
     if request not in {known.id for known in store.survey_requests(site)}:
-        raise UsageError(f"site {site} has no open request {request[:40]!r} for a survey; it may be done already")
+        raise UsageError(f"site {site} has no open request {request[:40]!r} for a survey; it may be closed already")
     store.keep_site_files(site, {KIND + request: None}, "done", actor=actor)

@@ -1,4 +1,4 @@
-"""Which areas got worse: failures of a week beside those of the week before, area by area. Pure."""
+"""Trend of areas: failures of one week compared with the week before, per area. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +15,9 @@ _ORDER: dict[Verdict, int] = {"worse": 0, "no clear change": 1, "better": 2, "to
 
 @dataclass(frozen=True, slots=True)
 class AreaTrend:
-    """An area now and before. low, high: how many times as often robots fail there now; high None where it has no bound.
+    """An area now and before. low, high: interval of the ratio of failure rates, now over before; high None if unbounded.
 
-    localised_*: share of the driving time in which robots were localised, None where nothing is known of it.
+    localised_*: share of the driving time in which robots were localised, None if unknown.
     """
 
     name: str
@@ -31,7 +31,7 @@ class AreaTrend:
 
     @property
     def times_words(self) -> str:
-        """How many times as often, in words; a dash where too little was driven."""
+        """The ratio as text; a dash with too little driving."""
         if self.low is None:
             return "–"
         if self.high is None:
@@ -40,10 +40,10 @@ class AreaTrend:
 
 
 def area_trends(now: Mapping[str, Counters], before: Mapping[str, Counters]) -> list[AreaTrend]:
-    """All areas of either week, the worse first. The intervals of all of them together hold the true ratios with 95 %.
+    """Return all areas of either week, the worsened first. All intervals together hold the true ratios with 95 %.
 
     Given all failures of both weeks, those of the last one are binomial (Przyborowski and Wilenski 1940); the exact interval of that share
-    (Clopper and Pearson 1934) is one of the ratio, and Bonferroni's correction makes up for looking at many areas.
+    (Clopper and Pearson 1934) gives that of the ratio, and Bonferroni's correction accounts for the number of areas.
     """
     nothing = Counters()
     pairs = {name: (now.get(name, nothing), before.get(name, nothing)) for name in {*now, *before}}
@@ -64,7 +64,7 @@ def _trend(name: str, now: Counters, before: Counters, tail: float | None) -> Ar
 
 
 def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
-    """The interval of the ratio of two rates with `tail` outside on either side."""
+    """Return the interval of the ratio of two rates with `tail` outside on either side."""
     a, b = now.events, before.events
     low = 0.0 if a == 0 else float(scipy.special.betaincinv(a, b + 1, tail))
     high = 1.0 if b == 0 else float(scipy.special.betaincinv(a + 1, b, 1 - tail))
@@ -73,7 +73,7 @@ def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
 
 
 def trend_sentence(trends: list[AreaTrend]) -> str:
-    """Which got worse, as an answer."""
+    """Return a sentence that names the worsened areas."""
     worse = [trend.name for trend in trends if trend.verdict == "worse"]
     silent = sum(trend.verdict == "too little driving to say" for trend in trends)
     if worse:

@@ -1,4 +1,4 @@
-"""Canaries: the choice of the robots that try a version first, and the test of their failures against the others'. Pure.
+"""Canaries: the choice of the first robots for a version, and the test of their failures against the others'. Pure.
 
 Two tests use the same counts. Harm: a sequential test, by an e-value, of whether the canary's rate exceeds the margin. Proof: the
 posterior probability that the rate is within the margin.
@@ -21,7 +21,7 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Action = Literal["wait", "promote", "roll_back"]
 DAY_NS = 86_400_000_000_000
-ALPHA = 0.01  # probability that a version within margin_ratio is rolled back, over all looks
+ALPHA = 0.01  # probability that a version within margin_ratio is rolled back, over all repeated tests
 _CONFIDENCE = 0.95  # of being within the margin, for promotion; below its complement a version may be rolled back
 
 _WORSE_BY = np.geomspace(1.25, 50.0, 16)  # how much worse than the margin the alternatives are
@@ -29,9 +29,9 @@ _QUANTILES = (np.arange(400) + 0.5) / 400
 
 
 class CanarySettings(Section, frozen=True):
-    """How a canary is chosen and judged. The margin: margin_ratio times the others' rate plus margin_per_robot_day.
+    """Choice and decision of a canary. The margin: margin_ratio times the others' rate plus margin_per_robot_day.
 
-    share: of the robots, when a command names none.
+    share: of the robots, if a command gives none.
     """
 
     share: Probability = 0.05
@@ -43,7 +43,7 @@ class CanarySettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class CanaryFinding:
-    """What the counts say. evidence: against the canary, harm from 1/alpha on; within_margin: probability that it is."""
+    """Result of the counts. evidence: against the canary, harm from 1/alpha on; within_margin: probability of being within the margin."""
 
     action: Action
     reason: str
@@ -54,19 +54,19 @@ class CanaryFinding:
 
 
 def number_of(site: str, version: int, robot: str) -> float:
-    """A robot's number in [0, 1) for a canary: always the same, and as if drawn anew for each version."""
+    """Return a robot's number in [0, 1) for a canary: constant for one version, independent between versions."""
     digest = hashlib.sha256(f"{site}/{version}/{robot}".encode()).digest()
     return int.from_bytes(digest[:6], "big") / float(1 << 48)
 
 
 def threshold_for(share: float, site: str, version: int, robots: Iterable[str]) -> float:
-    """The number below which robots take part: `share`, or as much more as one of `robots` needs to."""
+    """Return the threshold below which robots take part: `share`, or the smallest that includes one of `robots`."""
     numbers = [number_of(site, version, robot) for robot in robots]
     return max(share, math.nextafter(min(numbers), 1.0)) if numbers else share
 
 
 def judge_canary(canary: Counters, others: Counters, age_days: float, settings: CanarySettings) -> CanaryFinding:
-    """Whether to wait, promote or roll back, given what both arms did since the canary began."""
+    """Decide whether to wait, promote or roll back, by the counts of both arms since the canary began."""
     ours, theirs = rate(canary.events, canary.robot_days), rate(others.events, others.robot_days)
     evidence = evidence_of_harm(ours, theirs, settings.margin_ratio)
     within = within_margin(ours, theirs, settings.margin_ratio, settings.margin_per_robot_day)
@@ -86,11 +86,10 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
 
 
 def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
-    """The e-value against "the canary's rate is at most margin_ratio times the others'"; 1 where nothing was driven.
+    """Return the e-value against "the canary's rate is at most margin_ratio times the others'"; 1 without driving.
 
-    A mixture of binomial likelihood ratios, given the number of all failures. An e-value that ever reaches 1/alpha is an error in
-    at most a share alpha of harmless canaries, however often it is looked at (Ville's inequality), as long as the arms' shares of
-    driving stay as they are.
+    A mixture of binomial likelihood ratios, given the number of all failures. An e-value reaches 1/alpha at any time for at most a share
+    alpha of harmless canaries, however often it is tested (Ville's inequality), as long as the arms' shares of driving stay constant.
 
     Source: Ville 1939; Wald 1945, sequential tests of statistical hypotheses, for the mixture of likelihood ratios.
     """
@@ -104,7 +103,7 @@ def evidence_of_harm(canary: Rate, others: Rate, margin_ratio: float) -> float:
 
 
 def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_robot_day: float) -> float:
-    """The posterior probability that the canary's rate is within the margin; 0.5 where nothing was driven.
+    """Return the posterior probability that the canary's rate is within the margin; 0.5 without driving.
 
     Source: Jeffreys 1946, for the prior of a Poisson rate: Gamma(n + 1/2).
     """
@@ -118,8 +117,8 @@ def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_ro
 def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:
     if canary.robot_days <= 0 or others.robot_days <= 0:
         missing = "it" if canary.robot_days <= 0 else "the version before"
-        return f"nothing can be said before robots drive with {missing}"
-    return f"too early to tell: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
+        return f"no decision before robots drive with {missing}"
+    return f"too early to decide: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
 
 
 def _rate_text(found: Rate) -> str:

@@ -1,4 +1,4 @@
-"""Counters of one robot's stream of messages. Pure: time comes with the messages."""
+"""Counters of one robot's message stream. Pure: time comes with the messages."""
 
 import math
 
@@ -15,7 +15,7 @@ from fleetmap.failure_definition import (
 from fleetmap.messages import Flag, PoseMessage, RobotHealth, Status
 from mapserver.fleet_statistics.kpis import Counters
 
-MAX_GAP_S = 5.0  # a robot that is silent for longer was not observed meanwhile
+MAX_GAP_S = 5.0  # during a longer silence a robot counts as unobserved
 _MAX_COUNT = 1 << 40
 _MAX_FIGURE = 1e15
 
@@ -34,15 +34,15 @@ class HealthStream:
         self._good_since_ns: int | None = None
         self._jump_ns: int | None = None
         self._silent_ms = 0
-        self._watched_ns = 0  # time that reports cover since the first fix, by which blindness is measured
-        self.in_failure = False  # blind, or not found for too long, and no 5 s of good tracking since
+        self._watched_ns = 0  # observed time since the first fix, used to measure blindness
+        self.in_failure = False  # blind, or lost for too long, and no 5 s of good tracking since
         self._search = SearchClock()
-        self._search_ns = 0  # time that reports cover, by which the search is measured
+        self._search_ns = 0  # observed time, used to measure the search
         self._place: tuple[int, float, float] | None = None
         self._pose_mps: float | None = None
 
     def take_pose(self, message: PoseMessage) -> None:
-        """Speed between estimates, for robots that do not report it themselves."""
+        """Update the speed from estimates, for robots that do not report it."""
         x_m, y_m, _ = message.position_map_m
         if self._place is not None:
             dt_s = (message.stamp_ns - self._place[0]) * 1e-9
@@ -51,7 +51,7 @@ class HealthStream:
         self._place = (message.stamp_ns, x_m, y_m)
 
     def take_health(self, health: RobotHealth) -> Counters | None:
-        """What this report adds; None for one that was taken before."""
+        """Return the increments of this report; None for a duplicate."""
         if self._is_known(health):
             return None
         figures = _figures(health)
@@ -68,14 +68,14 @@ class HealthStream:
         return counts
 
     def _is_known(self, health: RobotHealth) -> bool:
-        """A recording that is played again has old stamps, but is sent later."""
+        """True for a report already counted. A replayed recording has old stamps, but later sending times."""
         if self._stamp_ns is None or health.stamp_ns > self._stamp_ns:
             return False
         if health.wall_ns is None or self._wall_ns is None:
             return health.stamp_ns == self._stamp_ns
         if health.wall_ns > self._wall_ns:
             return False
-        # Two that follow each other from far before: the robot's clock was set back.
+        # Two consecutive reports from far before: the robot's clock was set back.
         before_ns, self._older_wall_ns = self._older_wall_ns, health.wall_ns
         is_set_back = before_ns is not None and 0 < health.wall_ns - before_ns <= MAX_GAP_S * 1e9
         return not (is_set_back and self._wall_ns - health.wall_ns > MAX_GAP_S * 1e9)
@@ -93,7 +93,7 @@ class HealthStream:
         self._blind_since_ns = self._good_since_ns = self._jump_ns = None
 
     def _elapsed_ms(self, health: RobotHealth) -> int:
-        """By the robot's wall clock, which goes on while its cameras are silent; without one by the frames' stamps."""
+        """Return the time since the last report by the robot's wall clock, which runs while its cameras are silent; else by stamps."""
         if self._stamp_ns is None:
             return 0
         dt_ms = (health.stamp_ns - self._stamp_ns) // 1_000_000
@@ -102,7 +102,7 @@ class HealthStream:
         return dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
 
     def _is_stale(self, health: RobotHealth, dt_ms: int) -> bool:
-        """Whether no frame came for so long that the status speaks of the past. Ends with the next frame."""
+        """True if the last frame is so old that the status is outdated. Ends with the next frame."""
         self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
         return self._silent_ms > BLIND_S * 1e3
 
@@ -128,16 +128,16 @@ class HealthStream:
         self._end_failure(dt_ms, is_tracking)
 
     def _is_search_failure(self, dt_ms: int, is_found: bool, is_driving: bool, may_be_mapped: bool) -> bool:
-        """Whether the robot has not found itself for too long with this report."""
+        """True if the search of the robot for its position exceeds its limit with this report."""
         self._search_ns += dt_ms * 1_000_000
         return self._search.handle(
             self._search_ns, is_found=is_found, is_driving=is_driving, may_be_mapped=may_be_mapped
         )
 
     def _is_blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool) -> bool:
-        """Whether a stretch of blindness has become a failure with this report. It lasts until the next report that is better."""
+        """True if blindness just exceeded the limit. It lasts until the next better report."""
         if dt_ms == 0:
-            self._blind_since_ns = None  # what was in between is unknown
+            self._blind_since_ns = None  # the time in between is unknown
         began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
         if not is_blind_now:
             self._blind_since_ns = None
@@ -146,7 +146,7 @@ class HealthStream:
         return began
 
     def _end_failure(self, dt_ms: int, is_tracking: bool) -> None:
-        """A failure lasts until 5 s of good tracking."""
+        """End a failure after 5 s of good tracking."""
         if not is_tracking:
             self._good_since_ns = None
         elif self._good_since_ns is None or dt_ms == 0:
@@ -164,7 +164,7 @@ class HealthStream:
             counts.innovation_m_sum = figures.get("fix_innovation_m", 0.0)
             counts.exceeded = int(innovation > CHI2_6_0999)
         if self._has_fix and is_wrong(figures.get("fix_innovation_m", 0.0)):
-            # The estimate was wrong before, or is now. Jumps without 5 s between them are one; one within a failure belongs to it.
+            # The estimate was wrong before, or is now. Jumps within 5 s count once; a jump within a failure belongs to it.
             is_new = self._jump_ns is None or stamp_ns - self._jump_ns >= GOOD_S * 1e9
             counts.jumps = int(is_new and not self.in_failure)
             self._jump_ns = stamp_ns

@@ -1,4 +1,4 @@
-"""Key performance indicators of a fleet: counters that add up, and rates, shares and intervals of them, also as text. Pure.
+"""Key performance indicators of a fleet: additive counters, and rates, shares and intervals of them, also as text. Pure.
 
 A robot-day is 16 h of driving. Intervals hold the true value with 95 %.
 """
@@ -12,19 +12,19 @@ ROBOT_DAY_S = 16 * 3600.0
 HOUR_NS = 3_600_000_000_000
 _TAIL = 0.05
 LEAST_ROBOT_DAYS = 0.1
-"""Below it (96 minutes of driving) one failure would read as ten or more per robot-day: counts are shown, no rate."""
+"""Below it (96 minutes of driving) one failure would mean ten or more per robot-day: counts are shown, but no rate."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """Sums over some reports; two of them add up. Times in milliseconds, so that sums are exact.
+    """Additive sums over reports. Times in milliseconds, so that sums are exact.
 
-    observed, driving: time that reports cover, and of it with the wheels turning; after_fix: since the run's first fix, localised: of it
-    TRACKING; usable: with a position that may be relied upon. failures: reported ones; suspected: those that are estimates of silent ones;
-    blind_failures: those of the reported that statuses show too; blind_seen: such failures that the server saw in the statuses itself.
-    exceeded: innovations beyond their 99.9 % bound; jumps: fixes more than 0.30 m from where the robot took itself to be; docks_wrong:
-    arrivals where the estimate was so far off. judged: driving time, also at an unknown speed, of which it is known how much was localised;
-    found: that. continued: failures of an earlier hour that were running when the hour began, of sums over several hours the first one.
+    observed: time covered by reports; driving: the part with wheels turning; after_fix: since the run's first fix; localised: the part
+    TRACKING; usable: with a reliable position. failures: reported ones; suspected: reported estimates of silent ones;
+    blind_failures: reported ones that statuses show too; blind_seen: such failures seen by the server in the statuses.
+    exceeded: innovations beyond their 99.9 % bound; jumps: fixes more than 0.30 m from the estimated position; docks_wrong:
+    arrivals with the same error. judged: driving time, also at an unknown speed, with known localisation; found: the localised part
+    of it. continued: failures from an earlier hour still running at the start of the hour; of sums over several hours the first one.
     """
 
     reports: int = 0
@@ -70,25 +70,25 @@ class Counters:
 
     @property
     def silent_estimated(self) -> int:
-        """Silent failures as far as they can be guessed: what robots suspect or their fixes show, and docks that were elsewhere.
+        """Estimated silent failures: those suspected by robots or shown by their fixes, and docks at the wrong place.
 
-        Robots suspect what their fixes show, so that one of the two is counted, whichever is more.
+        Robots suspect what their fixes show, so only the larger of the two counts.
         """
         return max(self.suspected, self.jumps) + self.docks_wrong
 
     @property
     def unreported_blindness(self) -> int:
-        """Failures in the statuses, blindness and robots that do not find themselves, which were not reported (yet)."""
+        """Failures in the statuses (blindness, unsuccessful search for a position) that were not reported (yet)."""
         return max(0, self.blind_seen - self.blind_failures)
 
     @property
     def position_failures(self) -> int:
-        """Failures that began: reported ones, and those that only the statuses show."""
+        """Failures that began: reported ones, and those shown only by the statuses."""
         return self.failures + self.unreported_blindness
 
     @property
     def events(self) -> int:
-        """Everything that speaks against a map: failures, blindness not reported, silent ones as estimated."""
+        """All evidence against a map: failures, unreported blindness, estimated silent failures."""
         return self.position_failures + self.silent_estimated
 
 
@@ -97,7 +97,7 @@ COUNTER_COLUMNS = tuple(field.name for field in fields(Counters))
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Events per robot-day with the interval that holds the true rate with 95 %; None where nothing was driven."""
+    """Events per robot-day with the 95 % interval of the true rate; None without driving."""
 
     events: int
     robot_days: float
@@ -108,7 +108,7 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """`hits` of `tries`, with the interval that holds the true share with 95 %; None without tries."""
+    """`hits` of `tries`, with the 95 % interval of the true share; None without tries."""
 
     hits: int
     tries: int
@@ -119,12 +119,11 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Kpis:
-    """Key performance indicators of some counters; None where nothing was counted.
+    """Key performance indicators of some counters; None without counts.
 
     localised_share_of_all: of all driving time; localised_share: of the time since each run's first fix. not_localised_h: driving.
-    failures: those that began, reported or seen in the statuses; failures_running: those that ran before, and still did when the time of
-    these figures began. silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: those of the
-    failures that no robot reported (yet).
+    failures: those that began, reported or seen in the statuses; failures_running: those still running at the start of the period.
+    silent_estimated is an estimate, not a count: robots do not know the truth. unreported_blindness: failures that no robot reported (yet).
     """
 
     observed_h: float
@@ -148,7 +147,7 @@ class Kpis:
 
 
 def kpis(counts: Counters) -> Kpis:
-    """The indicators of some counters."""
+    """Return the indicators of some counters."""
     arrived = counts.frames + counts.frames_dropped
     return Kpis(
         observed_h=counts.observed_ms / 3.6e6,
@@ -173,7 +172,7 @@ def kpis(counts: Counters) -> Kpis:
 
 
 def rate(events: int, robot_days: float) -> Rate:
-    """Events per robot-day with its interval."""
+    """Return events per robot-day with their interval."""
     if robot_days <= 0:
         return Rate(events, 0.0, None, None, None)
     low, high = poisson_interval(events)
@@ -181,7 +180,7 @@ def rate(events: int, robot_days: float) -> Rate:
 
 
 def poisson_interval(events: int) -> tuple[float, float]:
-    """The exact 95 % interval of the mean of a Poisson count; one-sided (0 to 3.0, the rule of three) where none was seen.
+    """Return the exact 95 % interval of the mean of a Poisson count; one-sided (0 to 3.0, the rule of three) for zero events.
 
     Source: Garwood 1936, by quantiles of the gamma distribution.
     """
@@ -193,7 +192,7 @@ def poisson_interval(events: int) -> tuple[float, float]:
 
 
 def share(hits: int, tries: int) -> Share:
-    """A share with its exact interval; one-sided where no try or every try hit.
+    """Return a share with its exact interval; one-sided if no try or every try hit.
 
     Source: Clopper and Pearson 1934, by quantiles of the beta distribution.
     """
@@ -207,26 +206,26 @@ def share(hits: int, tries: int) -> Share:
 
 
 def is_telling(found: Rate) -> bool:
-    """Whether enough was driven to give a rate."""
+    """True if there was enough driving to give a rate."""
     return found.robot_days >= LEAST_ROBOT_DAYS
 
 
 def figure(value: float | None) -> str:
-    """A rate with two digits, without exponent."""
+    """Return a rate with two digits, without exponent."""
     if value is None:
         return "–"
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def format_rate(found: Rate) -> str:
-    """A rate with the interval that holds the true one with 95 %; a dash where too little was driven."""
+    """Return a rate with its 95 % interval as text; a dash with too little driving."""
     if not is_telling(found):
         return "–"
     return f"{figure(found.per_robot_day)} ({figure(found.low)} to {figure(found.high)})"
 
 
 def driven_words(robot_days: float) -> str:
-    """How much was driven: minutes, hours or robot-days."""
+    """Return the driving time as text: minutes, hours or robot-days."""
     hours = robot_days * ROBOT_DAY_S / 3600
     if hours < 1:
         return f"{hours * 60:.0f} min of driving"
@@ -234,7 +233,7 @@ def driven_words(robot_days: float) -> str:
 
 
 def hour_of(stamp_ns: int) -> int:
-    """Hours since 1970, the unit in which sums are kept."""
+    """Return hours since 1970, the unit of stored sums."""
     return stamp_ns // HOUR_NS
 
 

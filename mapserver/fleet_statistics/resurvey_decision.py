@@ -1,7 +1,7 @@
-"""Tiles that should be surveyed again, and a route through them. Pure.
+"""Tiles to resurvey, and a route through them. Pure.
 
-A tile is listed where robots fail clearly more often than before (or, without a before, than elsewhere on the site), or where they
-find clearly fewer of the landmarks that they look for.
+A tile is listed if robots fail clearly more often there than before (or, without earlier data, than elsewhere on the site), or if they
+find clearly fewer of the expected landmarks.
 """
 
 import math
@@ -16,15 +16,14 @@ from fleetmap.config import Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, kpis, rate
 
 _ALPHA = 0.01  # probability that any tile of an unchanged site is listed
-_MIN_LANDMARKS = 2000  # looked for in both periods, for their share to count
+_MIN_LANDMARKS = 2000  # expected in both periods, for their share to count
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class ResurveySettings(Section, frozen=True):
-    """What is recent, what is before, and how much worse the recent must be.
+    """Recent and earlier periods, and thresholds of worsening.
 
-    rising_ratio: how often the rate before must be exceeded, with at most a chance of 1 % that it is not; fading: by how much the
-    share of found landmarks fell.
+    rising_ratio: factor by which the earlier rate must be exceeded, at a significance of 1 %; fading: drop of the share of found landmarks.
     """
 
     recent_days: Positive = 2.0
@@ -36,9 +35,9 @@ class ResurveySettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class TileConcern:
-    """A tile "x,y" that should be surveyed again. landmarks_seen_*: share found of those looked for, None where none was.
+    """A tile "x,y" to resurvey. landmarks_seen_*: found share of expected landmarks, None without any.
 
-    name: as people know the tile, by the areas that it lies in.
+    name: the tile's name by its areas.
     """
 
     tile: str
@@ -52,7 +51,7 @@ class TileConcern:
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A place to drive to, in `map`."""
+    """A position to drive to, in `map`."""
 
     tile: str
     x_map_m: float
@@ -64,7 +63,7 @@ class Waypoint:
 def concerns(
     recent: Mapping[str, Counters], before: Mapping[str, Counters], settings: ResurveySettings
 ) -> list[TileConcern]:
-    """The tiles to survey again, the worst first. recent, before: sums by tile."""
+    """Return the tiles to resurvey, the most urgent first. recent, before: sums by tile."""
     total = Counters()
     for counts in recent.values():
         total.add(counts)
@@ -81,14 +80,14 @@ def concerns(
 
 
 def concern_of(tile: str, reasons: list[str], now: Counters, then: Counters) -> TileConcern:
-    """A tile with what was counted in it, recently and before."""
+    """Return a tile with its counts, recent and before."""
     old, new = kpis(then).landmarks_seen_share, kpis(now).landmarks_seen_share
     both = (rate(now.events, now.robot_days), rate(then.events, then.robot_days))
     return TileConcern(tile, reasons, *both, new, old, f"tile {tile}")
 
 
 def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, float]]) -> list[Waypoint]:
-    """A way through the tiles, each time to the nearest that is left, from the worst on. places: where to go in each tile."""
+    """Return a route through the tiles, always to the nearest remaining one, from the worst on. places: target in each tile."""
     left = [concern for concern in concerned if concern.tile in places]
     way: list[Waypoint] = []
     while left:
@@ -100,7 +99,7 @@ def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, fl
 
 
 def route_csv(way: Sequence[Waypoint]) -> str:
-    """The route as CSV: one waypoint a line, metres in `map`."""
+    """Return the route as CSV: one waypoint a line, metres in `map`."""
     lines = ["number,x_map_m,y_map_m,tile,reason"]
     for number, point in enumerate(way, start=1):
         reason = point.reason.replace('"', "'")
@@ -109,7 +108,7 @@ def route_csv(way: Sequence[Waypoint]) -> str:
 
 
 def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str, Any]:
-    """The route in GeoJSON's form (RFC 7946), with metres in `map` in the place of degrees."""
+    """Return the route as GeoJSON (RFC 7946), with metres in `map` instead of degrees."""
     points: list[dict[str, Any]] = [
         {
             "type": "Feature",
@@ -125,7 +124,7 @@ def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str,
 
 
 def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySettings, tests: int) -> list[str]:
-    """The exact conditional test of two Poisson rates, with Bonferroni's correction over the site's tiles.
+    """Apply the exact conditional test of two Poisson rates, with Bonferroni's correction over the site's tiles.
 
     Source: Przyborowski and Wilenski 1940.
     """

@@ -1,4 +1,4 @@
-"""Calibration of a robot's cameras as its health reports state it. Pure."""
+"""Calibration of a robot's cameras from its health reports. Pure."""
 
 import math
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ PARAMETERS = {
     "camera_height_m": "cameras, height",
     "time_offset_s": "time offset",
 }
-"""Parameters by the name of their figure, with words for people. Robots may send others, which are left out."""
+"""Parameters by the name of their figure, with display names. Others sent by robots are left out."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFigure:
-    """One parameter: by how much the map says that it differs from the robot's calibration, in the unit that its name ends with.
+    """One parameter: its difference to the robot's calibration by the map, in the unit at the end of its name.
 
-    name: a key of PARAMETERS. is_drifted: whether the robot says that this is more than chance and more than may pass.
+    name: a key of PARAMETERS. is_drifted: True if the robot reports a significant difference above the tolerance.
     """
 
     name: str
@@ -44,7 +44,7 @@ class CalibrationFigure:
 
 
 def calibration_figures(health: Mapping[str, Any] | None) -> tuple[CalibrationFigure, ...]:
-    """The parameters of a robot's last health report, as plain values; empty for a robot that does not report them."""
+    """Return the parameters of a robot's last health report, as plain values; empty for a robot that does not report them."""
     metrics = (health or {}).get("metrics") or {}
     drifted = metrics.get(DRIFTS)
     names = set(drifted.split(",")) if isinstance(drifted, str) else set()

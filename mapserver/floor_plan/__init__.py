@@ -1,1 +1,1 @@
-"""The drawing of a building: where a site's map lies in it, and the areas that people have names for."""
+"""The drawing of a building: the pose of a site's map in it, and named areas."""

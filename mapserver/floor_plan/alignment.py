@@ -1,4 +1,4 @@
-"""Where a site's map lies in the drawing of its building, as the store keeps it. Pure."""
+"""The pose of a site's map in the drawing of its building, as stored. Pure."""
 
 from typing import Annotated
 
@@ -12,13 +12,13 @@ from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import BuildingFrame
 
 PLAN = "plan"
-"""Kind of a site's file in the store, which robots do not get."""
+"""Kind of a site's file in the store that is not sent to robots."""
 
 
 class Alignment(msgspec.Struct, frozen=True, kw_only=True):
-    """What `mapserver align` found. metres_per_unit: of the drawing, whose units are pixels.
+    """Result of `mapserver align`. metres_per_unit: of the drawing, whose units are pixels.
 
-    off_m: what is left at each pin; plan: the file's name, for people.
+    off_m: residual at each pin; plan: the file's name, for operators.
     """
 
     frame: BuildingFrame
@@ -29,12 +29,12 @@ class Alignment(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def encode_alignment(alignment: Alignment) -> bytes:
-    """As JSON."""
+    """Encode as JSON."""
     return to_json(alignment, order="deterministic")
 
 
 def decode_alignment(data: bytes) -> Alignment:
-    """What `encode_alignment` made. StoreError for anything else."""
+    """Decode the result of `encode_alignment`. StoreError for invalid data."""
     try:
         return msgspec.json.decode(data, type=Alignment)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
@@ -42,14 +42,14 @@ def decode_alignment(data: bytes) -> Alignment:
 
 
 def map_corners_m(manifest: Manifest) -> Array:
-    """(4, 2) corners of the rectangle that a version's tiles cover; one tile at the origin for a version without any."""
+    """Return (4, 2) corners of the rectangle covered by a version's tiles; one tile at the origin for a version without tiles."""
     cells = np.array([(tile.x, tile.y) for tile in manifest.tiles] or [(0, 0)], float)
     (x0, y0), (x1, y1) = cells.min(axis=0) * manifest.tile_size_m, (cells.max(axis=0) + 1) * manifest.tile_size_m
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
 def reference_coordinates(frame: BuildingFrame, level: str, corners_m: Array) -> str:
-    """The block of an Open-RMF fleet adapter's config.yaml: four points in both frames, from which it fits the transform."""
+    """Return the block of an Open-RMF fleet adapter's config.yaml: four points in both frames, from which it fits the transform."""
     points_map = np.concatenate([corners_m, np.zeros((len(corners_m), 1))], axis=1)
     points_building = transform_points(frame.building_from_map, points_map)
 

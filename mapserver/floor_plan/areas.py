@@ -1,6 +1,6 @@
-"""The areas of a site that people have names for, such as aisles: read from GeoJSON, asked by position or by tile. Pure.
+"""Named areas of a site, such as aisles: read from GeoJSON, queried by position or by tile. Pure.
 
-GeoJSON (RFC 7946) means degrees of WGS 84. Here coordinates are metres, and a member of its own says in which frame.
+GeoJSON (RFC 7946) uses degrees of WGS 84. Here coordinates are metres, and the member "frame" names their frame.
 """
 
 import re
@@ -18,16 +18,16 @@ from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 
 OUTSIDE = "outside"
-"""Key of what no area and no tile holds."""
+"""Key of counts outside of all areas and tiles."""
 
 MAX_AREAS_BYTES = 8 << 20
 _MAX_AREAS, _MAX_CORNERS, _MAX_RING = 2000, 50_000, 2000
 _MAX_NAME = 64
 _MAX_M = 1e6
-_SAMPLES = 16  # a tile's area is known by as many points each way
-_LEAST_SHARE = 0.1  # of a tile, for an area to give it its name
+_SAMPLES = 16  # sample points of a tile each way
+_LEAST_SHARE = 0.1  # smallest share of a tile for an area to name it
 _NAMED = 3
-_MASK_WORDS = 'where it is a mask "mask": "keep-out", or "mask": "speed" and "percent": 1 to 99'
+_MASK_WORDS = 'for a mask "mask": "keep-out", or "mask": "speed" and "percent": 1 to 99'
 _TILE = re.compile(r"\btile (-?\d{1,10}),(-?\d{1,10})\b", re.ASCII)
 
 
@@ -40,7 +40,7 @@ class _MultiPolygon(msgspec.Struct, tag_field="type", tag="MultiPolygon"):
 
 
 class MaskKind(StrEnum):
-    """What an area does to a planner: no robot may be in it, or it drives there at a share of its speed."""
+    """Effect of an area on a planner: forbidden, or driven at a share of the speed."""
 
     KEEP_OUT = "keep-out"
     SPEED = "speed"
@@ -66,9 +66,9 @@ class _Collection(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """rings: (V, 2) corners in `map`, metres, not repeated at the end; a place is inside by the even-odd rule over all rings.
+    """rings: (V, 2) corners in `map`, metres, not repeated at the end; inside by the even-odd rule over all rings.
 
-    mask: what it is to planners, None for nothing. percent: of the robot's largest speed, in an area of the kind SPEED.
+    mask: effect on planners, None if absent. percent: of the robot's largest speed, in an area of the kind SPEED.
     """
 
     name: str
@@ -78,24 +78,24 @@ class Area:
 
     @property
     def size_m2(self) -> float:
-        """Sum over the outlines; holes are small beside them."""
+        """Sum over the outlines; holes are neglected."""
         return max(abs(_doubled_area(ring)) for ring in self.rings) / 2
 
     def holds(self, points_m: Array) -> NDArray[np.bool_]:
-        """(N,) of points (N, 2)."""
+        """Return a mask (N,) of the points (N, 2) inside."""
         return inside_rings(points_m, self.rings)
 
 
 @dataclass(frozen=True, slots=True)
 class Areas:
-    """Areas, the smallest first: of those that hold a place it is the one that people mean."""
+    """Areas, the smallest first: the smallest one that contains a position gives its name."""
 
     areas: tuple[Area, ...] = ()
     _boxes_m: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @classmethod
     def of(cls, areas: Sequence[Area]) -> "Areas":
-        """In order."""
+        """Sort the areas."""
         ordered = tuple(sorted(areas, key=lambda area: (area.size_m2, area.name)))
         corners = [np.concatenate(area.rings) for area in ordered]
         boxes = [(*points.min(axis=0), *points.max(axis=0)) for points in corners]
@@ -106,11 +106,11 @@ class Areas:
 
     @property
     def names(self) -> list[str]:
-        """In order of the alphabet."""
+        """Names in alphabetical order."""
         return sorted(area.name for area in self.areas)
 
     def at(self, x_m: float, y_m: float) -> str | None:
-        """Name of the area that holds a place in `map`; None outside of all, and for what is no number."""
+        """Return the name of the area at a position in `map`; None outside of all, and for NaN."""
         point = np.array([[x_m, y_m]])
         for area in self._near((x_m, y_m, x_m, y_m)):
             if area.holds(point)[0]:
@@ -118,7 +118,7 @@ class Areas:
         return None
 
     def of_tile(self, tile: tuple[int, int], size_m: float) -> list[str]:
-        """Names of the areas that hold a tenth of a tile or more, those with the larger shares first."""
+        """Return the names of the areas that cover a tenth of a tile or more, the largest share first."""
         corner = np.array(tile) * size_m
         steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * size_m
         points = corner + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
@@ -130,19 +130,19 @@ class Areas:
         return sorted((n for n, share in shares.items() if share >= _LEAST_SHARE), key=lambda n: (-shares[n], n))
 
     def tile_words(self, tile: tuple[int, int], size_m: float) -> str:
-        """A tile as people know it: "aisle 5 (tile 3,-2)"; "tile 3,-2" where no area is."""
+        """Return a tile's display name: "aisle 5 (tile 3,-2)"; "tile 3,-2" without an area."""
         names, plain = self.of_tile(tile, size_m), f"tile {tile[0]},{tile[1]}"
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         return f"{', '.join(names[:_NAMED])}{more} ({plain})" if names else plain
 
     def name_tiles(self, text: str, size_m: float) -> str:
-        """A sentence with every "tile 3,-2" in it as `tile_words`."""
+        """Replace every "tile 3,-2" in a sentence as in `tile_words`."""
         if not self.areas:
             return text
         return _TILE.sub(lambda found: self.tile_words((int(found[1]), int(found[2])), size_m), text)
 
     def geojson(self, site: str) -> dict[str, Any]:
-        """All areas in `map`; a polygon for each ring, so that holes are listed as such."""
+        """Return all areas in `map`; a polygon for each ring, holes included."""
         features = [
             {
                 "type": "Feature",
@@ -155,16 +155,16 @@ class Areas:
         return {"type": "FeatureCollection", "site": site, "frame": "map", "units": "metres", "features": features}
 
     def _near(self, box_m: tuple[float, ...]) -> list[Area]:
-        """Areas whose boxes meet a box (low x, low y, high x, high y)."""
+        """Return the areas whose boxes meet a box (low x, low y, high x, high y)."""
         low, high = self._boxes_m[:, :2], self._boxes_m[:, 2:]
         meets = ((low <= np.array(box_m[2:])) & (high >= np.array(box_m[:2]))).all(axis=1)
         return [self.areas[n] for n in np.flatnonzero(meets)]
 
 
 def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
-    """The areas of a file. building: where the map lies in it, for areas that are drawn there.
+    """Read the areas of a file. building: the map's pose in it, for areas drawn there.
 
-    Raises UsageError, naming the area, for anything that is not closed, simple, named once and within the limits.
+    Raises UsageError, naming the area, for polygons that are not closed or simple, repeated names and exceeded limits.
     """
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"areas of more than {MAX_AREAS_BYTES} bytes; draw them with fewer corners")
@@ -177,11 +177,11 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
     if collection.frame is None:
         words = 'add "frame": "map" or "frame": "building" beside "features", and write metres'
         raise UsageError(
-            f"areas: the file does not say where its coordinates are (GeoJSON alone means degrees); {words}"
+            f"areas: the file does not name the frame of its coordinates (plain GeoJSON means degrees); {words}"
         )
     if collection.frame == "building" and building is None:
         raise UsageError(
-            "areas drawn in the building need the map's place in it; run `mapserver align --plan FILE --pin ...` first"
+            "areas drawn in the building need the map's pose in it; run `mapserver align --plan FILE --pin ...` first"
         )
     map_from_building = None
     if collection.frame == "building" and building is not None:
@@ -195,7 +195,7 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
         corners += sum(len(ring) for ring in area.rings)
         if area.name in areas:
             raise UsageError(
-                f"area {area.name!r} is there twice; give each its own name, or make one MultiPolygon of them"
+                f"area {area.name!r} occurs twice; give each its own name, or make one MultiPolygon of them"
             )
         if corners > _MAX_CORNERS:
             raise UsageError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
@@ -223,7 +223,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:
-    """(V, 2) without the repeated end."""
+    """Return (V, 2) without the repeated end."""
     if len(positions) < 4 or any(len(position) not in (2, 3) for position in positions):
         raise UsageError(f"{where}: a ring has 4 or more positions [x, y], the last one as the first")
     if len(positions) > _MAX_RING:
@@ -238,7 +238,7 @@ def _ring(positions: list[list[float]], where: str) -> Array:
         raise UsageError(f"{where}: two corners one after the other are the same; remove one")
     crossing = _crossing(ring)
     if crossing is not None:
-        raise UsageError(f"{where}: its outline crosses itself near {ring[crossing].tolist()}; draw it anew there")
+        raise UsageError(f"{where}: its outline crosses itself near {ring[crossing].tolist()}; redraw it there")
     if abs(_doubled_area(ring)) < 2e-4:
         raise UsageError(f"{where} is a line without any area; give it a width")
     return ring
@@ -250,7 +250,7 @@ def _doubled_area(ring: Array) -> float:
 
 
 def _crossing(ring: Array) -> int | None:
-    """A corner whose edge meets another edge that is not its neighbour, None in a simple ring."""
+    """Return a corner whose edge meets another edge that is not its neighbour, None in a simple ring."""
     following = np.roll(ring, -1, axis=0)
 
     def side(start: Array, end: Array, point: Array) -> Array:
@@ -267,7 +267,7 @@ def _crossing(ring: Array) -> int | None:
         in_line = np.all([values == 0 for values in sides], axis=0)
         low, high = np.minimum(a, b), np.maximum(a, b)
         apart |= in_line & ((np.maximum(c, d) < low) | (np.minimum(c, d) > high)).any(axis=1)
-        # Neighbours share a corner; they meet elsewhere only where one runs back along the other.
+        # Neighbours share a corner; they meet elsewhere only if one runs back along the other.
         shares = (others == n + 1) | ((n == 0) & (others == count - 1))
         runs_back = in_line & (((b - a) * (d - c)).sum(axis=1) < 0)
         if (np.where(shares, runs_back, ~apart)).any():

@@ -1,7 +1,7 @@
-"""Where the map lies in a drawing, from points that are known in both. Pure.
+"""The map's pose in a drawing, from points known in both. Pure.
 
-A plane is that of the complex numbers here: x + iy. The building's frame has its origin in the drawing's upper left corner, x to the right,
-y up (so it is negative in the picture), as Open-RMF's traffic editor has it.
+Points of the plane are complex numbers here: x + iy. The building's frame has its origin in the drawing's upper left corner, x right,
+y up (negative in the picture), as in Open-RMF's traffic editor.
 """
 
 import re
@@ -18,9 +18,9 @@ from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
 
-PIN_SIGMA_M = 0.03  # of a click and of the map's side together, each axis; more where the pins themselves show more
+PIN_SIGMA_M = 0.03  # of click and map point together, each axis; larger if the pins' residuals are
 MAX_PINS = 100
-_MOST_OFF_M = ERROR_LIMIT_M  # a pin further off would make positions in the building wrong by what counts as a failure
+_MOST_OFF_M = ERROR_LIMIT_M  # a larger residual would make positions in the building off by the failure limit
 _LEAST_APART_M = 1.0
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _PIN = re.compile(rf"(.{{1,80}}?)=({_NUMBER}),({_NUMBER}):({_NUMBER}),({_NUMBER})", re.ASCII)
@@ -29,7 +29,7 @@ _Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Pin:
-    """One point. drawing: as it was said, for `fit_pins` right and up in the drawing's units, of a picture from its upper left corner."""
+    """One point. drawing: as given, for `fit_pins` right and up in the drawing's units, of a picture from its upper left corner."""
 
     name: str
     drawing: tuple[float, float]
@@ -38,9 +38,9 @@ class Pin:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Where the map lies. off_m: what is left at each pin; far_sigma_m: standard deviation at the map's furthest corner.
+    """The map's pose. off_m: residual at each pin; far_sigma_m: standard deviation at the map's furthest corner.
 
-    is_checked: whether the pins could show that the drawing is mirrored or a pin wrong.
+    is_checked: True if the pins could reveal a mirrored drawing or a wrong pin.
     """
 
     frame: BuildingFrame
@@ -51,7 +51,7 @@ class Fit:
 
 
 def parse_pin(text: str) -> Pin:
-    """NAME=px,py:mx,my. UsageError for anything else."""
+    """Parse NAME=px,py:mx,my. UsageError for invalid text."""
     match = _PIN.fullmatch(text)
     if match is None or not match[1].isprintable() or not all(isfinite(float(value)) for value in match.groups()[1:]):
         raise UsageError(f"--pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map")
@@ -60,10 +60,10 @@ def parse_pin(text: str) -> Pin:
 
 
 def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array) -> Fit:
-    """Least squares over a rotation, a shift and, without metres_per_unit, a scale. Source: Umeyama 1991, in the plane.
+    """Fit a rotation, a shift and, without metres_per_unit, a scale by least squares. Source: Umeyama 1991, in the plane.
 
-    map_corners_m: (N, 2) what the map covers. UsageError for pins that are too few, too close or contradict each other, which then names
-    the wrong one where it can, and for a mirrored drawing.
+    map_corners_m: (N, 2) extent of the map. UsageError for too few, too close or contradictory pins, naming
+    the wrong one if possible, and for a mirrored drawing.
     """
     _check_names(pins)
     points = np.array([complex(*pin.map_m) for pin in pins])
@@ -74,7 +74,7 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
             f"the pins lie within {apart_m:.2f} m in the map; choose them far apart, in corners of the hall"
         )
     if max(abs(a - b) for a, b in combinations(drawn, 2)) <= 0:
-        raise UsageError("the pins are one and the same point of the plan; choose them far apart")
+        raise UsageError("all pins are the same point of the plan; choose them far apart")
     rotation_scale, shift = _fitted(drawn, points, metres_per_unit)
     scale = 1 / abs(rotation_scale)
     off_m = scale * np.abs(drawn - rotation_scale * points - shift)
@@ -108,7 +108,7 @@ def _check_names(pins: Sequence[Pin]) -> None:
 
 
 def _fitted(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> tuple[complex, complex]:
-    """drawn ~ rotation_scale * points + shift."""
+    """Fit drawn ~ rotation_scale * points + shift."""
     left, right = drawn - drawn.mean(), points - points.mean()
     correlation = complex(np.vdot(right, left))
     if metres_per_unit is None:
@@ -121,18 +121,18 @@ def _fitted(drawn: _Complex, points: _Complex, metres_per_unit: float | None) ->
 
 
 def _offs_m(drawn: _Complex, points: _Complex, metres_per_unit: float | None, chosen: NDArray[np.intp]) -> Array:
-    """What is left at all points after a fit to the chosen ones."""
+    """Return residuals at all points after a fit to the chosen ones."""
     rotation_scale, shift = _fitted(drawn[chosen], points[chosen], metres_per_unit)
     return np.asarray(np.abs(drawn - rotation_scale * points - shift) / abs(rotation_scale))
 
 
 def _contradiction(names: list[str], drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> str:
-    """Why pins do not fit: a mirrored drawing, a wrong scale, one or more wrong pins, or nothing that can be told."""
+    """Return why pins do not fit: a mirrored drawing, a wrong scale, one or more wrong pins, or an unknown cause."""
     everything = np.arange(len(names))
     offs = _offs_m(drawn, points, metres_per_unit, everything)
     worst = int(offs.argmax())
     if _spread_m(points) >= _LEAST_APART_M and _fits(np.conj(drawn), points, metres_per_unit, everything):
-        return "the plan is mirrored: its points fit the map's only as in a mirror; flip the picture, or check the order of x and y"
+        return "the plan is mirrored: its points fit the map only mirrored; flip the picture, or check the order of x and y"
     if metres_per_unit is not None and _fits(drawn, points, None, everything):
         fitting = 1 / abs(_fitted(drawn, points, None)[0])
         return f"the pins fit at {fitting:.5g} metres per unit of the plan, not at {metres_per_unit:.5g}; correct --metres-per-pixel"
@@ -141,8 +141,8 @@ def _contradiction(names: list[str], drawn: _Complex, points: _Complex, metres_p
         wrong = [n for n in everything if n not in agreeing]
         beyond = _offs_m(drawn, points, metres_per_unit, np.array(agreeing))
         named = ", ".join(f"{names[n]} by {beyond[n]:.2f} m" for n in wrong)
-        return f"{len(agreeing)} pins agree, off are: {named}; correct or leave out these"
-    more = "add a fourth, which shows the wrong one" if len(names) == 3 else "check each of them"
+        return f"{len(agreeing)} pins agree, wrong are: {named}; correct or leave out these"
+    more = "add a fourth pin to find the wrong one" if len(names) == 3 else "check each of them"
     return f"the pins contradict each other: {names[worst]} is {offs[worst]:.2f} m off; {more}"
 
 
@@ -151,7 +151,7 @@ def _fits(drawn: _Complex, points: _Complex, metres_per_unit: float | None, chos
 
 
 def _largest_agreeing(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> list[int]:
-    """The most pins that fit together, found from every pair."""
+    """Return the largest set of pins that fit together, searched from every pair."""
     best: list[int] = []
     for pair in combinations(range(len(points)), 2):
         if abs(points[pair[0]] - points[pair[1]]) < _LEAST_APART_M or drawn[pair[0]] == drawn[pair[1]]:
@@ -163,7 +163,7 @@ def _largest_agreeing(drawn: _Complex, points: _Complex, metres_per_unit: float 
 
 
 def _covariance(drawn: _Complex, points: _Complex, fitted: tuple[complex, bool], off_m: Array) -> tuple[Array, float]:
-    """Of x, y, yaw and, where it is free, the scale; and the standard deviation of a pin, each axis."""
+    """Return the covariance of x, y, yaw and, if free, the scale; and the standard deviation of a pin, each axis."""
     rotation_scale, is_free = fitted
     turn = rotation_scale / abs(rotation_scale)
     columns = [np.full(len(points), -1 + 0j), np.full(len(points), -1j), -1j * turn * points]
@@ -171,21 +171,21 @@ def _covariance(drawn: _Complex, points: _Complex, fitted: tuple[complex, bool],
     rows = np.concatenate([np.real(columns), np.imag(columns)], axis=1).T
     freedom = len(rows) - rows.shape[1]
     variance = PIN_SIGMA_M**2 if freedom <= 0 else max(PIN_SIGMA_M**2, float((off_m**2).sum()) / freedom)
-    # Scaled to columns of one size: pixels are thousands, and the inverse would lose their digits.
+    # Scaled to columns of similar size: pixels are thousands, and the inverse would lose digits.
     sizes = np.linalg.norm(rows, axis=0)
     inverse = np.linalg.pinv((rows / sizes).T @ (rows / sizes), rcond=1e-13) / np.outer(sizes, sizes)
     return variance * inverse, float(np.sqrt(variance / len(points)))
 
 
 def _position_sigma_m(cov: Array, turn: complex, point: complex) -> float:
-    """Of a point of the map in the building, the larger axis."""
+    """Return it for a point of the map in the building, the larger axis."""
     moved = 1j * turn * point
     jacobian = np.array([[1.0, 0.0, moved.real], [0.0, 1.0, moved.imag]])
     return float(np.sqrt(np.linalg.eigvalsh(jacobian @ cov[:3, :3] @ jacobian.T)[-1]))
 
 
 def _spread_m(points: _Complex) -> float:
-    """How far points lie to both sides of the line that fits them best; without that a mirrored drawing looks like a turned one."""
+    """Return the spread of points on both sides of their best line; without it a mirrored drawing looks like a rotated one."""
     flat = np.stack([points.real, points.imag], axis=1)
     _, _, axes = np.linalg.svd(flat - flat.mean(axis=0))
     across = (flat - flat.mean(axis=0)) @ axes[-1]

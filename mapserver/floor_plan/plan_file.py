@@ -1,4 +1,4 @@
-"""The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), looked at before it is decoded."""
+"""The file of a plan: a picture (PNG, JPEG, TIFF, BMP, PGM), checked before it is decoded."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +17,14 @@ MAX_PLAN_PIXELS = 100_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlanFile:
-    """data: as it came. grey (H, W)."""
+    """data: the file's bytes. grey (H, W)."""
 
     name: str
     data: bytes
     grey: NDArray[np.uint8]
 
     def drawn(self, pins: list[Pin]) -> list[Pin]:
-        """Right and up. UsageError for a pin beside the picture."""
+        """Convert pins to axes right and up. UsageError for a pin outside the picture."""
         height, width = self.grey.shape
         for pin in pins:
             if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
@@ -36,12 +36,12 @@ class PlanFile:
 
 
 def upwards(pins: list[Pin]) -> list[Pin]:
-    """Pins that were said in a picture, where down is positive."""
+    """Convert pins from a picture's axes, where y points down."""
     return [Pin(pin.name, (pin.drawing[0], -pin.drawing[1]), pin.map_m) for pin in pins]
 
 
 def read_plan(path: Path) -> PlanFile:
-    """The plan of a file; errors as of `decode_plan`."""
+    """Read the plan in a file; errors as of `decode_plan`."""
     with (
         disk_errors(f"--plan {path} cannot be read", "check the path and its rights", UsageError),
         path.open("rb") as file,
@@ -51,14 +51,14 @@ def read_plan(path: Path) -> PlanFile:
 
 
 def decode_plan(name: str, data: bytes) -> PlanFile:
-    """The plan of a file's bytes. UsageError for what is none, is too large, or is damaged."""
+    """Decode the plan in a file's bytes. UsageError for an unknown format, a too large or a damaged file."""
     if len(data) > MAX_PLAN_BYTES:
         raise UsageError(f"--plan {name} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
     if name.lower().endswith(".dxf"):
-        raise UsageError(f"--plan {name}: DXF is not read; save the drawing as a PNG picture and align it by --pin")
+        raise UsageError(f"--plan {name}: DXF is not supported; save the drawing as PNG and align it by --pin")
     size = image_size(data)
     if size is None:
-        raise UsageError(f"--plan {name} is no PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
+        raise UsageError(f"--plan {name} is not a PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
     if not 0 < size[0] * size[1] <= MAX_PLAN_PIXELS:
         raise UsageError(
             f"--plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller"

@@ -1,4 +1,4 @@
-"""Polygons that people want surveyed again, as a site keeps them, and how much of one a survey has covered. Pure."""
+"""Polygons requested for a new survey, as stored for a site, and the covered share of one. Pure."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,19 +10,19 @@ import scipy
 from fleetmap.geometry import Array, inside_rings
 
 KIND = "survey request "
-"""Begins the kind of a request among the files of a site; its id follows."""
+"""Prefix of a request's kind among the files of a site; its id follows."""
 
 COVERED_SHARE = 0.9
-"""Of a request's places: so many near what was driven are a survey of it."""
+"""Covered share of a request's places above which it counts as surveyed."""
 
 _SAMPLES = 8  # of a tile's side
 _EDGE = 256  # of an edge: two metres of the longest
-_NEAR_M = 2.0  # the other lane of an aisle, not the next aisle
+_NEAR_M = 2.0  # includes the other lane of an aisle, but not the next aisle
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyRequest:
-    """Who asked when (nanoseconds since 1970) and why; corners in `map`, the first not repeated at the end."""
+    """Author, time (nanoseconds since 1970) and reason of a request; corners in `map`, the first not repeated at the end."""
 
     id: str
     asked_ns: int
@@ -31,7 +31,7 @@ class SurveyRequest:
     corners_map_m: list[list[float]]
 
     def tiles(self, size_m: float) -> list[tuple[int, int]]:
-        """Tiles that the polygon lies in, in order."""
+        """Return the tiles that the polygon touches, in order."""
         ring = np.array(self.corners_map_m)
         low, high = ring.min(axis=0), ring.max(axis=0)
         step = size_m / _SAMPLES
@@ -43,7 +43,7 @@ class SurveyRequest:
         return sorted({(int(x), int(y)) for x, y in np.floor(points / size_m)})
 
     def covered_share(self, places_map_m: Array, driven_map_m: Array) -> float:
-        """The share of places (K, 2) in the polygon that lie within 2 m of somewhere that was driven (F, 2); 0 without places in it."""
+        """Return the share of places (K, 2) in the polygon within 2 m of a driven position (F, 2); 0 without places in it."""
         inside = places_map_m[inside_rings(places_map_m, [np.array(self.corners_map_m)])]
         if not len(inside) or not len(driven_map_m):
             return 0.0
@@ -51,7 +51,7 @@ class SurveyRequest:
 
 
 def read_request(kind: str, data: bytes) -> SurveyRequest:
-    """A request as a site keeps it, under this kind."""
+    """Decode a request stored under this kind."""
     feature: dict[str, Any] = msgspec.json.decode(data)["features"][0]
     ring, who = feature["geometry"]["coordinates"][0], feature["properties"]
     return SurveyRequest(kind.removeprefix(KIND), who["asked_ns"], who["actor"], who["reason"], ring[:-1])

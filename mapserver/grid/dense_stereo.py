@@ -1,4 +1,4 @@
-"""Disparities of whole pictures, and the floor below the camera. Source of the matcher: Hirschmueller 2008, as OpenCV has it."""
+"""Disparities of whole pictures, and the floor height below the camera. Source of the matcher: Hirschmueller 2008, in OpenCV's version."""
 
 from collections.abc import Iterable
 
@@ -21,9 +21,9 @@ _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
 def dense_disparity(
     frame: RectifiedFrame, camera: StereoCamera, settings: StereoSettings
 ) -> tuple[NDArray[np.float32], float]:
-    """(H, W) disparities of the left picture, NaN where unknown, and their standard deviation in pixels.
+    """Return (H, W) disparities of the left picture, NaN if unknown, and their standard deviation in pixels.
 
-    Of the depth sensor where there is one. A pair is matched both ways, and where it shows no texture nothing is known.
+    From the depth sensor if present. A pair is matched in both directions; areas without texture are unknown.
     """
     if frame.disparity_px is not None:
         return frame.disparity_px, settings.depth_sigma_px
@@ -50,15 +50,15 @@ def dense_disparity(
 
 
 def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[np.float32]:
-    """(H, W) the largest disparity around each pixel, 0 where none is known."""
+    """Return (H, W) the largest disparity around each pixel, 0 if unknown."""
     block = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
     return np.asarray(cv2.dilate(np.nan_to_num(disparity_px), block), np.float32)
 
 
 def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
-    """How far below the camera the floor is, from disparities (H, W) and map_from_cam (4, 4) of some views.
+    """Return the distance of the floor below the camera, from disparities (H, W) and map_from_cam (4, 4) of some views.
 
-    In each the height at which most near points below the camera lie; their median, where most views agree on it. None where
+    Per view the most frequent height of near points below the camera; the median, if most views agree. None if
     they do not: the camera is carried by hand, or the map is not level.
     """
     found = []

@@ -1,4 +1,4 @@
-"""Areas with a mask, keep-out and speed, as nav2's costmap filters take them. Pure."""
+"""Areas with a mask, keep-out and speed, for nav2's costmap filters. Pure."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapserver.floor_plan.areas import Areas, MaskKind
 
 _MAX_CELLS = 1 << 25
-# A cell is masked where its middle or one of its corners is.
+# A cell is masked if its middle or one of its corners is inside.
 _WITHIN = np.array([(0.5, 0.5), (0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)]) * CELL_M
 
 
 def check_masks_on_map(areas: Areas, manifest: Manifest) -> None:
-    """Raises UsageError for a mask that touches no tile of a version."""
+    """Raise UsageError for a mask that touches no tile of a version."""
     tiles, size_m = {(tile.x, tile.y) for tile in manifest.tiles}, manifest.tile_size_m
     for area in areas.areas:
         if area.mask is None:
@@ -30,10 +30,10 @@ def check_masks_on_map(areas: Areas, manifest: Manifest) -> None:
 
 
 def mask_grid(areas: Areas, kind: MaskKind) -> OccupancyGrid:
-    """The areas with a mask of one kind as a costmap filter's mask: 100 where none may be, or percent of the speed; 0 elsewhere.
+    """Return the areas with a mask of one kind as a costmap filter's mask: 100 if forbidden, or percent of the speed; 0 elsewhere.
 
-    Cells are those of the grid of planners, cut to the masks; the lowest speed counts where masks overlap. Raises UsageError where the
-    site has none of this kind, and where they span more cells than a planner's map may have.
+    Cells are those of the planner grid, cut to the masks; the lowest speed applies if masks overlap. Raises UsageError if the
+    site has none of this kind, or if they span more cells than a planner's map may have.
     """
     chosen = [area for area in areas.areas if area.mask is kind]
     if not chosen:

@@ -1,4 +1,4 @@
-"""The grid of a site: what surveys saw of each cell, tile by tile, and what it is for a robot of some height."""
+"""The grid of a site: views of each cell by surveys, tile by tile, and its occupancy for a robot of a given height."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLI
 from mapserver.grid.dense_stereo import BLOCK_PX, nearest_around
 
 _RANGE_CELLS = 160  # of a view
-# A view that hits a voxel counts as two that pass it, since passes also come of its rim. What was known stays until two views more
-# speak against it, and is unknown between that and what decides: into a slot that was emptied few views look, and one night must do.
+# A view that hits a voxel counts as two that pass it, since rays also pass at its rim. An earlier state stays until two more views
+# contradict it, and is unknown until the deciding number: few views see into an emptied slot, and one night must suffice.
 HIT, OCCUPIED, _FREE, AGAINST = 2, 4, 4, 2
-# A pixel's depth may be that of anything in the block that was matched, and its ray stands for the pixels up to the next one.
+# A pixel's depth may belong to any point in the matched block, and its ray represents the pixels up to the next one.
 REACH_PX = (BLOCK_PX + core.GRID_RAY_STRIDE_PX) // 2
-_WIDTH_M, _STEP_M = 0.5, 1.5  # of what carries the camera; and between keyframes of one drive
-_SAME_STEPS = 10  # heights that differ by less stay as they were
+_WIDTH_M, _STEP_M = 0.5, 1.5  # width of the camera's carrier; distance of keyframes of one drive
+_SAME_STEPS = 10  # smaller differences of height are ignored
 
 
 @dataclass(frozen=True, slots=True)
 class SessionViews:
     """Counts of the views of one recording, by tile: hits, passes, hidden (N, N, SLICES) and heights (N, N, 4).
 
-    before: what was known. Hidden is what lies behind a thing that came since: it may be as deep as nobody can see.
+    before: earlier state. Hidden lies behind a newly appeared object: its depth may be unobservable.
     """
 
     before: Mapping[tuple[int, int], Counts] = field(default_factory=dict)
@@ -37,7 +37,7 @@ class SessionViews:
     def add(
         self, disparity: tuple[NDArray[np.float32], float], camera: StereoCamera, map_from_cam: Array, floor_m: float
     ) -> None:
-        """One view. disparity: as of `dense_disparity`; floor_m: how far below the camera the floor is."""
+        """Add one view. disparity: as of `dense_disparity`; floor_m: distance of the floor below the camera."""
         size = 2 * _RANGE_CELLS + 1
         at_cells = map_from_cam[:2, 3] / CELL_M
         corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
@@ -57,7 +57,7 @@ class SessionViews:
                 core.add_view(*window, row, column, *self._tile(x, y))
 
     def add_path(self, cameras_map: Array, floor_m: float) -> None:
-        """The way of the camera (K, 2 or more): what carries it has been there, as wide as a person and as high as the camera."""
+        """Add the path of the camera (K, 2 or more): its carrier occupied it, as wide as a person and as high as the camera."""
         steps = np.linalg.norm(np.diff(cameras_map[:, :2], axis=0), axis=1) < _STEP_M
         shares = np.linspace(0.0, 1.0, round(_STEP_M / CELL_M))[:, None, None]
         way = cameras_map[:-1, :2][steps] * (1 - shares) + cameras_map[1:, :2][steps] * shares
@@ -65,7 +65,7 @@ class SessionViews:
         disc = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 1, 2)
         disc = disc[np.linalg.norm(disc[:, 0], axis=1) <= _WIDTH_M / 2]
         keys = np.unique(np.floor((way.reshape(-1, 2) + disc).reshape(-1, 2) / CELL_M).astype(np.int64) @ [1 << 32, 1])
-        x = (keys + (1 << 31)) >> 32  # both halves again: numbers are told apart thirty times faster than rows
+        x = (keys + (1 << 31)) >> 32  # back to two halves: unique on integers is thirty times faster than on rows
         cells = np.stack([x, keys - (x << 32)], axis=-1)
         levels = int(np.clip(np.ceil((floor_m - FLOOR_M) / SLICE_M), 0, SLICES))
         for tile in np.unique(cells // TILE_CELLS, axis=0):
@@ -84,7 +84,7 @@ _Part = tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]
 
 
 def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
-    """The tiles that a window of so many cells each way meets: place, the part of the tile, the part of the window (rows, columns)."""
+    """Yield the tiles that a window of `size` cells overlaps: place, part of the tile, part of the window (rows, columns)."""
     first, last = corner // TILE_CELLS, (corner + size - 1) // TILE_CELLS
     for x in range(int(first[0]), int(last[0]) + 1):
         for y in range(int(first[1]), int(last[1]) + 1):
@@ -97,7 +97,7 @@ def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
 
 
 def _all_around(bits: Counts) -> Counts:
-    """(R, C) the bits that a cell and its eight neighbours share; none at the border."""
+    """Return (R, C) the bits common to a cell and its eight neighbours; none at the border."""
     for axis in (0, 1):
         bits = bits & np.roll(bits, 1, axis) & np.roll(bits, -1, axis)
     bits[[0, -1]], bits[:, [0, -1]] = 0, 0
@@ -105,7 +105,7 @@ def _all_around(bits: Counts) -> Counts:
 
 
 def updated(views: SessionViews) -> Tiles:
-    """The tiles with what a session saw; what it did not see stays as it was, but behind what came since."""
+    """Return the tiles updated by a session; unseen cells are unchanged, except behind new objects."""
     tiles = dict(views.before)
     for place, (hits, passes, hidden, heights) in views.tiles.items():
         old = views.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
@@ -116,7 +116,7 @@ def updated(views: SessionViews) -> Tiles:
         free = ~occupied & ((score <= -_FREE) | (was_free & (score < AGAINST) & ~is_hidden))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
-        # What stood there in some views alone has left no voxel.
+        # An object seen there by a few views only has left no voxel.
         levels = np.where(bits[0] > 0, np.log2(np.maximum(bits[0], 1)).astype(np.int64) + 1, 0)
         top = 1 + ((FLOOR_M + SLICE_M * levels - LOWEST_M) / HEIGHT_STEP_M).astype(np.uint8)
         tiles[place] = np.stack([*bits, np.minimum(low, top), np.minimum(high, top)], axis=-1)
@@ -129,7 +129,7 @@ def _height(old: Counts, new: Counts) -> Counts:
 
 
 def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, OccupancyGrid]:
-    """(2, H, W) metres over the floor of the lowest and the highest surface, NaN where none was seen, and where that lies."""
+    """Return (2, H, W) metres over the floor of the lowest and the highest surface, NaN if unseen, and their grid."""
     layers = []
     for layer in (2, 3):
         codes = whole_grid({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)
@@ -139,5 +139,5 @@ def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, Occupanc
 
 
 def area_m2(grid: OccupancyGrid, state: int) -> float:
-    """Square metres of the cells in this state."""
+    """Return the area in square metres of the cells in this state."""
     return float((grid.cells == state).sum()) * grid.resolution_m**2

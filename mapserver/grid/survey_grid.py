@@ -1,4 +1,4 @@
-"""What a build's recordings add to the grid of the version before: their keyframes are looked at again, where the final map has them."""
+"""Update of the previous version's grid by a build's recordings: their keyframes are matched densely at their final poses."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -19,7 +19,7 @@ _FLOOR_VIEWS = 15
 
 
 class GridSession(NamedTuple):
-    """A recording that is in the map: its name, its survey, and map_from_body (F, 4, 4) of its frames in the final frame."""
+    """A recording in the map: its name, its survey, and map_from_body (F, 4, 4) of its frames in the final frame."""
 
     name: str
     survey: Survey
@@ -27,7 +27,7 @@ class GridSession(NamedTuple):
 
 
 class DepthView(NamedTuple):
-    """A keyframe with its disparities (H, W), their standard deviation, and where it looks from (4, 4)."""
+    """A keyframe with its disparities (H, W), their standard deviation, and its pose (4, 4)."""
 
     keyframe: Keyframe
     disparity_px: NDArray[np.float32]
@@ -36,7 +36,7 @@ class DepthView(NamedTuple):
 
 
 def measures_depth(survey: Survey) -> bool:
-    """Whether its pictures hold depth: the camera of a survey with one camera may have a baseline too, of the adjustment's own."""
+    """True if its pictures contain depth: the camera of a single-camera survey may also have a baseline, set by the adjustment."""
     if not survey.state.camera.baseline_m > 0:
         return False
     frame = survey.odometry.keyframes[0].frame
@@ -44,7 +44,7 @@ def measures_depth(survey: Survey) -> bool:
 
 
 def depth_views(session: GridSession, settings: StereoSettings, chosen: slice) -> Iterator[DepthView]:
-    """The chosen keyframes of a session, matched as a whole one after the other."""
+    """Yield the chosen keyframes of a session, densely matched, in order."""
     survey, camera = session.survey, session.survey.state.camera
     columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
     yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
@@ -57,7 +57,7 @@ def depth_views(session: GridSession, settings: StereoSettings, chosen: slice) -
 def grow_grid(
     before: Mapping[tuple[int, int], Counts], sessions: Sequence[GridSession], settings: StereoSettings
 ) -> tuple[Tiles, dict[str, str]]:
-    """The tiles after all sessions, in their order, and by name why a recording adds nothing."""
+    """Return the tiles after all sessions, in order, and by name the reason why a recording adds nothing."""
     tiles, without = dict(before), {}
     for session in sessions:
         views = _views(session, settings, tiles)

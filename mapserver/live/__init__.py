@@ -1,4 +1,4 @@
-"""Surveys while they drive: tracking at the speed of the frames, a growing map beside it, and a build at the end."""
+"""Surveys mapped during the drive: tracking in real time, a growing map, and a build at the end."""
 
 from mapserver.live.drives import Drive, RecordedDrive, SensorDrive
 from mapserver.live.live_survey import LiveRequest, LiveResult, run_live

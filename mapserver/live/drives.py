@@ -1,4 +1,4 @@
-"""Where a survey under way comes from: a recording that is played, or the robot's sensors, which are recorded at the same time."""
+"""Sources of a live survey: a recording that is played, or a robot's sensors, which are recorded at the same time."""
 
 import threading
 import time
@@ -25,16 +25,16 @@ from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.worker import read_ahead
 from mapserver.survey.odometry_pass import SampleFeed
 
-_BEGIN_S = 0.2  # the first frame is due so long after all is ready
-_AHEAD = 8  # decoded frames that wait
+_BEGIN_S = 0.2  # delay of the first frame
+_AHEAD = 8  # limit of decoded frames in the queue
 _QUEUE = 40  # frames of sensors that may wait for tracking: two seconds
 _IMU_WAIT_S = 0.05
 _POLL_S = 0.25
-_SILENCE_S = 10.0  # after which a sensor that has said nothing is no sensor
+_SILENCE_S = 10.0  # limit for the first message of a sensor
 
 
 class DueFrame(NamedTuple):
-    """A frame with the IMU and wheel samples before it, and when it came on the monotonic clock; None where it was not waited for."""
+    """A frame with the IMU and wheel samples before it, and its arrival on the monotonic clock; None if not played in real time."""
 
     frame: RectifiedFrame
     imu: ImuSamples
@@ -43,7 +43,7 @@ class DueFrame(NamedTuple):
 
 
 class Drive(Protocol):
-    """A survey's frames as they come, speed times as fast as their stamps say. dropped: frames that came too quickly to be taken."""
+    """A survey's frames in time, at `speed` times the rate of their stamps. dropped: frames that arrived too fast."""
 
     name: str
     calibration: RigCalibration
@@ -53,23 +53,23 @@ class Drive(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Frames so far."""
+        """Number of dropped frames so far."""
 
     def check(self) -> list[str]:
-        """What is wanting, in words; RecordingError for what a build would refuse, as far as that shows before the drive."""
+        """Return shortcomings as text; RecordingError for what a build would refuse, as far as known before the drive."""
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
-        """Each frame when it is due; None now and then while none comes."""
+        """Yield each frame when it is due; None from time to time while waiting."""
 
     def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
-        """The recording, and the options with which a build reads the `count` frames of it that were taken."""
+        """Return the recording, and the build options that select the `count` used frames."""
 
 
 class RecordedDrive:
-    """A recording, played `speed` times as fast as it was recorded; 0 for as fast as its frames are taken."""
+    """A recording, played at `speed` times its own rate; 0 for as fast as its frames are processed."""
 
     def __init__(self, path: Path, recording: Recording, indices: NDArray[np.int64], given: str, speed: float) -> None:
-        """given: the `--frames` that chose the indices."""
+        """given: the `--frames` option of the indices."""
         if not (np.isfinite(speed) and speed >= 0):
             raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")
         self.name, self.calibration = recording.name, recording.calibration
@@ -79,7 +79,7 @@ class RecordedDrive:
 
     @property
     def dropped(self) -> int:
-        """See Drive: it waits for who takes its frames."""
+        """See Drive: it waits for its consumer."""
         return 0
 
     def check(self) -> list[str]:
@@ -111,10 +111,10 @@ class RecordedDrive:
 
 
 class SensorDrive:
-    """The sensors of a robot. Every sample goes into a recording, which is whole up to the last second whatever happens."""
+    """The sensors of a robot. Every sample is recorded; after a crash the file is complete except for the last second."""
 
     def __init__(self, source: Source, path: Path, topics: Topics) -> None:
-        """path: of the MCAP file to write; UsageError where there is one already."""
+        """path: of the MCAP file to write; UsageError if it exists."""
         if path.suffix != ".mcap" or path.exists():
             raise UsageError(f"--record {path}: name a new file that ends in .mcap")
         self.name, self.calibration, self.has_depth = path.stem, source.calibration, source.has_depth
@@ -136,11 +136,11 @@ class SensorDrive:
         return self._intake.counts.frames_dropped
 
     def check(self) -> list[str]:
-        """See Drive: sensors are judged by what they send."""
+        """See Drive: sensors are judged by their data."""
         return []
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
-        """See Drive; RecordingError where the sensors end by a fault, with where the drive is recorded up to there."""
+        """See Drive; RecordingError if the sensors fail, naming the recording up to there."""
         feeding = threading.Thread(target=self._feed, name="sensors", daemon=True)
         writer = McapRecordingWriter(self._path, self.calibration, topics=self._topics, in_place=True)
         feeding.start()
@@ -168,23 +168,23 @@ class SensorDrive:
         if not count:
             self._refuse_silence()
             raise RecordingError(
-                f"no frame could be used; look at the sensors with `locclient check`{self._unreadable()}"
+                f"no frame could be used; check the sensors with `locclient check`{self._unreadable()}"
             )
         return self._path, replace(options, frames="::", calibration=None, topics=self._topics, use=None)
 
     def _refuse_silence(self) -> None:
-        """RecordingError where cameras or IMU have said nothing, with the topics on which they are expected."""
+        """Raise RecordingError if cameras or IMU have sent nothing, with their expected topics."""
         counts, topics = self._intake.counts, self._topics
         second = topics.depth if self.has_depth else topics.right if len(self.calibration.cameras) > 1 else ""
         if not counts.frames:
             images = f"{topics.left} and {second}" if second else topics.left
             raise RecordingError(
-                f"no frame came from the sensors: images are expected on {images}; look at [source] sensors and [topics] with "
+                f"no frame came from the sensors: images are expected on {images}; check [source] sensors and [topics] with "
                 f"`locclient check`{self._unreadable()}"
             )
         if self.calibration.imu is not None and not counts.imu_samples:
             raise RecordingError(
-                f"{self._path}: images come, but no sample of the IMU that the calibration has; it is expected on {topics.imu}. Start "
+                f"{self._path}: images arrive, but no sample of the calibration's IMU; it is expected on {topics.imu}. Start "
                 "it, correct [topics] imu, or take it out of the calibration file"
             )
 
@@ -195,7 +195,7 @@ class SensorDrive:
     def _feed(self) -> None:
         try:
             self._source.run(self._intake, self._ended.wait)
-        except Exception as error:  # whatever it is, the drive must not end as if it were complete
+        except Exception as error:  # after any error the drive must not look complete
             self._fault = error
         finally:
             self._intake.finish()
@@ -214,7 +214,7 @@ class SensorDrive:
         return RecordingError(f"the sensors ended the drive: {reason}; {kept}")
 
     def _recorded(self, writer: McapRecordingWriter, bundle: SensorBundle) -> RectifiedFrame | None:
-        """The frame as tracking takes it; None, and nothing recorded of it, where it cannot be read."""
+        """Return the frame for tracking; None, without recording it, if it is unreadable."""
         writer.write_imu(bundle.imu)
         writer.write_wheel(bundle.wheel)
         writer.write_prior(bundle.priors)

@@ -1,4 +1,4 @@
-"""A survey under way: frames are tracked as they come, the map grows beside, everybody may look, and a build ends it."""
+"""A live survey: frames are tracked as they arrive, the map grows in parallel, viewers may watch, and a build ends it."""
 
 import gc
 import time
@@ -33,12 +33,12 @@ Tell = Callable[[LiveSurveyState], None]
 See = Callable[[Tracked], None]
 
 _TELL_EVERY_S = 0.5
-_PICTURE_PX, _PICTURE_QUALITY = 320, 50  # of its longer side; 10 kB
+_PICTURE_PX, _PICTURE_QUALITY = 320, 50  # of the longer side; 10 kB
 
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """A survey to follow. options: of the build at its end."""
+    """A requested live survey. options: of the build at its end."""
 
     site: str
     store: Path
@@ -47,9 +47,9 @@ class LiveRequest:
 
 
 class LiveFigures(NamedTuple):
-    """How the survey kept up: frames and the seconds that they last; 0.5 and 0.99 of the frames were answered within latency_ms, None
-    where they were not played at their own speed; late_frames took longer than the time to the next one. most_behind: keyframes that
-    waited at once; lag_s: the longest time from a keyframe to the map that shows it. dropped: frames that came too quickly to be taken.
+    """Timing of the survey: frames and their duration; 0.5 and 0.99 of the frames were processed within latency_ms, None
+    if not played in real time; late_frames took longer than a frame period. most_behind: largest queue of keyframes;
+    lag_s: longest time from a keyframe to the map that shows it. dropped: frames that arrived too fast.
     """
 
     frames: int
@@ -66,10 +66,10 @@ class LiveFigures(NamedTuple):
 
     def words(self) -> str:
         failed = self.mapping_failed
-        kept = "played as fast as it went"
+        kept = "played as fast as possible"
         if self.latency_ms is not None:
             kept = f"answered within {self.latency_ms[1]:.0f} ms (99 %), {self.late_frames} late"
-        made = f"{self.loops} loops" + (f" in {self.parts} parts that nothing has joined" if self.parts > 1 else "")
+        made = f"{self.loops} loops" + (f" in {self.parts} separate parts" if self.parts > 1 else "")
         return (
             f"live: {self.frames} frames of {self.seconds:.1f} s, {kept}, {self.dropped} dropped; {self.keyframes} keyframes, mapping at "
             f"most {self.most_behind} behind ({self.lag_s:.1f} s), {made}{'; ' if failed else ''}{failed}"
@@ -77,7 +77,7 @@ class LiveFigures(NamedTuple):
 
 
 class LiveResult(NamedTuple):
-    """What the survey saw while it drove, and the draft that was made of it."""
+    """Figures of the drive, and the draft built from it."""
 
     figures: LiveFigures
     built: BuiltMap
@@ -91,10 +91,10 @@ def run_live(
     console: Console,
     see: See | None = None,
 ) -> LiveResult:
-    """Follows a survey to its end, or until it is stopped, and builds the draft of what was seen.
+    """Run a survey to its end, or until it is stopped, and build the draft.
 
-    tell: takes the state, twice a second; see: every frame, and returns at once. Raises the FleetmapErrors of a build, before the drive
-    where possible.
+    tell: receives the state, twice a second; see: receives every frame, and returns at once. Raises the FleetmapErrors of a build,
+    before the drive if possible.
     """
     survey = _Survey(request, drive, tell, see)
     try:
@@ -113,19 +113,19 @@ def run_live(
 
 
 class _Survey:
-    """One survey while it drives, and what can be said of it."""
+    """One survey during its drive, with its present figures."""
 
     def __init__(self, request: LiveRequest, drive: Drive, tell: Tell, see: See | None) -> None:
         self._request, self._drive, self._tell, self._see = request, drive, tell, see
         self._stamps_ns: list[int] = []
         self._most_behind = 0
         self._latencies_s: list[float] = []
-        self._qualities: list[float] = []  # of each keyframe, the worst since the one before
+        self._qualities: list[float] = []  # of each keyframe, the worst since the previous one
         self._worst = 1.0
         self._sketch = NO_SKETCH
         self._seen: Image | None = None  # the newest keyframe
         self._behind, self._failed, self._lag_s = 0, "", 0.0
-        # Also with an IMU: odometry finds the scale, and the map's adjustment, at half of it on one recording, does not keep to that.
+        # Also with an IMU: odometry finds the scale, but in one recording the map's adjustment halved it.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
         rectifier, imu = drive.rectifier, drive.calibration.imu
         self._rig = LiveRig(
@@ -138,7 +138,7 @@ class _Survey:
         )
 
     def check(self) -> list[str]:
-        """What is wanting before it begins, in words; FleetmapErrors for what could only be in vain."""
+        """Return shortcomings before the start as text; FleetmapErrors for a survey certain to fail."""
         remarks, request = self._drive.check(), self._request
         self._config = SurveyConfig(request.settings, default_vocabulary(), read_zones(request.options.zones))
         if not self._rig.scale_known:
@@ -149,10 +149,10 @@ class _Survey:
         return remarks
 
     def follow(self, is_stopped: Callable[[], bool]) -> None:
-        """Tracks all frames, each when it is due; `check` comes first."""
+        """Track all frames, each when it is due; call `check` first."""
         request, drive = self._request, self._drive
         rectifier = drive.rectifier
-        # One thread a process, and no search for garbage among what lives as long as the survey: a frame would wait for either.
+        # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
         with _one_thread(), MappingProcess(self._config, self._rig) as mapping:
             self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
             mapping.finish()
@@ -212,7 +212,7 @@ class _Survey:
         return (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0
 
     def _late(self) -> int:
-        """Frames that were answered later than the time from one to the next, as they came."""
+        """Return the number of frames processed later than the time to the next frame."""
         if len(self._latencies_s) < 2:
             return 0
         latencies_s, stamps_ns = np.array(self._latencies_s), np.array(self._stamps_ns)
@@ -253,7 +253,7 @@ class _Survey:
         )
 
     def _picture(self) -> bytes:
-        """What the camera saw last, small."""
+        """Return the camera's latest image, scaled down."""
         if self._seen is None:
             return b""
         height, width = (-(-_PICTURE_PX * side // max(self._seen.shape)) for side in self._seen.shape)
@@ -262,7 +262,7 @@ class _Survey:
         return data if len(data) <= MAX_ARRAY_BYTES else b""
 
     def _estimate(self, found: LiveEstimate | None) -> EstimateMessage | None:
-        """As robots say it: of the base, with the odometry's continuous frame in the place of `odom`."""
+        """Return the estimate in the robots' form: of the base, with the odometry's continuous frame as `odom`."""
         if found is None:
             return None
         base_from_body = self._drive.calibration.base_from_body

@@ -1,4 +1,4 @@
-"""A survey under way as Foxglove shows it: the map that grows, where the robot is, and what its camera follows."""
+"""A live survey for Foxglove: the growing map, the robot's pose, and the tracked points of its camera."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ _IMAGE_EVERY_NS = 200_000_000
 
 
 class LiveViewer:
-    """Hands over what is shown; encoding it is the server's, so that no frame waits for it."""
+    """Passes data to the server, which encodes it, so that no frame is delayed."""
 
     def __init__(self, server: FoxgloveServer, drive: Drive) -> None:
         base_from_cam = drive.calibration.base_from_body @ drive.rectifier.body_from_cam
@@ -24,7 +24,7 @@ class LiveViewer:
         self._server.show(self._survey.shown(state))
 
     def see(self, tracked: Tracked) -> None:
-        """A frame as tracking leaves it: now and then it is shown, with the points that the odometry follows."""
+        """Receive a tracked frame: some are shown, with the points of the odometry."""
         frame, pixels = tracked.frame, tracked.pixels
         stamp_ns = frame.stamp_ns
         if stamp_ns - self._image_ns < _IMAGE_EVERY_NS:

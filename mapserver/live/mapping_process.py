@@ -1,4 +1,4 @@
-"""Mapping beside tracking: a process of its own, so that no frame waits for it. It takes every keyframe, in order."""
+"""Mapping beside tracking, in a separate process, so that no frame is delayed. It processes every keyframe, in order."""
 
 import gc
 import multiprocessing
@@ -24,21 +24,21 @@ from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveEstimate, LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 
-_READY_WITHIN_S = 60.0  # it imports the survey, on a machine that may be busy
-_STOP_WITHIN_S = 120.0  # for the keyframes that wait
+_READY_WITHIN_S = 60.0  # time to import the survey on a busy machine
+_STOP_WITHIN_S = 120.0  # for the keyframes in the queue
 MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
-_LOOK_EVERY_S = 2.0  # at what the drive lacks
+_LOOK_EVERY_S = 2.0  # period of the coverage check
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
-_SHOW_WITHIN_S = 0.5  # a map that is behind is shown so often; one that is not, after every keyframe
-_FEW = 10  # landmarks below which a cell is not covered
+_SHOW_WITHIN_S = 0.5  # display period of a lagging map; otherwise it is shown after every keyframe
+_FEW = 10  # least landmarks of a covered cell
 _MOST_MISSING = 64
-_NICENESS = 5  # below tracking, which answers frames
+_NICENESS = 5  # lower priority than tracking
 
 
 class MapSketch(NamedTuple):
-    """The map after so many keyframes: their places (K, 2) and the number of each one's part, landmarks (N, 2) thinned evenly, believed
-    loops (L, 4), how many candidates were refused, by verdict, and the newest ones. parts: what lies to each other. estimate: of the
-    newest keyframe. cells and missing: what is covered and what the drive lacks, looked at now and then; see LiveSurveyState.
+    """The map after some keyframes: their places (K, 2) and each one's part number, landmarks (N, 2) thinned evenly, accepted
+    loops (L, 4), numbers of refused candidates by verdict, and the latest ones. parts: connected parts. estimate: of the
+    newest keyframe. cells and missing: coverage and gaps of the drive, updated periodically; see LiveSurveyState.
     """
 
     keyframes: int
@@ -73,19 +73,19 @@ _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
 class MappingProcess:
-    """The process and the threads that speak with it, from `with` until its end."""
+    """The process and its communication threads, from `with` until its end."""
 
     def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
-        # What it needs goes through the pipe: more than a pipe holds, as arguments, would wait for ever for a process that has died.
+        # Its arguments go through the pipe: larger process arguments would block for ever if the process dies.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
         self._theirs, self._needed = theirs, (config, rig)
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
         self._latest, self._failed = NO_SKETCH, ""
-        self._put_s: deque[float] = deque()  # of keyframes that no sketch holds yet
-        self.longest_lag_s = 0.0  # from a keyframe to the sketch that holds it
+        self._put_s: deque[float] = deque()  # of keyframes not yet in a sketch
+        self.longest_lag_s = 0.0  # from a keyframe to its sketch
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
 
     def __enter__(self) -> Self:
@@ -94,7 +94,7 @@ class MappingProcess:
         if not self._is_ready():
             self._process.kill()
             raise FleetmapError(
-                "mapping did not start: its process says above why; where it says nothing, see that the machine has a core and memory "
+                "mapping did not start: see the messages of its process above; without any, check that the machine has a core and memory "
                 "to spare, then try again"
             )
         for thread in self._threads:
@@ -106,29 +106,29 @@ class MappingProcess:
 
     @property
     def sketch(self) -> MapSketch:
-        """The map after the newest keyframe that was taken."""
+        """Return the map after the newest processed keyframe."""
         return self._latest
 
     @property
     def behind(self) -> int:
-        """Keyframes that wait."""
+        """Number of keyframes in the queue."""
         return self._sent - self._latest.keyframes
 
     @property
     def failed(self) -> str:
-        """Why no more keyframes are taken; empty while all is well."""
+        """Return why no more keyframes are accepted; empty without a fault."""
         return self._failed
 
     def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
-        """One more keyframe; returns at once.
+        """Queue one more keyframe; returns at once.
 
-        A map that is too far behind is given up: the build at the end does not need it.
+        A map that lags too far is given up: the build at the end does not need it.
         """
         if self._failed:
             return
         if self.behind >= _MAX_WAITING:
             self._failed = (
-                f"mapping was {_MAX_WAITING} keyframes behind and was given up; the finished map is built all the same"
+                f"mapping was {_MAX_WAITING} keyframes behind and was given up; the finished map is built nevertheless"
             )
             self._waiting.put(None)
             return
@@ -137,7 +137,7 @@ class MappingProcess:
         self._waiting.put((frame, keyframe))
 
     def finish(self) -> None:
-        """Waits for the keyframes that were put, at most some time, and ends the process."""
+        """Wait for the queued keyframes, for a limited time, and end the process."""
         self._waiting.put(None)
         for thread in self._threads:
             if thread.ident is not None:
@@ -152,7 +152,7 @@ class MappingProcess:
         try:
             self._ours.send(self._needed)
             return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
-        except (EOFError, OSError):  # it ended before it began
+        except (EOFError, OSError):  # it ended before it was ready
             return False
 
     def _send(self) -> None:
@@ -160,7 +160,7 @@ class MappingProcess:
             while (item := self._waiting.get()) is not None:
                 self._ours.send(item)
             self._ours.send(None)
-        except OSError:  # the process has ended: `_receive` knows why
+        except OSError:  # the process has ended: `_receive` reports the reason
             pass
         except Exception as error:
             self._failed = self._failed or _given_up(error)
@@ -176,18 +176,18 @@ class MappingProcess:
                 for _ in range(shown):
                     self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
-            self._failed = self._failed or "the mapping process ended; the finished map is built all the same"
+            self._failed = self._failed or "the mapping process ended; the finished map is built nevertheless"
         except Exception as error:
             self._failed = self._failed or _given_up(error)
 
 
 def _given_up(error: Exception) -> str:
-    return f"mapping was given up ({type(error).__name__}: {error}); the finished map is built all the same"
+    return f"mapping was given up ({type(error).__name__}: {error}); the finished map is built nevertheless"
 
 
 def _map(pipe: Connection) -> None:
-    """The process: answers every keyframe with the map that it makes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the survey's own process says when it is over
+    """Run the process: answer every keyframe with the updated map."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends it
     os.nice(_NICENESS)
     cv2.setNumThreads(1)  # the other core is tracking's
     config, rig = pipe.recv()
@@ -209,7 +209,7 @@ def _map(pipe: Connection) -> None:
     except (EOFError, OSError):  # the survey was killed
         pass
     except Exception as error:  # a fault here must not end the survey
-        pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built all the same")
+        pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built nevertheless")
 
 
 def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
@@ -220,7 +220,7 @@ def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
 
 
 def sketch_of(growing: LiveMap, quality: tuple[Array, list[LiveMissing]] | None = None) -> MapSketch:
-    """What of a map is shown while it grows; no array is larger than a message may hold."""
+    """Return the displayed data of a growing map; no array exceeds the limit of a message."""
     placed, found, parts = growing.map_from_body, growing.loops(), growing.parts()
     numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
     ends = placed[found.believed][:, :, :2, 3].reshape(-1, 4)
@@ -240,19 +240,19 @@ def sketch_of(growing: LiveMap, quality: tuple[Array, list[LiveMissing]] | None 
 
 
 def thinned(rows: Array, columns: int) -> Array:
-    """Rows that fit a message as float32, spread evenly over all; the last one is always among them."""
+    """Return rows that fit a message as float32, spread evenly; the last one is included."""
     most = MAX_ARRAY_BYTES // (4 * columns)
     return rows[thinning(len(rows), most)]
 
 
 def thinning(count: int, most: int) -> NDArray[np.int64]:
-    """At most `most` of `count` numbers, evenly, the last one included."""
+    """Return at most `most` of `count` numbers, evenly, the last one included."""
     step = max(1, -(-count // most))
     return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)
 
 
 class _Cell(NamedTuple):
-    """Keyframes of a square, as `tile_directions` takes a tile."""
+    """Keyframes of a square, in the form of a tile for `tile_directions`."""
 
     tile_x: int
     tile_y: int
@@ -260,7 +260,7 @@ class _Cell(NamedTuple):
 
 
 def missing_directions(map_from_cam: Array) -> list[LiveMissing]:
-    """Headings that nothing looks at, where keyframes (K, 4, 4) passed the other way; by square, as `quality.directions` has it."""
+    """Return headings without views, although keyframes (K, 4, 4) passed the other way; by square, as in `quality.directions`."""
     cells_of = np.floor(map_from_cam[:, :2, 3] / COVERAGE_CELL_M).astype(np.int64)
     cells = [
         _Cell(int(x), int(y), map_from_cam[(cells_of == (x, y)).all(axis=1)])
@@ -276,7 +276,7 @@ def missing_directions(map_from_cam: Array) -> list[LiveMissing]:
 
 
 def covered_cells(points_map: Array, most: int) -> Array:
-    """(T, 3) x and y of squares that hold landmarks (N, 3), and how many; those with most of them."""
+    """Return (T, 3) x and y of squares with landmarks (N, 3), and their number; the squares with the most."""
     counts = Counter(map(tuple, np.floor(points_map[:, :2] / COVERAGE_CELL_M).astype(np.int64).tolist()))
     rows = [(x, y, count) for (x, y), count in counts.most_common(most) if count >= _FEW]
     return np.array(sorted(rows), np.float64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The nightly job of a site: take what came in, check it, build on the current version, publish if the gate agrees."""
+"""The nightly job of a site: read new recordings, check them, build on the current version, publish if the gate accepts it."""
 
 from mapserver.nightly.night import NightRequest, last_report, run_night
 

@@ -1,12 +1,12 @@
-"""The folder into which recordings are copied, and the folders where each goes from there. Nothing is ever deleted.
+"""The folder for incoming recordings, and the folders to which each is moved. Nothing is ever deleted.
 
     INBOX/NAME             a recording: a folder, or a file with a suffix such as .mcap
     INBOX/done/HASH-NAME   it is in a version
-    INBOX/held/HASH-NAME   it is sound, but could not be joined, or its draft was refused; move it back to try again
-    INBOX/bad/NAME         it cannot be read, or `doctor` says that it should not be used
+        INBOX/held/HASH-NAME   it is valid, but could not be joined, or its draft was refused; move it back to try again
+        INBOX/bad/NAME         it cannot be read, or `doctor` fails it
 
-Beside what is held or bad lies NAME.reason.txt. Strangers fill the inbox: only regular files and folders are opened. Links, FIFOs, sockets
-and devices are bad, and so is whatever fails while it is read. One entry never ends the night of the others.
+Beside a held or bad recording lies NAME.reason.txt. The inbox is untrusted: only regular files and folders are opened. Links, FIFOs,
+sockets and devices are bad, as is any entry with a read error. One entry never stops the processing of the others.
 """
 
 import fcntl
@@ -31,14 +31,14 @@ from mapserver.store.files import make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
 _HASH_SIGNS = 12
-_MAX_NAME_BYTES = 200  # of 255: the hash goes before the name, a number too, and `.reason.txt` behind it
+_MAX_NAME_BYTES = 200  # of 255: room for the hash and a number before the name, and `.reason.txt` after it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
 _MOST_ISSUES = 5
 _KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
-# Of one recording: an hour of two cameras at 30 Hz are 216,000 files
+# Limit of one recording: an hour of two cameras at 30 Hz has 216,000 files
 _MOST_FILES, _DEEPEST = 2_000_000, 32
-# Time to read one: so long, and 1 s for each 4 MiB that the disk holds of it, which sparse files do not raise
+# Time limit to read one: this, and 1 s for each 4 MiB on the disk; sparse files do not raise it
 _READ_S, _SLOWEST_BYTES_PER_S = 600, 4 << 20
 _LEAST_MEMORY_BYTES = 4 << 30
 _DAY_S = 86_400
@@ -46,9 +46,9 @@ _DAY_S = 86_400
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Recordings that are whole, by name; with the reason, those that are not yet, and entries that cannot be one.
+    """Complete recordings, by name; with the reason, incomplete ones, and entries that cannot be recordings.
 
-    others: names of files that are no recordings. They stay where they are.
+    others: names of files that are not recordings. They stay in place.
     """
 
     complete: tuple[Path, ...]
@@ -59,26 +59,26 @@ class Arrivals:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A recording that can be read; found: what its reader missed in it, in words."""
+    """A readable recording; found: gaps reported by its reader, as text."""
 
     path: Path
     sha256: str
     found: str = ""
 
     def why(self, reason: str) -> str:
-        """A reason with what the reader found, which is often what is behind it."""
+        """Return a reason together with the reader's findings, which are often its cause."""
         return f"{reason}; when it was read: {self.found}" if self.found else reason
 
 
 def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
-    """What is in the inbox now. Hidden names are ignored.
+    """Return the present contents of the inbox. Hidden names are ignored.
 
-    A recording is whole when nothing in it changed for `settle_s`, no file in it bears the name of a half copied one, and
-    no process has one open for writing, as far as the system tells. Raises UsageError where there is no such folder.
+    A recording is complete if nothing in it changed for `settle_s`, no file in it has the name of a partial copy, and
+    no process has one open for writing, as far as the system shows. Raises UsageError if the folder is missing.
     """
     if not inbox.is_dir():
-        raise UsageError(f"--inbox {inbox} is no folder; create it, or name the one that recordings are copied into")
-    with disk_errors(f"--inbox {inbox} cannot be listed", "let this account read and write it", UsageError):
+        raise UsageError(f"--inbox {inbox} is not a folder; create it, or name the folder of incoming recordings")
+    with disk_errors(f"--inbox {inbox} cannot be listed", "give this account read and write access", UsageError):
         paths = sorted(inbox.iterdir())
     complete, waiting, bad, others = [], [], [], []
     for path in paths:
@@ -99,7 +99,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
 
 
 def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
-    """A recording with its hash, or why it cannot be read; None if it was changed meanwhile. Limits the memory and time that this takes."""
+    """Return a recording with its hash, or the reason why it is unreadable; None if it changed meanwhile. Limits memory and time."""
     found: Recorded | str
     before: object = None
     try:
@@ -109,7 +109,7 @@ def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
             found = Recorded(path, recording.content_hash(), issues)
     except _TooSlowError:
         found = f"{path} was not read within {seconds:.0f} s; is it whole? Copy it again"
-    except Exception as error:  # whatever a library makes of a stranger's file, the night goes on
+    except Exception as error:  # a library's error on an untrusted file must not end the nightly run
         found = _reason(path, error)
     try:
         return found if before is None or _state(path)[0] == before else None
@@ -120,7 +120,7 @@ def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
 
 
 def is_openable(path: Path) -> bool:
-    """Whether there is nothing but files and folders in it."""
+    """True if it contains only files and folders."""
     try:
         return all(True for _ in _parts(path))
     except (OSError, RecordingError):
@@ -128,7 +128,7 @@ def is_openable(path: Path) -> bool:
 
 
 def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
-    """An entry and everything in it, links not followed. Raises RecordingError for what is neither file nor folder, OSError."""
+    """Yield an entry and all of its contents, links not followed. Raises RecordingError for other than files and folders, OSError."""
     left, number = [(path, 0)], 0
     while left:
         part, depth = left.pop()
@@ -148,7 +148,7 @@ def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 
 def _state(path: Path) -> tuple[object, float]:
-    """Which files an entry has, so that a change is seen, and the seconds that reading it may take."""
+    """Return the files of an entry, to detect changes, and the time limit to read it in seconds."""
     parts = list(_parts(path))
     stored_bytes = sum(512 * status.st_blocks for _, status in parts)
     state = {(part, status.st_ino, status.st_size, status.st_ctime_ns) for part, status in parts}
@@ -164,17 +164,17 @@ def _reason(path: Path, error: Exception) -> str:
         )
     if isinstance(error, OSError):
         named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else path
-        return f"{named} cannot be read ({error.strerror or error}); let this account read it, or copy it again"
+        return f"{named} cannot be read ({error.strerror or error}); give this account read access, or copy it again"
     return f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]}); try `mapserver doctor {path}`"
 
 
 class _TooSlowError(BaseException):
-    """Time is up. Code that catches every Exception must not catch it."""
+    """Raised at the time limit. A BaseException, so that code that catches every Exception does not catch it."""
 
 
 @contextmanager
 def _limited(seconds: float) -> Iterator[None]:
-    """Limits the block's memory (MemoryError), and in the main thread its time (_TooSlowError)."""
+    """Limit the block's memory (MemoryError), and in the main thread its time (_TooSlowError)."""
 
     def interrupt(_: int, __: FrameType | None) -> None:
         raise _TooSlowError
@@ -202,23 +202,23 @@ def _most_memory_bytes() -> int:
 
 
 def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
-    """Why a recording is not whole yet; None if it is. Raises as `_parts`."""
+    """Return why a recording is incomplete; None if it is complete. Raises as `_parts`."""
     newest_ns, reason = 0, None
     for part, status in _parts(path):
-        # Not mtime: copying tools set it back. Nobody can set this one.
+        # Not mtime, which copying tools set back: ctime cannot be set.
         newest_ns = max(newest_ns, status.st_ctime_ns)
         if reason is None and part.suffix in _UNFINISHED:
             reason = f"{part.name} is half copied"
         if reason is None and stat.S_ISREG(status.st_mode) and _is_being_written(part):
             reason = f"{part.name} is open for writing"
-    quiet_s = abs(now_ns - newest_ns) * 1e-9  # a change in the future was made before the clock was set back
+    quiet_s = abs(now_ns - newest_ns) * 1e-9  # a change in the future precedes a clock that was set back
     if reason is not None:
         return reason if quiet_s < _DAY_S else f"{reason} and has not changed for {quiet_s / _DAY_S:.0f} days"
     return f"it changed {quiet_s:.0f} s ago, {settle_s:.0f} s are waited" if quiet_s < settle_s else None
 
 
 def _is_being_written(path: Path) -> bool:
-    """Whether a process has it open for writing; False too where the system does not tell (files of others, network disks)."""
+    """True if a process has it open for writing; False also if the system does not show it (other users' files, network disks)."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except PermissionError:
@@ -236,11 +236,11 @@ def _is_being_written(path: Path) -> bool:
 
 
 def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> Path:
-    """Moves a recording into a folder of its inbox, the reason beside it; returns where it is now.
+    """Move a recording into a folder of its inbox, with the reason beside it; return its new path.
 
     A name that `is_safe_name` refuses is replaced by one of its hash.
 
-    Raises StoreError where the disk refuses; the recording is then where it was.
+    Raises StoreError if the disk refuses; the recording then stays in place.
     """
     folder = path.parent / where
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
@@ -261,7 +261,7 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
 
 
 def is_safe_name(name: str) -> bool:
-    """Whether a name can be shown, logged and kept in the database, and leaves room for what is put before and behind it."""
+    """True if a name can be displayed, logged and stored, and leaves room for prefix and suffix."""
     return name.isprintable() and len(os.fsencode(name)) <= _MAX_NAME_BYTES
 
 
@@ -271,13 +271,13 @@ def _safe_name(path: Path) -> str:
 
 
 def _free(folder: Path, name: str) -> Path:
-    """The first name that no recording has yet."""
+    """Return the first unused name."""
     names = chain([name], (f"{number}-{name}" for number in count(2)))
     return next(folder / free for free in names if not os.path.lexists(folder / free))
 
 
 def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
-    """The recordings of these hashes that are still in the inbox, in the same order: done, or held and then published by a person."""
+    """Return the recordings of these hashes still in the inbox, in the same order: done, or held and later published by an operator."""
     found: dict[str, Path] = {}
     for where in (DONE, HELD):
         with suppress(FileNotFoundError):

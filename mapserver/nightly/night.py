@@ -1,8 +1,8 @@
-"""One night of one site, from the inbox to a current version; the next one continues where this one was interrupted.
+"""One nightly run of one site, from the inbox to a current version; an interrupted run is continued by the next one.
 
-The state of the work is read from the store: a version says which recordings it was made of and which job saved it. So nothing is
-built twice and nothing is lost, wherever a night is killed: before its draft is whole there is none; a whole draft is taken to the
-gate by the next night; recordings that a version holds are only put away.
+The state of the work is read from the store: a version lists its recordings and the job that saved it. So nothing is built twice
+or lost whenever a run is killed: an incomplete draft is not stored; a stored draft is taken to the gate by the next run;
+recordings already in a version are only moved.
 """
 
 import time
@@ -27,17 +27,17 @@ from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore, VersionInfo
 
 JOB = "nightly"
-_MOST_A_NIGHT = 1000  # recordings, and lines about what is left where it is
+_MOST_A_NIGHT = 1000  # recordings, and lines on entries left in place
 _MOST_ENDED = 2
 _ENDED = (
-    "{nights} nights ended while this was read or built: killed, out of memory or out of time, or by a fault of the program; "
+    "{nights} nights ended while this was read or built: killed, out of memory or time, or by a bug; "
     "try `mapserver doctor` on it, and move it back, alone, to try again"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class NightRequest:
-    """What `mapserver nightly` was asked for. now_ns: the moment by which recordings have been quiet for `settle_s`, or not."""
+    """Options of `mapserver nightly`. now_ns: the time against which `settle_s` is checked."""
 
     site: str
     inbox: Path
@@ -49,9 +49,9 @@ class NightRequest:
 
 @dataclass
 class NightReport:
-    """The report of a night, with the keys that docs/reports.md explains. version: what is current in the end.
+    """The report of a night, with the keys of docs/reports.md. version: the current one at the end.
 
-    looking_at: names of the recordings that are read or built now. ended: by name, how many nights ended while they looked at it.
+    looking_at: names of the recordings being read or built. ended: by name, number of nights that ended during its processing.
     """
 
     job: int
@@ -66,10 +66,10 @@ class NightReport:
 
 
 def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
-    """Runs the night and returns the sentence that says how it ended.
+    """Run the night and return a sentence on its result.
 
-    Raises BusyError where another night of the site runs, GateRefusedError for a refused draft, and other FleetmapErrors; the job
-    in the store says the same. The current version is the last good one in any case.
+    Raises BusyError if another night of the site runs, GateRefusedError for a refused draft, and other FleetmapErrors; the job
+    in the store holds the same message. The current version is the last good one in any case.
     """
     site = request.site
     with MapStore.open(request.store, create=True) as maps, only_one(request.store, site):
@@ -79,12 +79,12 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
         try:
             with held(request.store, report.job):
                 sentence = _Night(request, gate, console, maps, report).run()
-        except KeyboardInterrupt:  # somebody ended it, not what it looked at
+        except KeyboardInterrupt:  # ended by a user, not by a recording
             maps.tell_progress(report.job, [], "looking_at")
             raise
         except FleetmapError as error:
             report.looking_at = []
-            with suppress(StoreError):  # a full disk: the next night finds this one's job running, and ends it
+            with suppress(StoreError):  # disk full: the next night finds this job running, and ends it
                 report.version = _current(maps, site)
                 kept = "" if report.version is None else f"; version {report.version} stays current"
                 maps.update_job(report.job, "failed", f"{error}{kept}", asdict(report))
@@ -95,7 +95,7 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
 
 
 def last_report(store: Path, site: str) -> dict[str, Any] | None:
-    """What the last night of a site reports, its state and message with it; None where there was none."""
+    """Return the last report of a site's nightly run, with its state and message; None if absent."""
     with MapStore.open(store) as maps:
         last = next((job for job in maps.jobs(site) if job.kind == JOB), None)
     return None if last is None else {"state": last.state, "message": last.message, **last.report}
@@ -114,7 +114,7 @@ def _current(maps: MapStore, site: str) -> int | None:
 
 
 def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
-    """Ends the jobs of nights that were killed: the lock says that none of them runs. Counts what they looked at."""
+    """End the jobs of killed nights: the lock shows that none of them runs. Count their recordings in work."""
     nights = [job for job in maps.jobs(site) if job.kind == JOB and job.id != report.job]
     killed = [job for job in nights if job.state == "running" or INTERRUPTED in job.report]
     report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
@@ -164,13 +164,13 @@ class _Night:
         return f"site {self._request.site}: version {versions} published, {self._counts()}"
 
     def _identified(self, paths: tuple[Path, ...]) -> list[Recorded]:
-        """Those that can be read, each once."""
+        """Return the readable ones, each once."""
         found: dict[str, Recorded] = {}
         for path in paths:
             name = path.name
             self._say(f"reading {name}")
             if not boxes.is_safe_name(name):
-                self._put_away(path, boxes.BAD, None, f"its name {name} is no usable one; name it anew")
+                self._put_away(path, boxes.BAD, None, f"its name {name} is invalid; rename it")
                 continue
             if self._report.ended.get(name, 0) >= _MOST_ENDED:
                 self._put_away(path, boxes.BAD, None, _ENDED.format(nights=self._report.ended[name]))
@@ -178,7 +178,7 @@ class _Night:
             self._look_at([path])
             recorded = boxes.identify(path, self._request.options.reading.opening)
             if recorded is None:
-                self._wait(name, "not yet: it changed while it was read")
+                self._wait(name, "incomplete: it changed while it was read")
             elif isinstance(recorded, str):
                 self._put_away(path, boxes.BAD, None, recorded)
             elif recorded.sha256 in found:
@@ -190,7 +190,7 @@ class _Night:
         return list(found.values())
 
     def _left_draft(self) -> VersionInfo | None:
-        """The draft that a killed night saved and that is still based on the current version."""
+        """Return the draft that a killed night saved, if still based on the current version."""
         site = self._request.site
         parent, resumed = _current(self._maps, site), set(self._report.resumes)
         drafts = [info for info in _versions(self._maps, site) if info.state == "draft" and info.job in resumed]
@@ -243,7 +243,7 @@ class _Night:
             self._put_away(recorded.path, where, recorded.sha256, recorded.why(unusable.get(recorded.path, reason)))
 
     def _replayed(self) -> list[Path]:
-        """Recordings of the current version that the inbox still has."""
+        """Return recordings of the current version that are still in the inbox."""
         current = _current(self._maps, self._request.site)
         if current is None:
             return []
@@ -251,7 +251,7 @@ class _Night:
         return boxes.kept(self._request.inbox, [entry.sha256 for entry in entries])
 
     def _publish(self, draft: VersionInfo, recordings: list[Recorded]) -> list[Recorded]:
-        """Takes a draft through the gate and puts away what it was made of; the others are returned."""
+        """Take a draft through the gate and move its recordings; return the others."""
         site, version = self._request.site, draft.version
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
         own = [recorded for recorded in recordings if recorded.sha256 in taken]
@@ -275,7 +275,7 @@ class _Night:
         except StoreError as error:
             self._wait(path.name, f"{error}; {where}: {reason}")
             return
-        self._report.ended.pop(path.name, None)  # another try, or another recording of this name, begins anew
+        self._report.ended.pop(path.name, None)  # a new attempt, or another recording of this name, starts at zero
         told = {"name": printable(path.name), "reason": printable(reason)}
         self._report.recordings.append({**told, "sha256": sha256, "fate": where})
 
@@ -285,7 +285,7 @@ class _Night:
             self._report.waiting.append({"name": printable(name), "reason": printable(reason)})
 
     def _look_at(self, paths: Sequence[Path]) -> None:
-        """Notes what the night looks at, so that the next ones know what ended it."""
+        """Record the recordings in work, so that the next nights know them if this one is killed."""
         self._report.looking_at = [path.name for path in paths]
         self._maps.tell_progress(self._report.job, self._report.looking_at, "looking_at")
 

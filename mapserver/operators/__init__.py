@@ -1,1 +1,1 @@
-"""Operators with names: passwords, sessions and tokens, what each may do, and where the server may listen. docs/security.md explains it."""
+"""Operator accounts: passwords, sessions, tokens and rights, and allowed server addresses. See docs/security.md."""

@@ -1,7 +1,7 @@
-"""Sign-in of operators, and who a request comes from.
+"""Sign-in of operators, and authentication of requests.
 
 Passwords are hashed by argon2 with the low-memory profile of RFC 9106, section 4, one at a time: each takes 64 MiB. Sessions and tokens are
-256 random bits, of which the store keeps the SHA-256.
+256 random bits; the store keeps their SHA-256.
 """
 
 import hashlib
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 
 IDLE_S, LIFE_S = 3600, 12 * 3600
 TRIES, TRY_EVERY_S = 5, 12
-ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = 20, 2  # under any names: one address leaves half of the server's time to others
+ADDRESS_TRIES, ADDRESS_TRY_EVERY_S = 20, 2  # for all names: one address can use at most half of the server's time
 MIN_PASSWORD, MAX_PASSWORD = 12, 1000
 MAX_TOKEN_DAYS = 400
-_WAITING = 4  # sign-ins that may wait for their turn: more would hold the threads that answer everybody else
+_WAITING = 4  # sign-ins in the queue: more would occupy the threads for other requests
 _NOTE_USE_EVERY_S = 60
-_NOTES, _NOTE_EVERY_S = 60, 60  # refusals in the log, which is never shortened
+_NOTES, _NOTE_EVERY_S = 60, 60  # refusals in the log, which is never pruned
 _LOOK_EVERY_S = 1
 
 
 @dataclass(frozen=True, slots=True)
 class SignIn:
-    """How a sign-in ended: the session's secret, or a refusal and the seconds after which to try again."""
+    """Result of a sign-in: the session's secret, or a refusal and the seconds until the next attempt."""
 
     session: str = ""
     refusal: str = ""
@@ -41,7 +41,7 @@ class SignIn:
 
 
 class Operators:
-    """The operators of an open store. For any thread."""
+    """The operators of an open store. Thread-safe."""
 
     def __init__(self, store: MapStore) -> None:
         self._store, self._now_ns = store, store.now_ns
@@ -54,37 +54,37 @@ class Operators:
 
     @property
     def is_sign_in_on(self) -> bool:
-        """Whether anybody was ever named; from then on every request needs a session or a token."""
+        """True once an operator was added; from then on every request needs a session or a token."""
         if not self._are_there and self._now_ns() - self._looked_ns > _LOOK_EVERY_S * 1e9:
             self._looked_ns, self._are_there = self._now_ns(), self._store.operators.are_there()
         return self._are_there
 
     def add(self, name: str, role: str, password: str, actor: Actor) -> None:
-        """A new operator; UsageError for a name that is taken or cannot be one."""
+        """Add an operator; UsageError for a taken or invalid name."""
         self._store.operators.add(check_operator_name(name), role, _hasher().hash(password), actor)
 
     def set_password(self, name: str, password: str, actor: Actor) -> None:
-        """Another password, which ends all sessions; UsageError for an unknown name."""
+        """Set a new password, which ends all sessions; UsageError for an unknown name."""
         self._store.operators.set_password(name, _hasher().hash(password), actor)
 
     def make_token(self, name: str, scopes: "Iterable[str]", days: float, actor: Actor) -> str:
-        """A token that is shown once; of a name that is no operator's it is a program's. UsageError for a name that cannot be one."""
+        """Create a token, shown once; without an operator of that name it is a program's. UsageError for an invalid name."""
         token, ends_ns = secrets.token_urlsafe(32), self._now_ns() + int(days * 86_400e9)
         row = TokenRow(check_operator_name(name), "", " ".join(sorted(set(scopes))), ends_ns)
         self._store.operators.add_token(_digest(token), row, actor)
         return token
 
     def sign_in(self, name: str, password: str, address: str) -> SignIn:
-        """A session for a name and password, or a refusal that does not say which of the two is wrong."""
+        """Return a session for a name and password, or a refusal that does not reveal which of the two is wrong."""
         if not self._waiting.acquire(blocking=False):
-            return SignIn(refusal="Too many people sign in at the moment. Try again.", retry_s=2)
+            return SignIn(refusal="Too many sign-ins at the moment. Try again.", retry_s=2)
         try:
             return self._sign_in(name, password, address)
         finally:
             self._waiting.release()
 
     def _sign_in(self, name: str, password: str, address: str) -> SignIn:
-        name = ascii(name[:64])[1:-1]  # as names are, or else nobody's
+        name = ascii(name[:64])[1:-1]  # valid names are unchanged, others match no operator
         who = Actor(name, address=address)
         if not (self._addresses.admits(address) and self._tries.admits((name, address))):
             self.note("sign-in refused", "too many tries", who)
@@ -92,7 +92,7 @@ class Operators:
         row = self._store.operators.find(name)
         stored = None if row is None or row.is_disabled else row.password
         with self._verifying:
-            # Unknown names take as long as known ones.
+            # Unknown names take as long as known ones, against timing attacks.
             is_right = _verified(stored or _dummy(), password[:MAX_PASSWORD])
         if stored is None or not is_right:
             self.note("sign-in refused", "wrong name or password", who)
@@ -113,7 +113,7 @@ class Operators:
             self._store.operators.end_session(who.proof, who.actor())
 
     def identify(self, session: str, authorization: str, address: str, *, uses: bool = True) -> Identity | None:
-        """Who shows this cookie or this `Authorization`; None for nobody that may. uses: whether this keeps the session from ending."""
+        """Return the owner of this cookie or this `Authorization`; None if invalid. uses: True if this extends the session."""
         scheme, _, token = authorization.partition(" ")
         if scheme.lower() == "bearer":
             return self._by_token(token.strip(), address)
@@ -128,7 +128,7 @@ class Operators:
         return Identity(row.name, row.role, SCOPES[row.role], address, sha256)
 
     def note(self, kind: str, detail: str, actor: Actor) -> None:
-        """One line of the log about something that strangers can cause: after the first 60 one a minute, with the number left out."""
+        """Log an event that strangers can cause: after the first 60 one line a minute, with the number left out."""
         if not self._notes.admits("notes"):
             self._unnoted += 1
             return
@@ -143,7 +143,7 @@ class Operators:
 
 
 def _is_within(age_ns: int, most_s: float) -> bool:
-    """Whether an age is at most so much. One of the future by more than a minute is from a clock that was ahead: it would live too long."""
+    """True if an age is within the limit. More than a minute in the future is refused: such a clock was ahead."""
     return -60e9 <= age_ns <= most_s * 1e9
 
 

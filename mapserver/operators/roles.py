@@ -1,4 +1,4 @@
-"""Roles and what they allow."""
+"""Roles and their rights."""
 
 import re
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
 
 
 class Scope(StrEnum):
-    """What a request may be allowed to do."""
+    """Right of a request."""
 
     READ = "read"
     METRICS = "metrics"
@@ -24,7 +24,7 @@ class Scope(StrEnum):
 
 
 class Role(StrEnum):
-    """What a person is to the fleet."""
+    """Role of a user."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
@@ -35,14 +35,14 @@ SCOPES: dict[str, frozenset[Scope]] = {
     Role.VIEWER: frozenset({Scope.READ}),
     Role.OPERATOR: frozenset({Scope.READ, Scope.METRICS, Scope.CHANGE}),
     Role.ADMIN: frozenset(Scope),
-    # A name that is nobody's: it has tokens alone, each with the scopes that it was made with.
+    # A program, not an operator: it has tokens only, each with its own scopes.
     "program": frozenset(Scope),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who sends a request, as a session, a token or a proxy has proved it. proof: the hash of a session, empty without one."""
+    """Authenticated sender of a request, by session, token or proxy. proof: the hash of a session, empty if absent."""
 
     name: str
     role: str
@@ -58,9 +58,9 @@ class Identity:
 
 
 def check_operator_name(name: str) -> str:
-    """The name; UsageError for one that nobody can have."""
+    """Return the name; UsageError for an invalid one."""
     if not _NAME.fullmatch(name):
         raise UsageError(
-            f"{name[:80]!r} is no operator's name; use up to 64 small letters, digits and . _ @ + -, such as ada"
+            f"{name[:80]!r} is an invalid operator name; use up to 64 small letters, digits and . _ @ + -, such as ada"
         )
     return name

@@ -1,4 +1,4 @@
-"""Headings of the places of a map, and those that are missing: a robot that comes the other way finds nothing there. Pure."""
+"""Headings of the places of a map, and missing ones: a robot that drives the other way cannot localize there. Pure."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ from fleetmap.geometry import Array
 from mapserver.quality.figures import TileDirections
 
 HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
-_NEAR_M = 2.0  # the other lane of an aisle, not the next aisle
-_OTHER_WAY = -0.5  # cosine between the headings of two places, below which one looks the other way of the other
+_NEAR_M = 2.0  # includes the other lane of an aisle, but not the next aisle
+_OTHER_WAY = -0.5  # cosine between the headings of two places, below which they look in opposite directions
 _UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the ceiling or the floor
-_LEAST_M = 3.0  # places that look one way only and lie closer together than this are a turn, not an aisle
+_LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisle
 _NAMED = 2
 
 
@@ -36,10 +36,10 @@ class Places(Protocol):
 
 
 def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
-    """What each tile with places was seen of, in the order of the tiles; places that look up or down are left out.
+    """Return the seen headings of each tile with places, in the order of the tiles; places that look up or down are left out.
 
-    One way only is judged for every place by those around it, over the borders of tiles: in a tile with two aisles, each driven
-    in another direction, nothing looks the other way in either of them.
+    One-way is judged for every place by its neighbours, across the borders of tiles: in a tile with two aisles, driven in
+    opposite directions, both are one-way.
     """
     counts = [len(tile.map_from_cam) for tile in tiles]
     map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *(tile.map_from_cam for tile in tiles)])
@@ -68,7 +68,7 @@ def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
 
 
 def one_way_words(found: Sequence[TileDirections]) -> str:
-    """How many tiles were driven one way only and what is missing in the first of them; empty where nothing is."""
+    """Return the number of one-way tiles and the missing headings in the first ones, as text; empty if none are missing."""
     one_way = [tile for tile in found if tile.missing]
     if not one_way:
         return ""
@@ -78,7 +78,7 @@ def one_way_words(found: Sequence[TileDirections]) -> str:
 
 
 def missing_words(tile: TileDirections) -> str:
-    """What nothing looks at, in words."""
+    """Return the missing headings as text."""
     return ", ".join(
         f"{count} places face {HEADINGS[(HEADINGS.index(heading) + 4) % len(HEADINGS)]} and none near them {heading}"
         for heading, count in tile.missing.items()
@@ -86,7 +86,7 @@ def missing_words(tile: TileDirections) -> str:
 
 
 def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(K,) which places have another near them that looks the other way."""
+    """Return (K,) which places have another near them that looks the other way."""
     met = np.zeros(len(positions_map), bool)
     if len(positions_map):
         first, second = (
@@ -98,5 +98,5 @@ def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDA
 
 
 def _extent_m(positions_map: Array) -> float:
-    """Diagonal of what holds the places."""
+    """Return the diagonal of the bounding box of the places."""
     return float(np.linalg.norm(np.ptp(positions_map[:, :2], axis=0))) if len(positions_map) else 0.0

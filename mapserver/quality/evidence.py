@@ -29,12 +29,12 @@ class Probes:
 
     @property
     def frames(self) -> Sequence[Probe]:
-        """Those from recordings, or the keyframes where there are none."""
+        """Return the frames from recordings, or the keyframes if there are none."""
         return [*self.held_out, *self.replayed] or self.last_version
 
 
 def examine(draft: MapView, before: MapView | None, probes: Probes, motion: TrajectoryBreaks | None) -> Evidence:
-    """What the probes find in the draft, and in the current version's tiles where there are any; starts are left to the caller."""
+    """Return the results of the probes in the draft, and in the current version's tiles if present; starts are left to the caller."""
     frames = probes.frames
     return Evidence(
         held_out=compare(draft, before, probes.held_out),
@@ -48,16 +48,16 @@ def examine(draft: MapView, before: MapView | None, probes: Probes, motion: Traj
 
 
 def _placed_by_either(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:
-    """Those that the draft or the current version finds: a draft cannot lose what robots do not have.
+    """Return the probes localised in the draft or the current version: a draft cannot lose positions unknown to robots.
 
-    Were those chosen that the current version finds, all that it finds by luck would count against the draft.
+    With only those of the current version, all its chance localisations would count against the draft.
     """
     views = (draft,) if before is None else (before, draft)
     return [p for p in probes if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
 
 
 def compare(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Compared | None:
-    """Each probe relocalized in both maps from a prior where it was taken; None without probes."""
+    """Relocalize each probe in both maps from a prior at its own position; None without probes."""
     if not probes:
         return None
     now = [relocalized(draft, probe, probe.map_from_cam) for probe in probes]
@@ -90,7 +90,7 @@ def _figures(view: MapView, probes: Sequence[Probe], fixes: Sequence[Fix | None]
 
 
 def _residual_px(view: MapView, probe: Probe, fix: Fix) -> float:
-    """Median distance of a fix's landmarks from the pixels at which they should be."""
+    """Return the median distance of a fix's landmarks from their expected pixels."""
     assert fix.matches is not None
     features, rows = fix.matches.T
     expected = probe.camera.pixel_from_point(transform_points(se3_inverse(fix.map_from_cam), view.points_map[rows]))
@@ -98,7 +98,7 @@ def _residual_px(view: MapView, probe: Probe, fix: Fix) -> float:
 
 
 def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
-    """Each probe offered with the prior of the far place that looks most like it; None where there is no such place."""
+    """Offer each probe with the prior of the most similar far place; None if there is no such place."""
     offered = accepted = 0
     for probe in probes:
         elsewhere = most_similar_beyond(view, probe, ELSEWHERE_M)
@@ -111,12 +111,12 @@ def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
 def trajectory_breaks(
     stamps_ns: Stamps, map_from_body: Array, odom_from_body: Array, covariances: Array, tracked: NDArray[np.bool_]
 ) -> TrajectoryBreaks | None:
-    """Where a survey's trajectory leaves what odometry saw, over stretches of three metres; None where it is shorter.
+    """Find differences between a survey's trajectory and odometry, over stretches of three metres; None if it is shorter.
 
     Both (F, 4, 4) of the frames at stamps_ns (F,), covariances (F, 6, 6) of odometry, rotation first; stretches with a frame that
-    is not tracked (F,), or more than half a second after the one before, are left out: odometry knows little there. A stretch
-    differs where its end is off by more than 0.15 m, 5 % of the way and three standard deviations of the odometry together.
-    Those that begin within a metre of the one before are one break.
+    is not tracked (F,), or more than half a second after the previous one, are left out: odometry is uncertain there. A stretch
+    differs if its end is off by more than 0.15 m, 5 % of its length and three standard deviations of the odometry together.
+    Those that begin within a metre of the previous one are one break.
     """
     steps_m = np.linalg.norm(np.diff(odom_from_body[:, :3, 3], axis=0), axis=1)
     along_m = np.concatenate([[0.0], np.cumsum(steps_m)])

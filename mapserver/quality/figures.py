@@ -1,4 +1,4 @@
-"""Figures of the evidence about a draft's tiles; docs/reports.md says what they mean. Light: the store reads them."""
+"""Figures of the evidence about a draft's tiles; see docs/reports.md. Light imports: the store reads them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from fleetmap.errors import MapFormatError
 from fleetmap.mapformat import Manifest
 
 TRUSTED_KEY = "trusted_calibrations"
-"""The key of a manifest's configuration that holds the calibrations that a person trusts."""
+"""Key of a manifest's configuration with the calibrations trusted by an operator."""
 
 EVIDENCE_KEY = "evidence"
-"""The key of a manifest's report that holds what the gate judges by, so that it goes wherever the version goes."""
+"""Key of a manifest's report with the gate's evidence, which therefore stays with the version."""
 
 
 class ProbeFigures(msgspec.Struct, frozen=True):
@@ -36,14 +36,14 @@ class Compared(msgspec.Struct, frozen=True):
 
 
 class Aliasing(msgspec.Struct, frozen=True):
-    """Frames offered with the prior of the place elsewhere that looks most like theirs, and the share that was taken for it."""
+    """Frames offered with the prior of the most similar other place, and the share wrongly localised there."""
 
     offered: int
     accepted_share: float
 
 
 class LookAlike(msgspec.Struct, frozen=True):
-    """A place, (x, y) in `map`, that is taken for another one once nothing around it is mapped; recall: landmark recall there."""
+    """A place, (x, y) in `map`, mistaken for another one if its surroundings are unmapped; recall: landmark recall there."""
 
     place: tuple[float, float]
     taken_for: tuple[float, float]
@@ -51,10 +51,10 @@ class LookAlike(msgspec.Struct, frozen=True):
 
 
 class Starts(msgspec.Struct, frozen=True):
-    """Frames without a prior in the tiles less all around their own place: robots that start where nothing is mapped.
+    """Frames without a prior in the tiles without those around their own place: robots that start at an unmapped place.
 
-    taken_share: of those that are taken for another place. lookalike_recall: the landmark recall that a start without a prior must
-    exceed: an unmapped place like these exceeds it with a probability of at most max_wrong_share. lookalikes: the taken frames.
+    taken_share: share localised at another place. lookalike_recall: landmark recall that a start without a prior must
+    exceed: an unmapped place like these exceeds it with a probability of at most max_wrong_share. lookalikes: the wrongly localised frames.
     """
 
     frames: int
@@ -65,7 +65,7 @@ class Starts(msgspec.Struct, frozen=True):
 
 
 class TrajectoryBreaks(msgspec.Struct, frozen=True):
-    """Stretches of the survey against odometry: in how many separate places its trajectory is torn, and the worst difference."""
+    """Stretches of the survey against odometry: number of separate breaks of its trajectory, and the worst difference."""
 
     stretches: int
     breaks: int
@@ -73,10 +73,10 @@ class TrajectoryBreaks(msgspec.Struct, frozen=True):
 
 
 class TileDirections(msgspec.Struct, frozen=True):
-    """Places of a tile by the heading that they look (E along x of `map`, N along y); tile: its x and y.
+    """Places of a tile by heading (E along x of `map`, N along y); tile: its x and y.
 
-    seen: places by their heading. missing: headings of which nothing was seen at places that were passed the other way, with how
-    many those are; empty where both ways were driven.
+    seen: places by their heading. missing: unseen headings of places passed the other way, with their
+    number; empty if both ways were driven.
     """
 
     tile: tuple[int, int]
@@ -85,10 +85,10 @@ class TileDirections(msgspec.Struct, frozen=True):
 
 
 class RigEvidence(msgspec.Struct, frozen=True):
-    """What recordings say about one calibration; rig: its fingerprint.
+    """Evidence of recordings on one calibration; rig: its fingerprint.
 
-    judged: subjects ("pair geometry", ...) that a recording found right, of this draft or of a version that it was built on. not_judged: by
-    subject what this draft's recordings lack. doubted: by subject what speaks against the calibration, without deciding.
+    judged: subjects ("pair geometry", ...) found right by a recording, of this draft or of a version that it was built on. not_judged: by
+    subject the data missing in this draft's recordings. doubted: by subject the undecided evidence against the calibration.
     """
 
     rig: str
@@ -97,13 +97,13 @@ class RigEvidence(msgspec.Struct, frozen=True):
     doubted: dict[str, str] = {}
 
     def unknown(self) -> dict[str, str]:
-        """By subject that nothing ever judged what is missing."""
+        """The missing data by subject never judged."""
         return {subject: missing for subject, missing in self.not_judged.items() if subject not in self.judged}
 
 
 @dataclass(frozen=True, slots=True)
 class TrustedCalibration:
-    """A person's word that the calibration `rig` (its fingerprint) is right; subjects: those that no recording had judged by then."""
+    """An operator's confirmation that the calibration `rig` (fingerprint) is right; subjects: those not judged by then."""
 
     rig: str
     subjects: list[str]
@@ -112,12 +112,12 @@ class TrustedCalibration:
 
     @property
     def sentence(self) -> str:
-        """It in words."""
+        """It as text."""
         return f"calibration {self.rig} is trusted by {self.actor} ({self.reason}): nothing judged its {', '.join(self.subjects)}"
 
 
 def trusted_calibrations(manifest: Manifest) -> list[TrustedCalibration]:
-    """The calibrations of a version that a person trusts; MapFormatError for a damaged entry."""
+    """Return the calibrations of a version trusted by an operator; MapFormatError for a damaged entry."""
     try:
         return msgspec.convert(manifest.configuration.get(TRUSTED_KEY, []), list[TrustedCalibration])
     except msgspec.ValidationError as error:
@@ -125,7 +125,7 @@ def trusted_calibrations(manifest: Manifest) -> list[TrustedCalibration]:
 
 
 def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
-    """One for each calibration, in their order: what one recording judged is judged, what one doubts is doubted."""
+    """Merge the evidence per calibration, in order: judged if one recording judged it, doubted if one doubts it."""
     found: dict[str, RigEvidence] = {}
     for new in rigs:
         old = found.get(new.rig, RigEvidence(new.rig))
@@ -135,7 +135,7 @@ def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """All of it; None where there was nothing to judge by."""
+    """All evidence; None for a part without data."""
 
     held_out: Compared | None = None
     replayed: Compared | None = None
@@ -149,7 +149,7 @@ class Evidence(msgspec.Struct, frozen=True):
 
 
 def carried_evidence(manifest: Manifest) -> Evidence | None:
-    """The evidence in a manifest, without directions and starts; None for one made without. MapFormatError for a damaged entry."""
+    """Return the evidence in a manifest, without directions and starts; None if absent. MapFormatError for a damaged entry."""
     found = manifest.report.get(EVIDENCE_KEY)
     try:
         return None if found is None else msgspec.convert(found, Evidence)

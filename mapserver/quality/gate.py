@@ -1,4 +1,4 @@
-"""Gate before publishing: reasons against a draft, by itself and beside the version that robots use now. Pure."""
+"""Gate before publishing: reasons against a draft, by itself and compared with the robots' present version. Pure."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Share = Annotated[float, msgspec.Meta(ge=0)]
 
 
 class GateSettings(Section, frozen=True):
-    """What a draft must be able to do, and how far it may fall behind the current version before a person must look at it."""
+    """Requirements on a draft, and the allowed loss against the current version before an operator must check it."""
 
     min_landmarks_share: Share = 0.7
     min_coverage_share: Share = 0.8
@@ -35,10 +35,10 @@ class GateSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class GateVerdict:
-    """The gate's answer. reasons: against publishing, none if accepted; hard ones stand even against --force.
+    """Result of the gate. reasons: against publishing, empty if accepted; hard ones stand even against --force.
 
-    unjudged: the reasons that a person's trust in the calibration takes away. report: the figures that were looked at; under `passed` the
-    names of the checks without a reason against the draft, under `not_judged` what evidence is missing for; `unjudged`, too.
+    unjudged: the reasons removed by trust in the calibration. report: the checked figures; under `passed` the names of the
+    checks without a reason against the draft, under `not_judged` those without evidence; `unjudged`, too.
     """
 
     reasons: tuple[str, ...]
@@ -48,17 +48,17 @@ class GateVerdict:
 
     @property
     def accepted(self) -> bool:
-        """Whether there is no reason against the draft."""
+        """True if there is no reason against the draft."""
         return not self.reasons and not self.hard_reasons
 
 
 def judge(
     draft: Manifest, current: Manifest | None, settings: GateSettings, evidence: Evidence | None = None
 ) -> GateVerdict:
-    """The verdict on a draft; `current` is None for a site's first version, `evidence` for a draft that nobody examined.
+    """Return the verdict on a draft; `current` is None for a site's first version, `evidence` for a draft without examination.
 
-    What cannot be judged, for want of frames or of a version to compare with, is named and refuses nothing; but for the calibration of a
-    site's first version, whose metres all later ones keep: nobody trusts that before a recording has judged it, or a person says so.
+    Figures without frames or without a version to compare with are listed as not judged and refuse nothing, except the calibration of a
+    site's first version, which sets the scale of all later ones: it needs a recording that judges it, or an operator's confirmation.
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
     examined = evidence or Evidence()
@@ -109,7 +109,7 @@ def _motion_reasons(motion: TrajectoryBreaks, settings: GateSettings) -> list[st
 
 
 def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
-    """What one kind of frames says against a draft: figures on the wrong side of their limit, which itself is allowed."""
+    """Yield reasons from one kind of frames: figures on the wrong side of their limit; the limit itself is allowed."""
     draft, before = compared.draft, compared.before
     least = [("localised_share", draft.localised_share, settings.min_localised_share, "min_localised_share")]
     most = [
@@ -137,15 +137,15 @@ def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: Gat
     if aliasing.accepted_share <= max(settings.max_aliased_share, usual):
         return []
     return [
-        f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are taken for another place that looks "
-        f"like theirs, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
+        f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are localised at another, similar "
+        f"place, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
     ]
 
 
 def _calibration_reasons(
     draft: Manifest, examined: Evidence, *, is_first: bool
 ) -> tuple[list[str], list[str], list[str]]:
-    """Doubts, which are for a person; what nothing judged of a first map, with which later ones are compared; what else is unknown."""
+    """Return doubts, for an operator; parts of a first map never judged, the reference of later ones; other unknown parts."""
     if examined.calibrations is None:
         return [], [], ["calibration"]
     trusted = {choice.rig: choice for choice in trusted_calibrations(draft)}
@@ -165,7 +165,7 @@ def _calibration_reasons(
 
 
 def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
-    """A tile is covered where it has at least half as many landmarks as before."""
+    """Return by tile its landmarks against before: a tile is covered with at least half as many."""
     before = {(tile.x, tile.y): tile.landmarks for tile in current.tiles if tile.landmarks}
     after = {(tile.x, tile.y): tile.landmarks for tile in draft.tiles}
     covered = sum(count for cell, count in before.items() if 2 * after.get(cell, 0) >= count)
@@ -204,13 +204,13 @@ def _hard_reasons(draft: Manifest, strangers: list[str] | None) -> tuple[str, ..
     reasons = []
     if not draft.tiles or draft.landmarks == 0:
         reasons.append(
-            f"it has {len(draft.tiles)} tiles and {draft.landmarks} landmarks: no robot could localise in it; look at "
-            "the build's report and at `mapserver doctor` for its recordings"
+            f"it has {len(draft.tiles)} tiles and {draft.landmarks} landmarks: no robot could localise in it; see "
+            "the build's report and `mapserver doctor` for its recordings"
         )
     reasons += strangers or ()
     if draft.report.get("scale") == "unknown":
         reasons.append(
-            "it has a scale of its own: one camera without IMU saw no dock or tag that could tell the metres; record with an IMU, a "
+            "it has a scale of its own: one camera without IMU saw no dock or tag that gives the scale; record with an IMU, a "
             "second camera, or past two docks"
         )
     return tuple(reasons)

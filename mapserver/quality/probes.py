@@ -1,4 +1,4 @@
-"""Probes: the features of single images whose place is known from elsewhere, to be relocalized in a map."""
+"""Probes: features of single images with known poses, to be relocalized in a map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ from mapserver.quality.figures import LookAlike, Starts
 from mapserver.survey.survey_map import SurveyMap
 
 PRIOR_RADIUS_M = 3.0
-ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # a neighbourhood that shares no place with the true one's
+ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # the two neighbourhoods share no place
 _SAME_WAY_COSINE = 0.5
 _ROBOTS = RelocalizerSettings()
-_ENOUGH_LANDMARKS = 4 * _ROBOTS.fix.min_inliers  # robots get a part of them, and match a part of that
+_ENOUGH_LANDMARKS = 4 * _ROBOTS.fix.min_inliers  # robots get some of them, and match a part
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """What a camera saw, and map_from_cam (4, 4) where that was, as the reference says."""
+    """Features of a camera image, and its reference pose map_from_cam (4, 4)."""
 
     camera: StereoCamera
     features: FrameFeatures
@@ -38,13 +38,13 @@ class Probe:
 
 
 def probe_features(frame: RectifiedFrame, camera: StereoCamera, survey_orb: OrbSettings) -> FrameFeatures:
-    """What a robot that extracts as the survey did would extract from a frame, as many as robots do, with the depth of all."""
+    """Return the features that a robot with the survey's extractor would extract from a frame, as many as on robots, all with depth."""
     orb = msgspec.structs.replace(survey_orb, count=_ROBOTS.orb.count)
     return with_depth(frame, extract(frame.left, orb), camera, _ROBOTS.stereo)
 
 
 def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix | None:
-    """The best fix that robots would believe around a prior: within PRIOR_RADIUS_M, looking a similar way.
+    """Return the best fix accepted by robots around a prior: within PRIOR_RADIUS_M, with a similar heading.
 
     Only places around the prior are searched, so its accuracy does not matter.
     """
@@ -56,8 +56,8 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
 
 
 def taken_elsewhere(view: MapView, probe: Probe, radius_m: float) -> Fix | None:
-    """Of the fixes that robots would believe without a prior, were nothing within a radius of a probe mapped, the one with the
-    largest landmark recall; None without any."""
+    """Return the fix with the largest landmark recall among those accepted by robots without a prior, if nothing within a
+    radius of a probe were mapped; None without any."""
     place_m = probe.map_from_cam[:3, 3]
     is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > radius_m
     fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
@@ -67,17 +67,17 @@ def taken_elsewhere(view: MapView, probe: Probe, radius_m: float) -> Fix | None:
 
 
 def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:
-    """(4, 4) map_from_cam of the place that looks most like a probe among those beyond a radius around it; None without any."""
+    """Return (4, 4) map_from_cam of the place most similar to a probe beyond a radius around it; None if absent."""
     is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1) > radius_m
     places = view.similar_places(probe.features.features.descriptors, is_far, 1)
     return np.asarray(view.map_from_cam[places[0]]) if len(places) else None
 
 
 def held_out_frames(keyframes: Sequence[int], measured: NDArray[np.bool_], count: int) -> list[int]:
-    """At most `count` numbers, evenly spread, of measured frames (F,) that are no keyframes: nothing of them is in the map.
+    """Return up to `count` numbers, evenly spread, of measured frames (F,) that are not keyframes: none of their data is in the map.
 
-    Odometry saw them, so that their place between two keyframes is known to millimetres; holding whole stretches back would cost
-    the map those stretches. Empty where every frame is a keyframe.
+    Odometry tracked them, so their position between two keyframes is known to millimetres; excluding whole stretches would
+    leave gaps in the map. Empty if every frame is a keyframe.
     """
     free = measured.copy()
     free[list(keyframes)] = False
@@ -85,17 +85,17 @@ def held_out_frames(keyframes: Sequence[int], measured: NDArray[np.bool_], count
 
 
 def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
-    """At most `count` of the numbers, evenly spread."""
+    """Return at most `count` of the numbers, evenly spread."""
     if len(numbers) <= count:
         return [int(number) for number in numbers]
     return [int(n) for n in numbers[np.linspace(0, len(numbers) - 1, count).round().astype(int)]]
 
 
 def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
-    """At most `count` keyframes of a version, with its own landmarks as features, from its archive, without images.
+    """Return at most `count` keyframes of a version, with its own landmarks as features, from its archive, without images.
 
-    They reach all of the site, and the place of each is what robots are told today. Those of later nights observe what was new
-    then, often a few landmarks: no robot could tell its place by so little.
+    They cover all of the site at the robots' present positions. Keyframes of later nights observe only the new landmarks of
+    their night, often too few to localize.
     """
     order = np.argsort(survey_map.obs_keyframe, kind="stable")
     bounds = np.searchsorted(survey_map.obs_keyframe[order], np.arange(len(survey_map.map_from_body) + 1))
@@ -114,7 +114,7 @@ _NAMED = 3
 
 
 def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | None:
-    """Each probe as a start without a prior at a place that the map lacks; None where all of the map lies around each.
+    """Use each probe as a start without a prior at an unmapped place; None if all of the map lies around each.
 
     A robot in an unmapped place is one more such probe: it exceeds the largest recall of n with a probability of 1 / (n + 1).
     Source: Vovk et al. 2005, Algorithmic Learning in a Random World, chapter 2 (conformal prediction).
@@ -137,7 +137,7 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
 
 
 def lookalike_words(starts: Starts | None) -> str:
-    """Where robots without a prior are not believed, in words; empty where they are believed everywhere."""
+    """Return places where robots without a prior are not trusted, as text; empty if there are none."""
     if starts is None or starts.lookalike_recall == 0.0:
         return ""
     worst = sorted(starts.lookalikes, key=lambda alike: -alike.recall)

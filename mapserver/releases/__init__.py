@@ -1,4 +1,4 @@
-"""Releases of maps: publishing, promoting, rolling back, canaries, and what changed between two versions."""
+"""Releases of maps: publishing, promoting, rolling back, canaries, and differences between versions."""
 
 from mapserver.releases.release import (
     difference,

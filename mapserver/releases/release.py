@@ -1,4 +1,4 @@
-"""Releases of an open store: each is decided by `rules` within the one transaction that writes it, and is on the disk at its end."""
+"""Releases of an open store: each is decided by `rules` in the transaction that writes it, and is on the disk when it returns."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,9 +20,9 @@ from mapserver.trust.signing import try_update_lists
 
 _USUAL_GATE = GateSettings()
 SURVEYED = "surveyed_requests"
-"""The key of a build's report that says how much of each request its recordings covered."""
+"""Key of a build's report with the share of each request covered by its recordings."""
 
-_RECENT_NS = 2 * 86_400_000_000_000  # robots that are silent for longer are not chosen to try a version
+_RECENT_NS = 2 * 86_400_000_000_000  # robots silent for longer are not chosen for canaries
 
 
 def publish(
@@ -34,31 +34,31 @@ def publish(
     force: bool = False,
     gate: GateSettings = _USUAL_GATE,
 ) -> int:
-    """Takes a draft (the newest one, if not named) through the gate, makes it current and returns its number.
+    """Take a draft (by default the newest one) through the gate, make it current and return its number.
 
-    force: what the gate says is logged with the actor, and only its hard limits refuse.
+    force: the gate's reasons are logged with the actor, and only its hard limits refuse.
 
-    Raises UsageError where there is no such draft, GateRefusedError for one that is refused (its reasons stay with
-    it), StoreError or MapFormatError for one whose bytes are not all there.
+    Raises UsageError for an unknown draft, GateRefusedError for a refused one (its reasons are stored with
+    it), StoreError or MapFormatError for one with missing bytes.
     """
     draft = rules.chosen_draft(store.releases(site), version)
     if force and not (actor.name and actor.reason):
-        raise UsageError("publishing by force needs who and why; name --reason")
+        raise UsageError("publishing by force needs an actor and a reason; add --reason")
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
     _change(store, site, lambda rows: rules.publication(rows, draft.version, judged_against, actor))
     return draft.version
 
 
 def trust_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> VersionInfo:
-    """The draft with a person's word in its manifest that its calibrations are right.
+    """Return the draft with an operator's confirmation of its calibrations in its manifest.
 
-    It stays a draft for the gate to judge. The word is about calibrations by their fingerprint: versions that are built on this one
-    inherit it, other calibrations do not. Nothing changes where recordings judged all of them, or they are trusted already.
+    It stays a draft for the gate to judge. The confirmation names calibrations by their fingerprint: versions built on this one
+    inherit it, other calibrations do not. No change if recordings judged all of them, or they are already trusted.
 
-    Raises UsageError without a name and a reason, StateError for a version that is no draft, StoreError where the disk refuses.
+    Raises UsageError without a name and a reason, StateError for a version that is not a draft, StoreError on a disk error.
     """
     if not (actor.name and actor.reason):
-        raise UsageError("trusting a calibration needs who and why; name --reason")
+        raise UsageError("trusting a calibration needs an actor and a reason; add --reason")
     manifest, evidence = decode_manifest(store.blob(draft.manifest_sha256)), store.evidence(draft.site, draft.version)
     known = trusted_calibrations(manifest)
     new = [
@@ -75,7 +75,7 @@ def trust_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> Vers
 
 
 def judge_draft(store: MapStore, draft: VersionInfo, gate: GateSettings) -> GateVerdict:
-    """What the gate says of a draft, beside the site's current version."""
+    """Return the gate's verdict on a draft, compared with the site's current version."""
     current = store.current(draft.site)
     return judge(
         store.manifest(draft.site, draft.version),
@@ -86,9 +86,9 @@ def judge_draft(store: MapStore, draft: VersionInfo, gate: GateSettings) -> Gate
 
 
 def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) -> None:
-    """Makes a version that was published before the current one.
+    """Make an earlier published version current.
 
-    Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one whose bytes are not all there.
+    Raises UsageError for an unknown version, StateError for a draft, StoreError or MapFormatError for one with missing bytes.
     """
     store.check_bytes(store.version(site, version))
     _change(store, site, lambda rows: rules.promotion(rows, version, actor))
@@ -97,17 +97,17 @@ def promote(store: MapStore, site: str, version: int, *, actor: Actor = NOBODY) 
 def roll_back(
     store: MapStore, site: str, *, to: int | None = None, canary: int | None = None, actor: Actor = NOBODY
 ) -> int:
-    """Makes the version current that was so before and returns its number; the one that is retires.
+    """Make the previous current version current again and return its number; the present one retires.
 
-    While some robots try another version, that is taken back instead, and the current one stays. to: the version that is to become
-    current; canary: the trial that is to end, by its `id`; None: whichever it is.
+    During a canary that version is withdrawn instead, and the current one stays. to: the expected version to become current; canary:
+    the canary to be ended, by its `id`; None: any.
 
-    Raises StateError where none was current before or it is another one than was named, StoreError or MapFormatError if its bytes are not
-    all there.
+    Raises StateError without a previous current version or if it differs from the expected one, StoreError or MapFormatError if its
+    bytes are incomplete.
     """
     rows = store.releases(site)
     if canary is not None and (rows.canary is None or rows.canary.id != canary):
-        raise StateError(f"trial {canary} of site {site} has ended already; look at `versions`")
+        raise StateError(f"trial {canary} of site {site} has ended already; check `versions`")
     if rows.canary is not None and to is None:
         outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
         end_canary(store, rows.canary, promote=False, outcome=outcome, actor=actor)
@@ -121,9 +121,9 @@ def roll_back(
 def start_canary(
     store: MapStore, site: str, version: int, share: float, *, actor: Actor = NOBODY, gate: GateSettings = _USUAL_GATE
 ) -> CanaryRow:
-    """Lets a share of the site's robots run a version before the others; a draft goes through the gate first.
+    """Let a share of the site's robots run a version before the others; a draft goes through the gate first.
 
-    Raises what `rules.check_canary` raises, and what `publish` raises for drafts.
+    Raises the errors of `rules.check_canary`, and those of `publish` for drafts.
     """
     rows = store.releases(site)
     base = rules.check_canary(rows, version, share).version
@@ -140,9 +140,9 @@ def start_canary(
 
 
 def end_canary(store: MapStore, canary: CanaryRow, *, promote: bool, outcome: str, actor: Actor = NOBODY) -> None:
-    """Makes the canary's version current, or takes it back from the robots that try it, and retires it.
+    """Make the canary's version current, or withdraw it from its robots and retire it.
 
-    Raises StateError where it does not run any more, and what `promote` raises.
+    Raises StateError if it is no longer running, and the errors of `promote`.
     """
     if promote:
         store.check_bytes(store.version(canary.site, canary.version))
@@ -153,14 +153,14 @@ def end_canary(store: MapStore, canary: CanaryRow, *, promote: bool, outcome: st
 
 
 def difference(store: MapStore, site: str, before: int, after: int) -> Difference:
-    """What changed between two versions of a site; errors as of `MapStore.manifest`."""
+    """Return the difference between two versions of a site; errors as of `MapStore.manifest`."""
     manifests = (store.manifest(site, before), store.manifest(site, after))
     size = store.version(site, after).manifest_bytes
     return manifest_difference(*manifests, size, lambda sha256: decode_tile(store.blob(sha256)))
 
 
 def _change(store: MapStore, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
-    """As `MapStore.change_releases`, signs what robots may run now, if the keys are here, and ends requests that were surveyed."""
+    """As `MapStore.change_releases`; also signs the allowed versions, if the keys are present, and closes surveyed requests."""
     changes = store.change_releases(site, decide)
     try_update_lists(store)
     if any(state == "current" for _, state in changes.states):
@@ -169,7 +169,7 @@ def _change(store: MapStore, site: str, decide: Callable[[SiteReleases], Release
 
 
 def _end_surveyed(store: MapStore, site: str) -> None:
-    """Takes requests off the list that the current version, or one that it was built on, covers with its own recordings."""
+    """Close requests covered by the current version, or one that it was built on, with its own recordings."""
     waiting = {request.id for request in store.survey_requests(site)}
     known = {info.version: info for info in store.versions(site)} if waiting else {}
     current = store.current(site)
@@ -187,7 +187,7 @@ def _end_surveyed(store: MapStore, site: str) -> None:
 
 
 def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSettings, *, force: bool) -> int | None:
-    """The version that the draft was compared with; keeps the verdict, errors as of `publish`."""
+    """Return the version used for comparison; stores the verdict, errors as of `publish`."""
     site = draft.site
     store.check_bytes(draft)
     current = store.current(site)

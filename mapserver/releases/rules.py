@@ -1,7 +1,7 @@
-"""Rules of releases: which version may become current, and what that changes. Pure functions over rows of the store.
+"""Rules of releases: versions that may become current, and the resulting changes. Pure functions over rows of the store.
 
 draft -> current when published; current -> published when another becomes current, -> retired when it is rolled back;
-published -> retired by `gc`, once newer ones are enough; published or retired -> current when promoted.
+published -> retired by `gc`, once there are enough newer ones; published or retired -> current when promoted.
 """
 
 import shlex
@@ -23,7 +23,7 @@ from mapserver.store.rows import (
 
 
 def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
-    """The draft of this number, the newest one where none is named; UsageError without any, StateError for no draft."""
+    """Return the draft of this number, by default the newest one; UsageError without any, StateError for a version that is not a draft."""
     if number is not None:
         return _draft(rows, number)
     drafts = [info for info in rows.versions.values() if info.state == "draft"]
@@ -36,20 +36,20 @@ def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
 
 
 def is_forced(verdict: GateVerdict, *, force: bool) -> bool:
-    """Whether a draft that the gate refuses is published all the same: only where no hard reason stands against it."""
+    """True if a refused draft is published by force: only without hard reasons against it."""
     return force and bool(verdict.reasons) and not verdict.hard_reasons
 
 
 def refusal(draft: VersionInfo, verdict: GateVerdict, store: Path) -> GateRefusedError:
-    """The error for a draft that the gate refuses; its last line is the command that publishes it all the same, where there is one."""
+    """Return the error for a refused draft; its last line is the command that publishes it nevertheless, if possible."""
     words = f"draft {draft.version} of {draft.site} is refused: {'; '.join((*verdict.hard_reasons, *verdict.reasons))}"
     if verdict.hard_reasons:
         return GateRefusedError(f"{words}; this cannot be forced")
     trusts = set(verdict.reasons) == set(verdict.unjudged)
     when = (
-        "Record what is missing, or, if you know that the calibration is right"
+        "Record the missing data, or, if you know that the calibration is right"
         if trusts
-        else "To publish it all the same"
+        else "To publish it nevertheless"
     )
     where = f"--site {draft.site} --store {shlex.quote(str(store))} --version {draft.version}"
     option = "--trust-calibration" if trusts else "--force"
@@ -59,7 +59,7 @@ def refusal(draft: VersionInfo, verdict: GateVerdict, store: Path) -> GateRefuse
 
 
 def publication(rows: SiteReleases, draft: int, judged_against: int | None, actor: Actor) -> ReleaseChanges:
-    """Makes a draft current that was compared with version `judged_against`; StateError where someone was faster."""
+    """Make a draft current that was compared with version `judged_against`; StateError if another version became current meanwhile."""
     left = None if rows.current is None else rows.current.version
     if left != judged_against:
         raise StateError(
@@ -72,7 +72,7 @@ def publication(rows: SiteReleases, draft: int, judged_against: int | None, acto
 
 
 def promotion(rows: SiteReleases, version: int, actor: Actor) -> ReleaseChanges:
-    """Makes a published or retired version current, nothing where it is; StateError for a draft."""
+    """Make a published or retired version current, no change if it is; StateError for a draft."""
     wanted = _known(rows, version)
     if wanted.state == "current":
         return ReleaseChanges()
@@ -86,12 +86,12 @@ def promotion(rows: SiteReleases, version: int, actor: Actor) -> ReleaseChanges:
 
 
 def rollback(rows: SiteReleases, actor: Actor, to: int | None = None) -> ReleaseChanges:
-    """Makes the version current that was so before and retires the one that is; StateError where none was, or where it is not `to`."""
+    """Make the previous current version current and retire the present one; StateError without a previous one, or if it is not `to`."""
     current, target = rows.current, rows.rollback_target
     if to is not None and (to != target or rows.canary is not None):
-        raise StateError(f"a rollback of site {rows.site} no longer leads to version {to}; look at `versions`")
+        raise StateError(f"a rollback of site {rows.site} no longer leads to version {to}; check `versions`")
     if current is None or target is None:
-        raise StateError(f"site {rows.site} has no version that was current before; `versions` shows what to promote")
+        raise StateError(f"site {rows.site} has no earlier current version; `versions` lists versions to promote")
     detail = f"from version {current.version} to {target}"
     return ReleaseChanges(
         states=((current.version, "retired"), (target, "current")),
@@ -101,10 +101,10 @@ def rollback(rows: SiteReleases, actor: Actor, to: int | None = None) -> Release
 
 
 def check_canary(rows: SiteReleases, version: int, share: float) -> VersionInfo:
-    """The current version, with which a canary of `version` would be compared.
+    """Return the current version, the reference for a canary of `version`.
 
-    Raises UsageError for an unknown version or a share outside of 0 to 1, StateError where the site has no current version, this
-    is it, or a canary runs already.
+    Raises UsageError for an unknown version or a share outside of 0 to 1, StateError if the site has no current version, it is
+    `version`, or a canary is running.
     """
     _known(rows, version)
     if not 0 < share < 1:
@@ -113,17 +113,17 @@ def check_canary(rows: SiteReleases, version: int, share: float) -> VersionInfo:
         held = "has no current version" if rows.current is None else f"has version {version} as its current one"
         raise StateError(f"site {rows.site} {held}; a canary is compared with another, current version")
     if rows.canary is not None:
-        raise StateError(f"site {rows.site} tries version {rows.canary.version} already; `rollback` takes it back")
+        raise StateError(f"site {rows.site} has a canary of version {rows.canary.version}; `rollback` withdraws it")
     return rows.current
 
 
 def canary_start(rows: SiteReleases, new: NewCanary) -> ReleaseChanges:
-    """Begins a canary; a draft becomes a published version that is not current.
+    """Start a canary; a draft becomes a published version that is not current.
 
-    Raises StateError where another version became current meanwhile or another canary began, and what `check_canary` raises.
+    Raises StateError if another version became current meanwhile or another canary began, and the errors of `check_canary`.
     """
     if rows.current is None or rows.current.version != new.base_version or rows.canary is not None:
-        raise StateError(f"site {rows.site} was changed by somebody else meanwhile; look at `versions`, try again")
+        raise StateError(f"site {rows.site} was changed meanwhile by another operator; check `versions` and try again")
     check_canary(rows, new.version, new.share)
     detail = f"version {new.version} for {new.share:.1%} of the robots, beside version {new.base_version}"
     log: tuple[LogEntry, ...] = (LogEntry("canary_started", detail, new.version, new.actor),)
@@ -133,13 +133,13 @@ def canary_start(rows: SiteReleases, new: NewCanary) -> ReleaseChanges:
 
 
 def canary_promotion(rows: SiteReleases, canary: CanaryRow, actor: Actor) -> ReleaseChanges:
-    """Makes the canary's version current; raises StateError where it does not run any more."""
+    """Make the canary's version current; raises StateError if it is no longer running."""
     _check_running(rows, canary)
     return promotion(rows, canary.version, actor)
 
 
 def canary_withdrawal(rows: SiteReleases, canary: CanaryRow, outcome: str, actor: Actor) -> ReleaseChanges:
-    """Ends a canary and retires its version; raises StateError where it does not run any more."""
+    """End a canary and retire its version; raises StateError if it is no longer running."""
     _check_running(rows, canary)
     detail = f"version {canary.version}; version {canary.base_version} stays current"
     entry = LogEntry("canary_rolled_back", detail, canary.version, replace(actor, reason=outcome))
@@ -152,7 +152,7 @@ def canary_withdrawal(rows: SiteReleases, canary: CanaryRow, outcome: str, actor
 
 
 def _becomes_current(rows: SiteReleases, version: int, entry: LogEntry) -> ReleaseChanges:
-    """Ends a canary that runs: its comparison is over."""
+    """Make a version current and end a running canary, whose comparison is over."""
     left = () if rows.current is None else ((rows.current.version, "published"),)
     states = (*left, (version, "current"))
     if rows.canary is None:
@@ -172,7 +172,7 @@ def _becomes_current(rows: SiteReleases, version: int, entry: LogEntry) -> Relea
 
 def _check_running(rows: SiteReleases, canary: CanaryRow) -> None:
     if rows.canary is None or rows.canary.id != canary.id:
-        raise StateError(f"version {canary.version} of site {canary.site} is not tried any more; look at `versions`")
+        raise StateError(f"version {canary.version} of site {canary.site} is no longer a canary; check `versions`")
 
 
 def _known(rows: SiteReleases, version: int) -> VersionInfo:

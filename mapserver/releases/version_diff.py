@@ -13,7 +13,7 @@ TileReader = Callable[[str], Tile]
 
 @dataclass(frozen=True, slots=True)
 class SideBySide:
-    """A figure of the builds' reports; None where a report does not have it."""
+    """A figure of the builds' reports; None if absent in a report."""
 
     before: Any
     after: Any
@@ -24,8 +24,8 @@ class Difference:
     """From version `before` to version `after` of a site.
 
     Tiles are counted by their cell, landmarks by their id. landmarks_moved: with other coordinates; moved_median_m and
-    moved_max_m say how far, None where none moved. fetch_bytes: manifest, tiles and vocabulary that a robot with all
-    of `before` downloads; full_bytes: what a robot with nothing does. quality: by key of the builds' reports.
+    moved_max_m: their displacement, None without any. fetch_bytes: manifest, tiles and vocabulary downloaded by a robot with all
+    of `before`; full_bytes: by a robot without any map. quality: by key of the builds' reports.
     """
 
     site: str
@@ -50,7 +50,7 @@ class Difference:
 def manifest_difference(
     before: Manifest, after: Manifest, after_manifest_bytes: int, read_tile: TileReader
 ) -> Difference:
-    """The difference of two manifests; `read_tile` is asked only for tiles that are not in both."""
+    """Return the difference of two manifests; `read_tile` is called only for tiles that are not in both."""
     old, new = ({(tile.x, tile.y): tile for tile in manifest.tiles} for manifest in (before, after))
     known = {tile.sha256 for tile in before.tiles}
     changed = {cell for cell in old.keys() & new.keys() if old[cell].sha256 != new[cell].sha256}

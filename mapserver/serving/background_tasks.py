@@ -26,7 +26,7 @@ _PRUNE_EVERY_S = 600.0
 _CANARIES_EVERY_S = 10.0
 _LOOK_EVERY_S = 0.2
 _JOBS_EVERY_S = 20.0
-_ADMIT_EVERY_S = 1.0  # what changes meanwhile goes together
+_ADMIT_EVERY_S = 1.0  # changes in between are combined
 _CONNECTED_EVERY_S = 5.0
 _ALERTS_EVERY_S = 10.0
 _log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class BackgroundTask:
-    """A function that is called every `every_s` seconds."""
+    """A function called every `every_s` seconds."""
 
     name: str
     every_s: float
@@ -45,17 +45,15 @@ class BackgroundTask:
 def server_tasks(
     store: MapStore, fleet: Fleet, bus_service: BusService, canary: CanarySettings
 ) -> list[BackgroundTask]:
-    """All background tasks of a server."""
+    """Return all background tasks of a server."""
     return [
-        # Before the announcement: robots take only what the lists admit.
+        # Before the announcement: robots accept only versions on the lists.
         BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
         BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
         BackgroundTask("keeping reports", _FLUSH_EVERY_S, fleet.flush),
         BackgroundTask("looking for robots", _PRESENCE_EVERY_S, bus_service.look_for_robots),
         BackgroundTask("removing old reports", _PRUNE_EVERY_S, fleet.prune),
-        BackgroundTask(
-            "looking for jobs that were killed", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())
-        ),
+        BackgroundTask("searching for killed jobs", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
         BackgroundTask("looking at canaries", _CANARIES_EVERY_S, lambda: review(store, canary, time.time_ns())),
     ]
 
@@ -63,7 +61,7 @@ def server_tasks(
 def alert_tasks(
     store: MapStore, fleet: Fleet, settings: AlertSettings, webhook: Webhook | None
 ) -> list[BackgroundTask]:
-    """Looks for what the webhook should be told; nothing without one."""
+    """Return the task that finds alerts for the webhook; empty without one."""
     if webhook is None:
         return []
     watch = AlertWatch(lambda: active_alerts(store, fleet, settings, time.time_ns()), webhook.put, time.time_ns)
@@ -71,7 +69,7 @@ def alert_tasks(
 
 
 def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:
-    """Those of the bus's door. Apart from the others, because a robot that was stolen must not wait for them."""
+    """Return the tasks of bus admission. They run separately, because revoking a stolen robot must not wait for others."""
     if guard is None:
         return []
 
@@ -81,13 +79,13 @@ def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask
 
     return [
         BackgroundTask("admitting robots", _ADMIT_EVERY_S, guard.follow),
-        BackgroundTask("looking at who is connected", _CONNECTED_EVERY_S, look),
+        BackgroundTask("checking connections", _CONNECTED_EVERY_S, look),
     ]
 
 
 async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
-    """Runs them in turn, in a thread, until it is cancelled. One that fails is tried again at its next time."""
-    refusals = LogLimit(_log)  # a fault that stays would fill the log, once a second
+    """Run them in turn, in a thread, until cancelled. A failed one is tried again at its next time."""
+    refusals = LogLimit(_log)  # a lasting fault would fill the log every second
     while True:
         for task in tasks:
             if time.monotonic() < task.due_s:
@@ -95,10 +93,10 @@ async def run_background_tasks(tasks: list[BackgroundTask]) -> None:
             try:
                 await asyncio.to_thread(task.act)
             except FleetmapError as error:
-                # A store that is busy for a moment must not stop the server; robots also ask by themselves.
+                # A briefly busy store must not stop the server; robots also query by themselves.
                 refusals.warning(task.name, "%s failed: %s", task.name, error)
             except Exception:
-                # A fault in one task must not end the others.
+                # An error in one task must not end the others.
                 _log.exception("%s failed", task.name)
             task.due_s = time.monotonic() + task.every_s
         await asyncio.sleep(_LOOK_EVERY_S)

@@ -1,4 +1,4 @@
-"""The server's side of the bus: answers for versions, manifests and bytes; takes the robots' messages; announces versions."""
+"""The server's side of the bus: answers queries for versions, manifests and bytes; receives robots' messages; announces versions."""
 
 import logging
 import threading
@@ -30,22 +30,22 @@ Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok", "refused" or "dropped", bytes sent)."""
 
 _log = logging.getLogger(__name__)
-MAX_REPORT_BYTES = 16 << 10  # a health report with everything in it has 3 kB, a pose 0.5 kB
-# What a robot may publish, at once and in a second: robots send health once a second, poses with every frame, an ack with a version.
-RENEWAL_RATE = (5, 1 / 60)  # of a robot: each is a signature, and a line in the log
+MAX_REPORT_BYTES = 16 << 10  # a complete health report has 3 kB, a pose 0.5 kB
+# A robot's limit of messages, at once and per second: health once a second, poses with every frame, an ack per version.
+RENEWAL_RATE = (5, 1 / 60)  # per robot: each costs a signature and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _CACHED_BYTES = 64_000_000
-_ENTRY_BYTES = 200  # what an entry of the cache takes beside its bytes, so that empty ones are bounded too
+_ENTRY_BYTES = 200  # overhead of a cache entry, so that empty ones are limited too
 
 
 class BusService:
-    """Serves a store on a bus from its making to `close`. Reads what other processes publish meanwhile.
+    """Serves a store on a bus from construction to `close`. Also receives publications of other processes.
 
-    Bytes go out in parts; what was sent last is kept in memory, because robots ask for the same things at the same time.
+    Bytes are sent in parts; the latest ones are cached in memory, because robots query the same ones at the same time.
     """
 
     def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count, guard: BusGuard | None = None) -> None:
-        """guard: knows the enrolled robots, where only those may speak; None: any may."""
+        """guard: of the enrolled robots, if only those may connect; None: no restriction."""
         self._guard = guard
         self._store = store
         self._fleet = fleet
@@ -77,9 +77,9 @@ class BusService:
             self._handles.append(bus.queryable(robot_key("*", "*", "renew"), self._counted("renewal", self._renew)))
 
     def announce_changes(self) -> list[str]:
-        """Tells every known robot whose wanted version changed since the last call; returns the sites where somebody was told.
+        """Notify every known robot whose wanted version changed since the last call; return the sites of notified robots.
 
-        The first call tells all of them, because they may have missed what happened while no server ran.
+        The first call notifies all of them, because they may have missed changes while no server ran.
         """
         changed, known = [], set()
         for info in self._store.sites():
@@ -119,12 +119,12 @@ class BusService:
         return lambda key, question: part_of(whole(key), question)
 
     def _sender(self, key: str) -> tuple[str, str]:
-        """Site and robot of a robot's key; LinkError for one that may not speak, also where the bus let it through."""
+        """Return site and robot of a robot's key; LinkError for one without permission, even if the bus let it through."""
         site, robot, _ = split_key(key)
         check_name(robot, "robot")
         if self._guard is not None and not self._guard.access.has_robot(site, robot):
             raise LinkError(
-                f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol {robot} --site {site[:64]}` does that"
+                f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol {robot} --site {site[:64]}` enrols it"
             )
         return site, robot
 
@@ -152,7 +152,7 @@ class BusService:
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)
         if not number.isdecimal() or len(number) > 10:
-            raise LinkError(f"{number[:80]!r} is no version number")
+            raise LinkError(f"invalid version number {number[:80]!r}")
         info = self._store.version(site, int(number))
         if info.state == "draft":
             raise LinkError(f"version {number} of site {site} is a draft; robots get published versions only")
@@ -174,9 +174,7 @@ class BusService:
             site, robot = self._sender(key)
             if not self._rates[what].admits((site, robot)):
                 self._count(what, "dropped", 0)
-                self._refusals.warning(
-                    key, "more messages come under %r than are taken; the rest is dropped", key[:200]
-                )
+                self._refusals.warning(key, "too many messages under %r; the excess is dropped", key[:200])
                 return
             if len(payload) > MAX_REPORT_BYTES:
                 raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
@@ -196,7 +194,7 @@ class BusService:
             site, _, _ = split_key(key)
             state = decode_message(payload, LiveSurveyState)
             if state.site != check_name(site, "site"):
-                raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; look at who sends it")
+                raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; check its sender")
             self.surveys.take(state)
         except FleetmapError as error:
             self._refuse(key, "survey", error)
@@ -204,13 +202,13 @@ class BusService:
             self._count("survey", "ok", 0)
 
     def _refuse(self, key: str, what: str, error: FleetmapError) -> None:
-        """Published messages have no answer: the log and the metric show the refusal."""
+        """Log and count the refusal: published messages have no answer."""
         self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
         self._count(what, "refused", 0)
 
 
 class ByteCache:
-    """Thread-safe; the bytes that were asked for last. A whole fleet asks for the same tile at once: it is read once."""
+    """Thread-safe cache of the latest bytes. When a whole fleet queries the same tile at once, it is read once."""
 
     def __init__(self, max_bytes: int, read: Callable[[str], bytes]) -> None:
         self._max_bytes, self._read = max_bytes, read
@@ -218,7 +216,7 @@ class ByteCache:
         self._lock = threading.Lock()
 
     def get(self, sha256: str) -> bytes:
-        """The bytes of an address, read where they are not held; errors as of `read`."""
+        """Return the bytes of an address, read if not cached; errors as of `read`."""
         with self._lock:
             if (held := self._held.pop(sha256, None)) is not None:
                 self._held[sha256] = held

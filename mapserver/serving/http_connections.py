@@ -1,4 +1,4 @@
-"""What strangers may hold open of the HTTP server: connections of one address and of all, and for how long."""
+"""Limits of HTTP connections, per address and in total, and of their duration."""
 
 import asyncio
 import logging
@@ -17,17 +17,17 @@ from fleetmap.log_lines import LogLimit
 
 MAX_CONNECTIONS, MAX_OF_ADDRESS = 512, 64
 MAX_HEAD_BYTES = 16 << 10
-HEAD_S = 10.0  # until a request's head is there, also behind the request before; and for the handshake of TLS
+HEAD_S = 10.0  # until the headers are complete, also on a kept connection; and for the TLS handshake
 BACKLOG = 256
 _LOOK_EVERY_S = 1.0
-_TAKEN_S, _TAKEN_BYTES = 30.0, 150_000  # a client that takes less of what waits for it holds the server's memory
-_BYTES_ACKED = 120  # place of tcpi_bytes_acked in Linux's struct tcp_info
+_TAKEN_S, _TAKEN_BYTES = 30.0, 150_000  # a slower reader would occupy the server's memory
+_BYTES_ACKED = 120  # offset of tcpi_bytes_acked in Linux's struct tcp_info
 _PROXY = "a proxy"
 _log = logging.getLogger(__name__)
 
 
 def raise_file_limit() -> None:
-    """Lets this process open as many files as its hard limit allows: the usual soft one, 1024, is less than robots and strangers need."""
+    """Raise the process's limit of open files to its hard limit: the usual soft limit, 1024, is less than robots and strangers need."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
@@ -35,20 +35,20 @@ def raise_file_limit() -> None:
 class BoundedListener(socket.socket):
     """A listening socket that closes connections above the limits at once.
 
-    asyncio's own loop calls `accept` of this object; uvloop does not. Connections count from here on, before any handshake of TLS.
+    asyncio's own loop calls `accept` of this object; uvloop does not. Connections count from here on, before the TLS handshake.
     """
 
     def __init__(self, family: int, proxies: frozenset[str] = frozenset()) -> None:
-        """proxies: addresses of proxies, which bring everybody's requests and have no limit of their own."""
+        """proxies: addresses of proxies, which carry the requests of all users and have no limit of their own."""
         super().__init__(family, socket.SOCK_STREAM)
         self._proxies = proxies
-        self._open: list[tuple[socket.socket, str, float]] = []  # with the address and when it was accepted
+        self._open: list[tuple[socket.socket, str, float]] = []  # with address and time of acceptance
         self._refusals = LogLimit(_log)
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """The next connection; ConnectionAbortedError for one above the limits, which is closed.
+        """Return the next connection; ConnectionAbortedError for one above the limits, which is closed.
 
-        Where all are taken, the oldest one of the address that has the most makes room for one of an address that has fewer.
+        If all are in use, the oldest one of the busiest address is closed for one of an address with fewer.
         """
         connection, address = super().accept()
         host = _network(address[0])
@@ -60,7 +60,7 @@ class BoundedListener(socket.socket):
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         if counts[host] >= MAX_OF_ADDRESS:
             self._refuse(connection, f"{host} has {MAX_OF_ADDRESS} connections open")
-        # Numbers of files are given from below: the last quarter is for the store and the bus.
+        # File numbers are allocated from below: the last quarter is reserved for the store and the bus.
         elif len(self._open) >= MAX_CONNECTIONS or connection.fileno() >= limit - limit // 4:
             full = f"{len(self._open)} connections and about {connection.fileno()} of {limit} files are open"
             if most <= counts[host] + 1:
@@ -78,14 +78,14 @@ class BoundedListener(socket.socket):
         raise ConnectionAbortedError(words)
 
     async def watch(self, protocols: set[Any]) -> None:
-        """Ends connections that make no progress, for ever. protocols: uvicorn's, of those whose handshake is done."""
+        """End connections without progress, for ever. protocols: uvicorn's, after their handshake."""
         marks: dict[Any, _Mark] = {}
         while True:
             await asyncio.sleep(_LOOK_EVERY_S)
             try:
                 marks = self._look(marks, protocols)
             except Exception:
-                _log.exception("looking for connections without progress failed")
+                _log.exception("the check for connections without progress failed")
 
     def _look(self, marks: "dict[Any, _Mark]", protocols: set[Any]) -> "dict[Any, _Mark]":
         now_s = time.monotonic()
@@ -95,21 +95,21 @@ class BoundedListener(socket.socket):
             if mark.is_late(now_s):
                 protocol.transport.abort()
         known = {held.fileno() for protocol in protocols if (held := _socket_of(protocol)) is not None}
-        for connection, _, since_s in self._open:  # the handshake of the others is not done
+        for connection, _, since_s in self._open:  # the others have not finished their handshake
             if connection.fileno() not in known and now_s - since_s > HEAD_S:
                 _shut(connection)
         return marks
 
 
 class _Mark:
-    """Since when a connection is as it is. acked: bytes that the client had taken then."""
+    """Start of a connection's present state. acked: bytes acknowledged by the client then."""
 
     def __init__(self, state: object, since_s: float, acked: int) -> None:
         self.state, self.since_s, self.acked = state, since_s, acked
 
     @classmethod
     def after(cls, before: "_Mark | None", protocol: Any, now_s: float) -> "_Mark":
-        state: object = "answers"  # which may take its time
+        state: object = "answers"  # without a time limit
         acked, cycle = 0, getattr(protocol, "cycle", None)
         if protocol.transport.get_write_buffer_size() > 0:
             info = protocol.transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 192)
@@ -125,20 +125,20 @@ class _Mark:
 
 
 def _socket_of(protocol: Any) -> Any:
-    """The socket of a connection; None once it has ended."""
-    with suppress(AttributeError):  # asyncio's TLS transport loses what lies below it when it is closed twice
+    """Return the socket of a connection; None once it has ended."""
+    with suppress(AttributeError):  # asyncio's TLS transport loses its lower transport when it is closed twice
         return protocol.transport.get_extra_info("socket")
     return None
 
 
 def _shut(connection: socket.socket) -> None:
-    """Ends a connection that a transport of the loop holds, which notices."""
-    with suppress(OSError):  # the client was faster
+    """Shut down a connection held by a transport of the loop, which notices it."""
+    with suppress(OSError):  # already closed by the client
         connection.shutdown(socket.SHUT_RDWR)
 
 
 def _network(host: str) -> str:
-    """What counts as one address: of IPv6 the 64 bits that one customer of a network has at least."""
+    """Return the unit that counts as one address: for IPv6 the 64 bits that one customer has at least."""
     address = ip_address(host.partition("%")[0])
     if address.version == 4:
         return str(address)
@@ -146,7 +146,7 @@ def _network(host: str) -> str:
 
 
 def plain_address(address: str) -> str:
-    """Of IPv4 addresses in IPv6 the former, as sockets of both kinds write them."""
+    """Return the IPv4 address of an IPv4-mapped IPv6 address; others are unchanged."""
     found = ip_address(address.partition("%")[0])
     return str(getattr(found, "ipv4_mapped", None) or found)
 
@@ -154,9 +154,9 @@ def plain_address(address: str) -> str:
 def binding_fault(
     address: str, host: str, names: Sequence[str] = (), *, has_tls: bool = False, has_operators: bool = False
 ) -> str:
-    """Why HTTP must not be served like this, and what to do: on this machine to everybody, beyond it with TLS to operators alone.
+    """Return why HTTP must not be served at this address, and the remedy: other machines need TLS and signed-in operators.
 
-    Empty where it may. address: of --http; host: its host; names: others that the server goes by, as a proxy passes them on.
+    Empty if allowed. address: of --http; host: its host; names: other names of the server, passed on by a proxy.
     """
     is_local = is_loopback_name(host)
     steps = []
@@ -164,15 +164,15 @@ def binding_fault(
         steps.append("give it a certificate with --http-cert and --http-key")
     beyond = [name for name in names if not is_loopback_name(name)]
     if (not is_local or beyond) and not has_operators:
-        steps.append("name who may sign in with `mapserver operators add NAME --role admin`")
+        steps.append("add an operator with `mapserver operators add NAME --role admin`")
     if not steps:
         return ""
     where = f"--http {address}" if not is_local else f"--http-name {beyond[0]}"
-    return f"{where} is reached from other machines; {', and '.join(steps)} (or let everybody in with --insecure)"
+    return f"{where} can be reached from other machines; {', and '.join(steps)} (or allow everyone with --insecure)"
 
 
 def is_loopback_name(host: str) -> bool:
-    """Whether a host's name or address is the machine itself."""
+    """True if a host name or address is the machine itself."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:

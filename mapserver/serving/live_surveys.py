@@ -1,4 +1,4 @@
-"""Surveys under way: the last state that each site's survey sent."""
+"""Live surveys: the last received state of each site's survey."""
 
 import threading
 import time
@@ -8,11 +8,11 @@ from typing import NamedTuple
 from fleetmap.live_survey import LiveSurveyState
 
 _MOST_SITES = 32
-SILENT_S = 5.0  # surveys tell twice a second while they drive
+SILENT_S = 5.0  # surveys report twice a second during the drive
 
 
 class LiveSurvey(NamedTuple):
-    """A state, and for how long nothing newer has come."""
+    """A state, and the time since it was received."""
 
     state: LiveSurveyState
     seconds_since: float
@@ -23,7 +23,7 @@ class LiveSurvey(NamedTuple):
 
 
 class LiveSurveys:
-    """Thread-safe; the sites that were heard last, each with its newest state."""
+    """Thread-safe; the latest sites, each with its newest state."""
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
@@ -31,7 +31,7 @@ class LiveSurveys:
         self._lock = threading.Lock()
 
     def take(self, state: LiveSurveyState) -> None:
-        """Keeps a state; LinkError for arrays that are none, of which nothing is kept."""
+        """Store a state; LinkError for invalid arrays, which are not stored."""
         state.path(), state.part_numbers(), state.landmarks(), state.loop_lines(), state.covered()
         with self._lock:
             self._states.pop(state.site, None)
@@ -44,7 +44,7 @@ class LiveSurveys:
             return sorted(self._states)
 
     def of(self, site: str) -> LiveSurvey | None:
-        """The site's survey, None where none was heard since the server's start."""
+        """Return the site's survey, None if none was received since the server's start."""
         with self._lock:
             found = self._states.get(site)
             return None if found is None else LiveSurvey(found[0], self._clock_s() - found[1])

@@ -1,4 +1,4 @@
-"""A person's word of where a robot stands, checked and passed on to the robot."""
+"""An operator's pose for a robot, checked and sent to the robot."""
 
 import math
 
@@ -9,20 +9,20 @@ from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.store import Actor, MapStore
 
 MOST_SIGMA_M = 20.0
-# Robots report every second. One that takes back its liveliness token has left.
+# Robots report every second. One without its liveliness token has left.
 _HEARD_WITHIN_S, _LEFT_S = 10.0, 3.0
 
 
 class RobotPlacing:
-    """Tells robots their place. bus: None where none is served."""
+    """Sends robots their position. bus: None if the server has none."""
 
     def __init__(self, store: MapStore, fleet: Fleet, bus: Bus | None) -> None:
         self._store, self._fleet, self._bus = store, fleet, bus
 
     def tell(self, told: InitialPoseMessage, actor: Actor) -> None:
-        """Publishes the word, and notes in the site's history who gave it.
+        """Publish the pose, and log its author in the site's history.
 
-        UsageError for a site or robot that is not known and for a place outside the map, StateError for a robot that would not hear it.
+        UsageError for an unknown site or robot and a position outside the map, StateError for a robot that is not connected.
         """
         robot = self._listening(told.site, told.robot)
         self._check_place(told, robot)
@@ -36,13 +36,13 @@ class RobotPlacing:
         self._store.current(site)  # raises for an unknown site
         robot = next((robot for robot in self._fleet.robots(site) if robot.robot == name), None)
         if robot is None:
-            raise UsageError(f"site {site} never heard of a robot {name[:64]!r}; /v1/robots lists those that it knows")
+            raise UsageError(f"site {site} has no robot {name[:64]!r}; /v1/robots lists its robots")
         if robot.seconds_since > (_LEFT_S if robot.is_present is False else _HEARD_WITHIN_S):
             raise StateError(
-                f"{name} was last heard {robot.seconds_since:.0f} s ago and would not hear this; tell it when it is back"
+                f"{name} was last seen {robot.seconds_since:.0f} s ago and is not connected; try again when it is back"
             )
         if self._bus is None or self._bus.closed():
-            raise StateError("no bus is served here, on which robots could be told; `mapserver serve` does it")
+            raise StateError("this server has no bus to notify robots; start one with `mapserver serve`")
         return robot
 
     def _check_place(self, told: InitialPoseMessage, robot: RobotStatus) -> None:

@@ -1,7 +1,7 @@
 """Alerts as JSON to a webhook, in the form of Prometheus Alertmanager (version 4), so that its receivers take them.
 
-Whoever answers there is not trusted: nothing but the status of the answer is read, no redirect is followed, and each attempt ends after
-some seconds whatever comes. A thread of its own sends, so that nobody waits for it.
+The receiver is not trusted: only the status of its response is read, redirects are not followed, and each attempt has a time
+limit. Messages are sent by a separate thread, so that callers are not blocked.
 """
 
 import http.client
@@ -32,10 +32,10 @@ Body = dict[str, Any]
 
 
 class Webhook:
-    """Sends messages one after the other until `close`; those that wait too long or fail four times are dropped, which the log says."""
+    """Sends messages in order until `close`; those that wait too long or fail four times are dropped and logged."""
 
     def __init__(self, settings: AlertSettings) -> None:
-        """UsageError for an address that must not be told, and a token that cannot be read."""
+        """UsageError for a forbidden address or an unreadable token."""
         address = check_address(settings.webhook or "")
         self._secure, self._host, self._port = address.scheme == "https", address.hostname or "", address.port
         self._path = f"{address.path or '/'}{f'?{address.query}' if address.query else ''}"
@@ -52,7 +52,7 @@ class Webhook:
         try:
             self._waiting.put_nowait(to_json(body))
         except queue.Full:
-            self._refusals.warning("full", "an alert is dropped: %d wait for the webhook", _MOST_WAITING)
+            self._refusals.warning("full", "an alert is dropped: the queue of the webhook is full (%d)", _MOST_WAITING)
 
     def close(self) -> None:
         self._ended.set()
@@ -71,16 +71,14 @@ class Webhook:
             fault = self._attempt(body)
             if not fault:
                 return
-            self._refusals.warning("fault", "the webhook at %s did not take an alert: %s", self._host, fault)
+            self._refusals.warning("fault", "the webhook at %s did not accept an alert: %s", self._host, fault)
             if pause_s is not None and self._ended.wait(pause_s):
                 return
-        self._refusals.warning(
-            "dropped", "an alert is dropped: the webhook did not take it %d times", len(_PAUSES_S) + 1
-        )
+        self._refusals.warning("dropped", "an alert is dropped: the webhook refused it %d times", len(_PAUSES_S) + 1)
 
     def _attempt(self, body: bytes) -> str:
         made = http.client.HTTPConnection(self._host, self._port or (443 if self._secure else 80), timeout=_ATTEMPT_S)
-        # A timeout of sockets begins anew with each byte: who sends them one by one would hold us for ever.
+        # A socket timeout restarts with each byte: a receiver that sends single bytes would block this thread for ever.
         watch = threading.Timer(_ATTEMPT_S, _cut, (made,))
         try:
             made.connect()
@@ -92,7 +90,7 @@ class Webhook:
                 made.sock.do_handshake()
             made.request("POST", self._path, body, self._headers)
             status = made.getresponse().status
-        except Exception as error:  # whatever it is, the next alert is tried all the same
+        except Exception as error:  # after any error the next alert is still tried
             return f"{type(error).__name__}: {error}"[:200]
         finally:
             watch.cancel()
@@ -101,7 +99,7 @@ class Webhook:
 
 
 class AlertWatch:
-    """Tells the webhook what begins to hold and what no longer does. After a restart of the server what holds is told again."""
+    """Notifies the webhook of new and ended alerts. After a restart of the server active alerts are sent again."""
 
     def __init__(
         self, look: Callable[[], Sequence[Alert]], put: Callable[[Body], None], clock_ns: Callable[[], int]
@@ -110,7 +108,7 @@ class AlertWatch:
         self._known: dict[tuple[str, str, str], Alert] = {}
 
     def look(self) -> None:
-        """Compares what holds with the last time."""
+        """Compare the active alerts with the last time."""
         now = {alert.key: alert for alert in self._look()}
         begun = [alert for key, alert in now.items() if key not in self._known]
         ended = [alert for key, alert in self._known.items() if key not in now]
@@ -119,11 +117,11 @@ class AlertWatch:
             if alerts:
                 self._put(message(alerts[:_MOST_ALERTS], status, self._clock_ns()))
                 if len(alerts) > _MOST_ALERTS:
-                    _log.warning("%d alerts at once; the first %d are told", len(alerts), _MOST_ALERTS)
+                    _log.warning("%d alerts at once; only the first %d are sent", len(alerts), _MOST_ALERTS)
 
 
 def message(alerts: Sequence[Alert], status: str, now_ns: int) -> Body:
-    """Alerts of one status, as Alertmanager's webhooks send them."""
+    """Return alerts of one status, in the format of Alertmanager's webhooks."""
     told = [
         {
             "status": status,
@@ -138,7 +136,7 @@ def message(alerts: Sequence[Alert], status: str, now_ns: int) -> Body:
 
 
 def check_address(webhook: str) -> Any:
-    """The parts of a webhook's address; UsageError for one that is no https, beyond this machine, or holds a password."""
+    """Return the parts of a webhook's address; UsageError without https to another machine, or with a password."""
     try:
         parts = urlsplit(webhook)
         host, _ = parts.hostname, parts.port
@@ -149,7 +147,7 @@ def check_address(webhook: str) -> Any:
     if parts.username is not None or parts.password is not None:
         raise UsageError("[alerts] webhook holds a name or password; put a token into a file and name it in token_file")
     if parts.scheme == "http" and not is_loopback_name(host):
-        raise UsageError(f"[alerts] webhook = {webhook[:200]!r}: beyond this machine only https:// is told")
+        raise UsageError(f"[alerts] webhook = {webhook[:200]!r}: for another machine use https://")
     return parts
 
 

@@ -1,4 +1,4 @@
-"""Maps on the disk: content-addressed files and one SQLite database. SQL lives here alone."""
+"""Maps on the disk: content-addressed files and one SQLite database. All SQL is here."""
 
 from mapserver.store.access.chain import AuditLine, chain_faults
 from mapserver.store.access.operators import OperatorQueries, OperatorRow, TokenRow

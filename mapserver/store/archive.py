@@ -1,8 +1,8 @@
-"""The archive of a version: all of a survey, from which a later one can optimise again. Stays on the server.
+"""The archive of a version: the complete survey, for later optimisation. Stays on the server.
 
 Format 2, magic FMAR, in the envelope of `fleetmap.mapformat.container`. The payload: u32 length of a JSON head (the
-camera, the next free ids, then name, dtype and shape of every array), the head, and the arrays' bytes one after the
-other in that order, little-endian. Format 1 knew no history and one sigma for each observation.
+camera, the next free ids, then name, dtype and shape of every array), the head, and the arrays' bytes in that
+order, little-endian. Format 1 had no history and one sigma for each observation.
 """
 
 import struct
@@ -24,11 +24,11 @@ from mapserver.survey.survey_map import History, SurveyMap, history_of
 ARCHIVE_MAGIC = b"FMAR"
 ARCHIVE_FORMAT = 2
 MAX_ARCHIVE_PAYLOAD_BYTES = (1 << 32) - 1
-# Archives shrink to a third at most: corners' descriptors and pictures hardly repeat. What claims more was made to fill a memory.
+# Archives shrink to a third at most: descriptors and pictures hardly repeat. A higher ratio is an attack on memory.
 _FREE_BYTES, _MOST_TIMES_SMALLER = 64 << 20, 64
-_LEVEL = 3  # written once, hardly ever read, and large: speed counts more than size
+_LEVEL = 3  # written once, rarely read, and large: speed matters more than size
 _HEAD_SIZE = struct.Struct("<I")
-# Dtype and shape by docs of SurveyMap: letters are lengths that arrays share. Patches are square, of any side.
+# Dtype and shape as in the docs of SurveyMap: letters are lengths that arrays share. Patches are square, of any side.
 _ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "body_from_cam": ("<f8", (4, 4)),
     "keyframe_stamps_ns": ("<i8", ("K",)),
@@ -52,7 +52,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "landmark_seen": ("<u4", ("N",)),
     "landmark_missed": ("<u4", ("N",)),
 }
-_HISTORY = frozenset(_ARRAYS.keys() & History.__dataclass_fields__.keys())  # format 1 knew none
+_HISTORY = frozenset(_ARRAYS.keys() & History.__dataclass_fields__.keys())  # absent in format 1
 
 
 class _ArrayHead(msgspec.Struct, frozen=True):
@@ -70,7 +70,7 @@ class _Head(msgspec.Struct, frozen=True):
 
 
 def encode_archive(survey: SurveyMap) -> bytes:
-    """The survey's bytes, without loss."""
+    """Encode the survey without loss."""
     history = history_of(survey)
     arrays = {name: np.ascontiguousarray(_array(survey, history, name), dtype) for name, (dtype, _) in _ARRAYS.items()}
     head = to_json(
@@ -92,10 +92,10 @@ def encode_archive(survey: SurveyMap) -> bytes:
 
 
 def decode_archive(data: bytes) -> SurveyMap:
-    """The survey of `encode_archive`'s bytes.
+    """Decode the survey from the bytes of `encode_archive`.
 
-    Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a whole archive. Takes memory in proportion to
-    the bytes, whatever they claim.
+    Raises NewerFormatError for a newer format, MapFormatError for an incomplete archive. Memory is proportional to
+    the bytes, whatever sizes they state.
     """
     limit = min(MAX_ARCHIVE_PAYLOAD_BYTES, _FREE_BYTES + _MOST_TIMES_SMALLER * len(data))
     number, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", limit)
@@ -104,7 +104,7 @@ def decode_archive(data: bytes) -> SurveyMap:
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
         if entry.name not in expected or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
-            reason = f"archive: array {entry.name!r} of {entry.dtype!r} is none of ours; the bytes are damaged"
+            reason = f"archive: array {entry.name!r} of {entry.dtype!r} is unknown; the bytes are damaged"
             raise MapFormatError(reason)
         count = prod(entry.shape)
         end = offset + count * np.dtype(entry.dtype).itemsize
@@ -132,7 +132,7 @@ def decode_archive(data: bytes) -> SurveyMap:
 
 
 def _check(arrays: dict[str, AnyArray]) -> None:
-    """Raises MapFormatError for arrays that do not fit each other: an archive may come from elsewhere, and builds index by it."""
+    """Raise MapFormatError for inconsistent arrays: an archive may be untrusted, and builds use it as indices."""
     lengths: dict[int | str, int] = {}
     for name, array in arrays.items():
         shape = _ARRAYS[name][1]

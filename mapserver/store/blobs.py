@@ -1,4 +1,4 @@
-"""The folder of files that are addressed by their content."""
+"""The folder of content-addressed files."""
 
 import errno
 import hashlib
@@ -15,37 +15,37 @@ _FOLDER = "blobs"
 
 
 class BlobFolder:
-    """Bytes by their SHA-256, in files below the store's folder. No symbolic link there is followed."""
+    """Bytes by their SHA-256, in files below the store's folder. Symbolic links there are not followed."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
 
     def put(self, data: bytes) -> str:
-        """The address of `data`, which is on the disk when this returns. Raises StoreError where the disk refuses."""
+        """Store `data` and return its address; it is on the disk when this returns. Raises StoreError on a disk error."""
         sha256 = sha256_hex(data)
         self._keep(sha256, len(data), [data])
         return sha256
 
     def put_chunks(self, chunks: Iterable[bytes], sha256: str, size_bytes: int) -> None:
-        """As `put`, for bytes that come in pieces and must be `size_bytes` with this address.
+        """As `put`, for bytes in pieces that must be `size_bytes` with this address.
 
-        Raises MapFormatError for other bytes, StoreError where the disk refuses.
+        Raises MapFormatError for other bytes, StoreError on a disk error.
         """
         self._keep(sha256, size_bytes, _checked(chunks, sha256, size_bytes))
 
     def get(self, sha256: str) -> bytes:
-        """The bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        """Return the bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
         return verified(b"".join(self.chunks(sha256)), sha256)
 
     def chunks(self, sha256: str) -> Iterator[bytes]:
-        """The bytes of an address in pieces, unverified; raises StoreError for missing ones."""
+        """Yield the bytes of an address in pieces, unverified; raises StoreError for missing ones."""
         path = self.path(sha256)
         with disk_errors(f"{path} cannot be read", "the store is incomplete, restore it"):
             self._check_plain(path)
             yield from read_chunks(path)
 
     def is_whole(self, sha256: str) -> bool:
-        """Whether the bytes of an address are there and are what it says; reads them in pieces."""
+        """True if the bytes of an address exist and match it; reads them in pieces."""
         digest = hashlib.sha256()
         try:
             self._check_plain(self.path(sha256))
@@ -62,11 +62,11 @@ class BlobFolder:
         return {path.name for path in self._files() if _is_address(path)}
 
     def unreferenced(self) -> list[Path]:
-        """Files that are no blobs, such as what a killed process left behind."""
+        """Return files that are not blobs, such as remains of a killed process."""
         return sorted(path for path in self._files() if not _is_address(path))
 
     def remove_file(self, path: Path) -> int:
-        """Removes a file and returns its size; raises StoreError where the disk refuses."""
+        """Remove a file and return its size; raises StoreError on a disk error."""
         with disk_errors(f"{path} cannot be removed", "check the folder's rights"):
             check_no_link(self._root, path.parent)
             size = path.stat().st_size
@@ -79,7 +79,7 @@ class BlobFolder:
             check_no_link(self._root, path.parent)
             # A file of that name may be damaged; reading it costs less than writing it.
             if is_plain_file(path) and path.stat().st_size == size_bytes and self.is_whole(sha256):
-                # Who wrote it may have died before its name was on the disk.
+                # Its writer may have died before its name was on the disk.
                 sync_path(path.parent)
                 chunks = ()
             make_folder(path.parent)
@@ -96,7 +96,7 @@ class BlobFolder:
         return self._inner(lambda entry: entry.is_file(follow_symlinks=False))
 
     def _inner(self, wanted: "Callable[[os.DirEntry[str]], bool]") -> Iterator[Path]:
-        """What is in the folders of the folder, as far as they are folders and no links."""
+        """Yield the entries of the folder's subfolders, without links."""
         top = self._root / _FOLDER
         if top.is_symlink() or not top.is_dir():
             return
@@ -107,7 +107,7 @@ class BlobFolder:
     def _check_plain(self, path: Path) -> None:
         check_no_link(self._root, path)
         if not is_plain_file(path):
-            raise FileNotFoundError(errno.ENOENT, "no plain file", str(path))
+            raise FileNotFoundError(errno.ENOENT, "not a plain file", str(path))
 
 
 def _is_address(path: Path) -> bool:

@@ -17,10 +17,10 @@ from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sh
 from mapserver.store.rows import LogEntry
 from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
 
-APPLICATION_ID = 0x464D4150  # "FMAP": says whose file this is
+APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
 _BUSY_TIMEOUT_MS = 30_000
 _INCREMENTAL = 2
-_HEAD_BYTES, _FORMAT_AT, _APPLICATION_AT = 100, 60, 68  # of a file of SQLite, its user_version and application_id in it
+_HEAD_BYTES, _FORMAT_AT, _APPLICATION_AT = 100, 60, 68  # SQLite header; its user_version and application_id
 
 
 Row = TypeVar("Row")
@@ -29,9 +29,9 @@ Row = TypeVar("Row")
 class Transactions:
     """The database at a path, created or migrated as needed. Methods may be called from any thread.
 
-    One connection writes and another one reads, each under a lock of its own: reading does not wait while a write is forced to the
-    disk. Within a transaction its own thread reads what it has written. read_only: nothing is made or migrated.
-    Raises NewerFormatError for a database that a newer fleetmap made, StoreError for one that cannot be opened or is another program's.
+    One connection writes and another one reads, each under its own lock: reading does not wait while a write is forced to the
+    disk. Within a transaction its own thread reads its own writes. read_only: nothing is created or migrated.
+    Raises NewerFormatError for a database of a newer fleetmap, StoreError for one that cannot be opened or belongs to another program.
     """
 
     def __init__(self, path: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
@@ -52,23 +52,23 @@ class Transactions:
     def close(self) -> None:
         with self._lock, self._reading:
             self._reader.close()
-            self._database.close()  # the last one tidies up the write-ahead log
+            self._database.close()  # the last one checkpoints the write-ahead log
 
     @contextmanager
     def write(self, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
-        """One transaction: all of the block or nothing. Raises StoreError where the disk refuses."""
+        """Run the block as one transaction. Raises StoreError on a disk error."""
         with self._lock:
             self._writing_thread = threading.get_ident()
             try:
                 with _transaction(self._database, durable=durable) as connection:
                     yield connection
             except sqlite3.Error as error:
-                raise StoreError(f"the store {self._path} refuses to be written ({error}); check its disk") from error
+                raise StoreError(f"the store {self._path} cannot be written ({error}); check its disk") from error
             finally:
                 self._writing_thread = None
 
     def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
-        """The rows by column. Raises StoreError where the disk refuses."""
+        """Return the rows by column. Raises StoreError on a disk error."""
         try:
             if self._writing_thread == threading.get_ident():
                 return list(self._database.query(sql, values))
@@ -78,21 +78,21 @@ class Transactions:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
     def shrink(self, pages: int) -> None:
-        """Gives at most so many unused pages of the file back to the disk."""
+        """Return up to `pages` unused pages of the file to the disk."""
         with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
-            # `execute` takes one step, which frees one page
+            # One step of `execute` frees one page
             self._database.conn.executescript(f"PRAGMA incremental_vacuum({pages:d})")
 
     def rows(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> list[Row]:
-        """The rows, each as a `kind` with a field for every column. Raises StoreError where the disk refuses."""
+        """Return the rows, each as a `kind` with a field for every column. Raises StoreError on a disk error."""
         return [kind(**row) for row in self.query(sql, values)]
 
     def first(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> Row | None:
-        """As `rows`: the first of them, None without any."""
+        """As `rows`: the first of them, None if absent."""
         return next(iter(self.rows(kind, sql, values)), None)
 
     def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
-        """One line of the log, chained to the one before it, within a transaction; site: empty where it is about none."""
+        """Write a line of the log, chained to the previous one, within a transaction; site: empty if not about one."""
         actor = entry.actor
         last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone()
         number, before = last or (0, "")
@@ -130,11 +130,10 @@ def _opened(path: Path, prepare: Callable[[Database, Path], object], options: st
 
 
 def _opened_for_reading(path: Path) -> Database:
-    """A connection that leaves the disk as it is.
+    """Open a connection that does not change the disk.
 
-    Where nobody can write beside the database, SQLite reads it alone, which holds everything unless the last process that wrote
-    was killed. An older format is read from a copy in memory, which is migrated. Raises StoreError for a killed one, and for what is no
-    database.
+    If the folder is not writable, SQLite reads the database file alone, which is complete unless the last writing process was killed. An
+    older format is migrated in a copy in memory. Raises StoreError after a killed process, and for an invalid database.
     """
     log = path.with_name(f"{path.name}-wal")
     try:
@@ -146,12 +145,12 @@ def _opened_for_reading(path: Path) -> Database:
             return _current(_opened(path, _check_ours, "mode=ro&immutable=1"))
     except sqlite3.Error as error:
         raise StoreError(
-            f"the store {path.parent} cannot be read without writing ({error}); copy it to where it can be written"
+            f"the store {path.parent} cannot be read without writing ({error}); copy it to a writable folder"
         ) from error
 
 
 def format_of(path: Path) -> int:
-    """The format of a store's database, 0 for one that is no store's; looks at nothing but its head, without SQLite."""
+    """Return the format of a store's database, 0 if it is not one; reads only the file header, without SQLite."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES).ljust(_HEAD_BYTES, b"\0")
@@ -162,7 +161,7 @@ def format_of(path: Path) -> int:
 
 
 def is_older(path: Path) -> bool:
-    """True if the database would be migrated by whoever opens it to write."""
+    """True if the database would be migrated when opened for writing."""
     return 0 < format_of(path) < FORMAT
 
 
@@ -191,7 +190,7 @@ def _prepare(database: Database, path: Path) -> None:
 
 @contextmanager
 def _transaction(database: Database, *, durable: bool) -> Iterator[sqlite3.Connection]:
-    """One write transaction: all of the block or nothing; a durable one is on the disk when it ends."""
+    """Run one write transaction; a durable one is on the disk when it ends."""
     connection = database.conn
     # NORMAL may lose the last commits when the power fails, never the file's integrity: enough for robots' reports.
     connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
@@ -216,7 +215,7 @@ def _check_ours(database: Database, path: Path) -> None:
         raise StoreError(reason)
     if application == APPLICATION_ID and number < LAST_UNNAMED:
         raise StoreError(
-            f"{path} was made by an earlier fleetmap (store format {number}; this one migrates {LAST_UNNAMED}), and stays as it is; "
+            f"{path} was made by an earlier fleetmap (store format {number}; this one migrates {LAST_UNNAMED}), and is left unchanged; "
             "export its versions with that one (`mapserver export FILE`), and import them into another --store, or build them again there"
         )
     if number > FORMAT:
@@ -229,14 +228,14 @@ def _migrate(database: Database) -> None:
     if database.conn.execute("PRAGMA user_version").fetchone()[0] == FORMAT:
         return
     with _transaction(database, durable=True) as connection:
-        # What is pending is asked under the lock: another process may have come first.
+        # Pending migrations are listed under the lock: another process may have run them.
         MIGRATIONS.apply(database)
         connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {FORMAT}")
 
 
 def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
-    """The database as the older fleetmap reads it, whole or not at all, before it is migrated. StoreError where the disk refuses."""
+    """Copy the database for the older fleetmap, atomically, before it is migrated. StoreError on a disk error."""
     fresh = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
         connection.execute("VACUUM INTO ?", (str(fresh),))
@@ -248,6 +247,6 @@ def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
         with suppress(OSError):
             fresh.unlink()
         raise StoreError(
-            f"{path} has an older format, and its copy {target.name} cannot be written before it is migrated ({error}); make space: "
-            "the store is as it was"
+            f"{path} has an older format, and its copy {target.name} cannot be written before it is migrated ({error}); free some space: "
+            "the store is unchanged"
         ) from error

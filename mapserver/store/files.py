@@ -1,4 +1,4 @@
-"""Folders, plain files and locks of a store, for its owner alone. Every call goes through `os`, where tests make it fail."""
+"""Folders, plain files and locks of a store, private to its owner. Every call goes through `os`, where tests inject errors."""
 
 import fcntl
 import os
@@ -14,11 +14,11 @@ from fleetmap.files import OWN_FILE, sync_path
 _CHUNK_BYTES = 1 << 20
 _LOCK_WITHIN_S = 60.0
 _OWN_FOLDER = 0o700  # as OWN_FILE
-_RESERVE_BYTES = 4 << 20  # what a transaction that removes some hundred versions writes
+_RESERVE_BYTES = 4 << 20  # enough for a transaction that removes some hundred versions
 
 
 def read_chunks(path: Path) -> Iterator[bytes]:
-    """The bytes of a file, a piece at a time. Raises OSError as `os.read`."""
+    """Yield the bytes of a file in pieces. Raises OSError as `os.read`."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         while chunk := os.read(descriptor, _CHUNK_BYTES):
@@ -28,14 +28,14 @@ def read_chunks(path: Path) -> Iterator[bytes]:
 
 
 def read_file(path: Path) -> bytes:
-    """All bytes of a file. Raises OSError as `os.read`."""
+    """Return all bytes of a file. Raises OSError as `os.read`."""
     return b"".join(read_chunks(path))
 
 
 def make_folder(folder: Path) -> None:
-    """`folder` and its parents exist afterwards, also after a power cut.
+    """Create `folder` and its parents durably, so that they exist after a power cut.
 
-    The nearest parent that was there is synced too: who made it may have died before doing so.
+    The nearest existing parent is synced too: its creator may have died before doing so.
     """
     missing = [folder, *folder.parents]
     missing = missing[: next(i for i, parent in enumerate(missing) if parent.is_dir())]
@@ -48,20 +48,18 @@ def make_folder(folder: Path) -> None:
 
 
 def check_no_link(root: Path, path: Path) -> None:
-    """Raises StoreError where `path`, or a folder between it and `root`, is a symbolic link: a store follows none out of its folder."""
+    """Raise StoreError if `path`, or a folder between it and `root`, is a symbolic link: a store does not follow links."""
     for part in (path, *path.parents):
         if part == root:
             return
         with disk_errors(f"{part} cannot be looked at", "check the disk"):
             is_link = part.is_symlink()
         if is_link:
-            raise StoreError(
-                f"{part} is a symbolic link, which a store does not follow; put what it names in its place"
-            )
+            raise StoreError(f"{part} is a symbolic link, which a store does not follow; replace it by its target")
 
 
 def is_plain_file(path: Path) -> bool:
-    """Whether it is a file, and no link, device or pipe."""
+    """True for a file that is not a link, device or pipe."""
     try:
         return stat.S_ISREG(os.stat(path, follow_symlinks=False).st_mode)  # noqa: PTH116
     except FileNotFoundError:
@@ -69,12 +67,12 @@ def is_plain_file(path: Path) -> bool:
 
 
 def make_own_file(path: Path) -> None:
-    """An empty file for its owner alone, unless there is one."""
+    """Create an empty private file, unless it exists."""
     os.close(_open_own(path, os.O_RDWR))
 
 
 def keep_reserve(root: Path) -> None:
-    """Space that `release_reserve` gives back on a full disk, so that garbage can be collected there. A full disk has none to keep."""
+    """Reserve space for `release_reserve`, so that garbage can be collected on a full disk. On a full disk nothing is reserved."""
     with suppress(OSError):
         descriptor = _open_own(root / "reserve", os.O_RDWR | os.O_NOFOLLOW)
         try:
@@ -84,7 +82,7 @@ def keep_reserve(root: Path) -> None:
 
 
 def release_reserve(root: Path) -> bool:
-    """Gives the reserved space back; False where there was none."""
+    """Free the reserved space; False if there was none."""
     try:
         os.unlink(root / "reserve")  # noqa: PTH108
     except OSError:
@@ -94,9 +92,9 @@ def release_reserve(root: Path) -> bool:
 
 @contextmanager
 def locked(path: Path, *, shared: bool) -> Iterator[None]:
-    """Holds the lock file at `path` during the block: by many if shared, else alone. A dead process holds nothing.
+    """Hold the lock file at `path` during the block: shared or exclusive. The lock of a dead process is released.
 
-    Raises StoreError when the lock is not free within a minute, OSError where the file cannot be made.
+    Raises StoreError if the lock is not free within a minute, OSError if the file cannot be created.
     """
     descriptor = _open_own(path, os.O_RDWR | os.O_NOFOLLOW)
     try:

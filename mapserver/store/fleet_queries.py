@@ -29,12 +29,12 @@ CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
 
 LastReports = dict[tuple[str, str], tuple[int | None, int, dict[str, Any]]]
-"""By (site, robot): the version that it runs, None where it did not say, when it was heard, and its last report."""
+"""By (site, robot): its version (None if not reported), the time of its last report, and that report."""
 
 _DAY_NS = 86_400_000_000_000
 _USUAL_RETENTION = FleetRetention()
-_PRUNED_SHARE = 0.95  # of the bytes that pictures may have: they are added up again after so many new ones, not at each
-_SHRINK_PAGES = 20_000  # 80 MB, so that nobody waits long
+_PRUNED_SHARE = 0.95  # of the limit of pictures' bytes: pruning to this share avoids a new sum at each picture
+_SHRINK_PAGES = 20_000  # 80 MB, to keep waiting times short
 _SUMS = ", ".join(f"sum(t.{name}) {name}" for name in COUNTER_COLUMNS)
 _SUMS_OF_WINDOW = _SUMS.replace("sum(t.continued)", "sum(CASE WHEN t.hour = ?4 THEN t.continued ELSE 0 END)")
 _COUNTED = """FROM tally_keys k JOIN tallies t ON t.key_id = k.id
@@ -50,7 +50,7 @@ _FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
 
 @dataclass(slots=True)
 class FleetBatch:
-    """What came since the last batch."""
+    """Data since the last batch."""
 
     counters: dict[CounterKey, Counters] = field(default_factory=dict)
     traces: list[TraceRow] = field(default_factory=list)
@@ -61,7 +61,7 @@ class FleetBatch:
 
 
 class FleetQueries:
-    """The part of an open store that holds the health of the fleet."""
+    """The fleet's health in an open store."""
 
     def __init__(self, transactions: Transactions) -> None:
         self._transactions = transactions
@@ -69,7 +69,7 @@ class FleetQueries:
         self._picture_bytes = -(1 << 62)  # looked up at the first failure
 
     def add(self, batch: FleetBatch) -> None:
-        """Keeps a batch in one transaction. A power cut may lose the last ones, never failures."""
+        """Store a batch in one transaction. A power cut may lose the last batches, never failures."""
         with self._transactions.write(durable=False) as connection:
             keys = [key[:3] for key in batch.counters] + [(row.site, "robot", row.robot) for row in batch.traces]
             ids = self._ids(connection, keys)
@@ -90,10 +90,10 @@ class FleetQueries:
         retention: FleetRetention = _USUAL_RETENTION,
         area: str | None = None,
     ) -> bool:
-        """Keeps a failure and its sums, durably; False (and nothing done) for one that is known already.
+        """Store a failure and its sums durably; False (and no change) for a known one.
 
-        times_ns: when it was received and when it happened; area: where. Older failures of the robot, and the oldest
-        pictures of all, go where there are too many.
+        times_ns: time of receipt and of the failure; area: its place. Older failures of the robot, and the oldest
+        pictures of all, are deleted above the limits.
         """
         received_ns, happened_ns = times_ns
         x_map_m, y_map_m = (None, None) if report.map_from_base is None else report.map_from_base.position_m[:2]
@@ -125,7 +125,7 @@ class FleetQueries:
     def counters(
         self, site: str | None, axis: str, *, since_hour: int = 0, until_hour: int = 1 << 60, key: str | None = None
     ) -> dict[tuple[str, str], Counters]:
-        """Sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
+        """Return sums by (site, key) of an axis over hours from `since_hour` to before `until_hour`."""
         values = (_axis(axis), site, key, since_hour, until_hour)
         query = f"SELECT k.site, k.key, {_SUMS_OF_WINDOW} {_COUNTED} GROUP BY k.id ORDER BY k.site, k.key"
         rows = self._transactions.query(query, values)
@@ -134,7 +134,7 @@ class FleetQueries:
     def hours(
         self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
     ) -> dict[int, Counters]:
-        """Sums of an axis (and key) by the hour."""
+        """Return sums of an axis (and key) by the hour."""
         values = (_axis(axis), site, key, since_hour, until_hour)
         rows = self._transactions.query(f"SELECT t.hour, {_SUMS} {_COUNTED} GROUP BY t.hour ORDER BY t.hour", values)
         return {row.pop("hour"): Counters(**row) for row in rows}
@@ -151,38 +151,38 @@ class FleetQueries:
         )
 
     def failure(self, number: int) -> FailureDetail:
-        """One failure with its context; raises UsageError where it does not exist."""
+        """Return one failure with its context; raises UsageError if it does not exist."""
         rows = self._transactions.query(f"SELECT {_FAILURE_COLUMNS}, report FROM failures WHERE number = ?", (number,))
         if not rows:
-            raise UsageError(f"there is no failure {number}; the list of failures shows those that are kept")
+            raise UsageError(f"failure {number} does not exist; the list of failures shows the stored ones")
         report = msgspec.msgpack.decode(rows[0].pop("report"), type=FailureReport)
         query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
         pictures = self._transactions.rows(PictureRow, query, (number,))
         return FailureDetail(FailureRow(**rows[0]), report, pictures)
 
     def picture(self, number: int, place: int) -> bytes:
-        """The JPEG of a failure; raises UsageError where there is none, or none any more."""
+        """Return the JPEG of a failure; raises UsageError if it does not exist or was deleted."""
         query = "SELECT jpeg FROM failure_pictures WHERE number = ? AND place = ?"
         rows = self._transactions.query(query, (number, place))
         if not rows:
-            raise UsageError(f"failure {number} has no picture {place}; old ones go when pictures need too much space")
+            raise UsageError(f"failure {number} has no picture {place}; old pictures are deleted to save space")
         return bytes(rows[0]["jpeg"])
 
     def first_pictures(self, numbers: Iterable[int]) -> dict[int, int]:
-        """The place of the first picture of a camera of each failure that has one."""
+        """Return by failure the place of its first camera picture, for failures that have one."""
         wanted = to_json(list(numbers)).decode()
         query = """SELECT number, min(place) place FROM failure_pictures WHERE kind != 'matches'
                    AND number IN (SELECT value FROM json_each(?)) GROUP BY number"""
         return {row["number"]: row["place"] for row in self._transactions.query(query, (wanted,))}
 
     def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
-        """The number of a robot's report, None where it is not kept."""
+        """Return the number of a robot's report, None if not stored."""
         query = "SELECT number FROM failures WHERE site = ? AND robot = ? AND failure_id = ?"
         rows = self._transactions.query(query, (site, robot, failure_id))
         return int(rows[0]["number"]) if rows else None
 
     def add_replay(self, number: int, replay: FailureReplay, keep_bytes: int) -> None:
-        """Keeps a failure's recording, with its pictures among those of the failure; the oldest recordings go, never this one."""
+        """Store a failure's recording, and its pictures with those of the failure; the oldest recordings are deleted, never this one."""
         with self._transactions.write() as connection:
             values = (number, replay.summary, replay.mcap)
             if not connection.execute("INSERT OR IGNORE INTO failure_replays VALUES (?, ?, ?)", values).rowcount:
@@ -197,21 +197,21 @@ class FleetQueries:
             _prune_replays(connection, keep_bytes, number)
 
     def replay_summary(self, number: int) -> bytes | None:
-        """The summary of a failure's recording, None where there is none, or none any more."""
+        """Return the summary of a failure's recording, None if absent or deleted."""
         rows = self._transactions.query("SELECT summary FROM failure_replays WHERE number = ?", (number,))
         return bytes(rows[0]["summary"]) if rows else None
 
     def replay(self, number: int) -> bytes:
-        """The MCAP file of a failure's recording; UsageError where there is none, or none any more."""
+        """Return the MCAP file of a failure's recording; UsageError if absent or deleted."""
         rows = self._transactions.query("SELECT mcap FROM failure_replays WHERE number = ?", (number,))
         if not rows:
             raise UsageError(
-                f"failure {number} has no recording: its robot sends none ([run] replays), has not sent it yet, or it went to save space"
+                f"failure {number} has no recording: its robot sends none ([run] replays), has not sent it yet, or it was deleted for space"
             )
         return bytes(rows[0]["mcap"])
 
     def trace(self, site: str, robot: str, *, since_hour: int = 0, until_hour: int = 1 << 60) -> list[TraceRow]:
-        """What is kept of a robot, oldest first. Hour by hour: in the order of the table an hour's other robots lie between."""
+        """Return a robot's trace, oldest first, hour by hour: in the table, an hour's rows of other robots lie in between."""
         return self._transactions.rows(
             TraceRow,
             f"""WITH RECURSIVE asked(at, last) AS (
@@ -224,7 +224,7 @@ class FleetQueries:
         )
 
     def prune(self, retention: FleetRetention) -> int:
-        """Removes what is too old or too much; returns how many rows went."""
+        """Remove old or excess data; return the number of removed rows."""
         now_ns = self._transactions.now_ns()
         tallies_ns, traces_ns, failures_ns = (
             now_ns - int(days * _DAY_NS)
@@ -243,7 +243,7 @@ class FleetQueries:
     def _ids(
         self, connection: sqlite3.Connection, keys: Iterable[tuple[str, str, str]]
     ) -> dict[tuple[str, str, str], int]:
-        """Numbers of keys, which are never removed: those in memory stay right."""
+        """Return the numbers of keys, which are never removed: cached ones stay valid."""
         found = {key: self._key_ids.get(key, 0) for key in keys}
         for key in (key for key, number in found.items() if number == 0):
             connection.execute("INSERT OR IGNORE INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", key)
@@ -253,7 +253,7 @@ class FleetQueries:
 
 
 def name_failures(connection: sqlite3.Connection, site: str, areas: Areas) -> None:
-    """Gives failures of a site the areas that hold them now, within a transaction."""
+    """Set the present areas of a site's failures, within a transaction."""
     query = (
         "SELECT number, x_map_m, y_map_m FROM failures WHERE site = ? AND x_map_m IS NOT NULL AND y_map_m IS NOT NULL"
     )
@@ -262,7 +262,7 @@ def name_failures(connection: sqlite3.Connection, site: str, areas: Areas) -> No
 
 
 def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> None:
-    """Keeps what robots said last, within a transaction."""
+    """Store the robots' last reports, within a transaction."""
     connection.executemany(
         """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
            ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
@@ -275,13 +275,13 @@ def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> N
 
 
 def tile_key(tile: tuple[int, int] | None) -> str | None:
-    """How a tile is written in keys and rows: "x,y"."""
+    """Return a tile as text for keys and rows: "x,y"."""
     return None if tile is None else f"{tile[0]},{tile[1]}"
 
 
 def _axis(axis: str) -> str:
     if axis not in AXES:
-        raise UsageError(f"nothing is counted by {axis!r}; choose one of {', '.join(AXES)}")
+        raise UsageError(f"unknown axis {axis!r}; choose one of {', '.join(AXES)}")
     return axis
 
 
@@ -293,20 +293,20 @@ def _add_counters(
 
 
 def _newest_beyond(rows: list[tuple[int, int]], keep: float) -> int | None:
-    """The newest number whose size, with those of all newer ones, is beyond `keep`. rows: number and size, the newest first."""
+    """Return the newest number at which the sizes summed from the newest exceed `keep`. rows: number and size, the newest first."""
     sums = accumulate(size for _, size in rows)
     return next((number for (number, _), kept in zip(rows, sums, strict=True) if kept > keep), None)
 
 
 def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
-    """Whole hours go, the oldest first, until at most `keep` rows stay (the running hour stays whatever it holds)."""
+    """Delete whole hours, the oldest first, until at most `keep` rows remain (the running hour always stays)."""
     hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
     last = _newest_beyond(hours[1:], keep - hours[0][1]) if hours else None
     return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
 
 
 def _prune_failures(connection: sqlite3.Connection, robot: tuple[str, str], keep: int) -> None:
-    """The oldest failures of a robot go until `keep` stay; their pictures go with them."""
+    """Delete the oldest failures of a robot until `keep` remain; their pictures are deleted with them."""
     (count,) = connection.execute("SELECT count(*) FROM failures WHERE site = ? AND robot = ?", robot).fetchone()
     if count <= keep:
         return
@@ -319,7 +319,7 @@ def _sum_of_pictures(connection: sqlite3.Connection) -> int:
 
 
 def _prune_replays(connection: sqlite3.Connection, keep_bytes: int, newest: int) -> None:
-    """The oldest recordings go until keep_bytes stay."""
+    """Delete the oldest recordings until at most keep_bytes remain."""
     sizes = connection.execute("SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC").fetchall()
     last = _newest_beyond(sizes, keep_bytes)
     connection.execute("DELETE FROM failure_replays WHERE number <= ? AND number <> ?", (last, newest))

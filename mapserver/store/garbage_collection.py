@@ -1,4 +1,4 @@
-"""Garbage collection: versions beyond retention, bytes that no version mentions, files that killed processes left."""
+"""Garbage collection: versions beyond retention, unreferenced bytes, files left by killed processes."""
 
 import sqlite3
 from dataclasses import dataclass, field
@@ -13,9 +13,9 @@ _DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """What stays. keep_versions, keep_drafts: the newest of each site, besides those that are protected anyway.
+    """Retention rules. keep_versions, keep_drafts: the newest of each site, besides protected ones.
 
-    keep_days: how long a retired version or superfluous draft stays; robot_days: how long a silent robot counts as
+    keep_days: time for which a retired version or superfluous draft is kept; robot_days: time for which a silent robot counts as
     using the version that it reported.
     """
 
@@ -27,7 +27,7 @@ class Retention:
 
 @dataclass(slots=True)
 class Garbage:
-    """What was done, or would be: (site, version) retired and removed, files and bytes freed."""
+    """Result, real or of a dry run: (site, version) retired and removed, files and bytes freed."""
 
     retired: list[tuple[str, int]] = field(default_factory=list)
     removed: list[tuple[str, int]] = field(default_factory=list)
@@ -38,9 +38,9 @@ class Garbage:
 def collect(
     transactions: Transactions, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor
 ) -> Garbage:
-    """Removes versions first, which must be on the disk before the first file goes. The caller holds the lock alone.
+    """Remove versions first; this must be on the disk before the first file is deleted. The caller holds the exclusive lock.
 
-    Never touched: current versions, those that some robots try, what a rollback would go to, what a robot runs.
+    Never removed: current versions, canaries, rollback targets, versions in use by robots.
     """
     garbage = Garbage()
     if dry_run:

@@ -1,12 +1,12 @@
 """The store of maps: versions of sites in one folder.
 
     DIR/store.sqlite3            sites, versions and their states, robots, jobs, events
-    DIR/lock                     held alone while garbage is collected, shared while bytes come in that nothing mentions yet
+        DIR/lock                     exclusive during garbage collection, shared while new, still unreferenced bytes arrive
     DIR/blobs/ab/<sha256>        tiles, manifests, vocabularies, archives, by content
-    DIR/reserve                  space that `gc` gives back to work on a full disk
+        DIR/reserve                  space freed by `gc` to work on a full disk
     DIR/sites/<site>/current     the current manifest's address as text, for robots that read the folder; derived
 
-Bytes are on the disk before the transaction that mentions them, so a crash leaves at most files that nothing mentions.
+Bytes are on the disk before the transaction that references them, so a crash leaves at most unreferenced files.
 """
 
 import hashlib
@@ -89,11 +89,11 @@ class MapStore(StoreQueries):
     def open(
         cls, path: Path, *, create: bool = False, read_only: bool = False, clock_ns: Callable[[], int] = time.time_ns
     ) -> Self:
-        """The store in folder `path`, which is made with `create`. What is derived is repaired here.
+        """Open the store in folder `path`, created with `create`. Derived files are repaired.
 
-        read_only: of a store that cannot be written, by its rights or because the disk is full, what is there is read; one of an
-        older format stays as it is.
-        Raises StoreError where there is none, it cannot be opened or an earlier fleetmap made it, NewerFormatError for one made by
+        read_only: also opens a store that cannot be written because of its rights or a full disk; an
+        older format is not migrated.
+        Raises StoreError if it does not exist, cannot be opened or is from an earlier fleetmap, NewerFormatError for one of
         a newer fleetmap.
         """
         is_new = not (path / "store.sqlite3").is_file()
@@ -129,9 +129,9 @@ class MapStore(StoreQueries):
         self.close()
 
     def save(self, site: str, content: DraftContent, *, actor: Actor = NOBODY) -> VersionInfo:
-        """A new draft version of `site`, whole on the disk, as it was made and not as the database tells it afterwards.
+        """Store a new draft version of `site` on the disk, and return it as created.
 
-        Raises MapFormatError for tiles that cannot be encoded, StoreError where the disk refuses.
+        Raises MapFormatError for tiles that cannot be encoded, StoreError on a disk error.
         """
         check_name(site, "site")
         details = content.details
@@ -168,10 +168,10 @@ class MapStore(StoreQueries):
     def keep_site_files(
         self, site: str, files: Mapping[str, bytes | None], detail: str, *, actor: Actor = NOBODY
     ) -> None:
-        """Keeps what belongs to a site beside its versions, by kind, all of it or nothing; None takes a kind away. detail: for the log.
+        """Store files of a site beside its versions, by kind, in one transaction; None deletes a kind. detail: for the log.
 
-        Failures are named by the areas as they are then. Raises UsageError for an unknown site and for areas that are none or need
-        an alignment that is not there, StoreError where the disk refuses.
+        Failures get the area names valid then. Raises UsageError for an unknown site, for invalid areas and for areas
+        without the alignment that they need, StoreError on a disk error.
         """
         self._check_site(site)
         with self._locked(shared=True):
@@ -184,9 +184,9 @@ class MapStore(StoreQueries):
                 self._transactions.log(connection, site, LogEntry(" and ".join(files), detail, None, actor))
 
     def change_releases(self, site: str, decide: Callable[[SiteReleases], ReleaseChanges]) -> ReleaseChanges:
-        """Writes what `decide` makes of a site's rows, in the one transaction that reads them; on the disk when this returns.
+        """Write the changes that `decide` returns for a site's rows, in the transaction that reads them; durable on return.
 
-        What `decide` raises passes through, and nothing is changed. Raises StoreError where the disk refuses.
+        Errors of `decide` propagate without any change. Raises StoreError on a disk error.
         """
         with self._transactions.write() as connection:
             changes = decide(site_releases(self._transactions, site))
@@ -196,7 +196,7 @@ class MapStore(StoreQueries):
         return changes
 
     def record_verdict(self, draft: VersionInfo, verdict: VerdictRow, actor: Actor) -> None:
-        """Keeps what the gate said of a draft; a refusal also stands in the log."""
+        """Store the gate's verdict on a draft; a refusal is also logged."""
         with self._transactions.write() as connection:
             connection.execute(
                 """INSERT INTO verdicts (site, version, stamp_ns, accepted, forced, reasons, report)
@@ -213,9 +213,9 @@ class MapStore(StoreQueries):
                 self._transactions.log(connection, draft.site, LogEntry(kind, detail, draft.version, actor))
 
     def replace_manifest(self, draft: VersionInfo, manifest: Manifest, entry: LogEntry) -> VersionInfo:
-        """The draft with another manifest of the same tiles, as it was made, and a line in the log.
+        """Replace the manifest of a draft by one with the same tiles; return the draft, and log the change.
 
-        Raises StateError where it is no draft any more or somebody else changed it, StoreError where the disk refuses.
+        Raises StateError if it is no longer a draft or was changed by another user, StoreError on a disk error.
         """
         data = encode_manifest(manifest)
         with self._locked(shared=True):
@@ -228,7 +228,7 @@ class MapStore(StoreQueries):
                 )
                 if not done.rowcount:
                     raise StateError(
-                        f"draft {draft.version} of site {draft.site} was changed by somebody else meanwhile; try again"
+                        f"draft {draft.version} of site {draft.site} was changed meanwhile by another operator; try again"
                     )
                 connection.execute(
                     "UPDATE version_blobs SET sha256 = ? WHERE site = ? AND version = ? AND kind = 'manifest'",
@@ -238,7 +238,7 @@ class MapStore(StoreQueries):
         return new
 
     def check_bytes(self, version: VersionInfo) -> None:
-        """Raises StoreError or MapFormatError unless all bytes that robots need of a version are there and right."""
+        """Raise StoreError or MapFormatError unless all bytes of a version for robots are present and correct."""
         manifest = decode_manifest(self._blobs.get(version.manifest_sha256))
         for sha256 in (manifest.vocabulary.sha256, *(tile.sha256 for tile in manifest.tiles)):
             self._blobs.get(sha256)
@@ -250,7 +250,7 @@ class MapStore(StoreQueries):
     def collect_garbage(
         self, retention: Retention = _USUAL_RETENTION, *, dry_run: bool = False, actor: Actor = NOBODY
     ) -> Garbage:
-        """Removes what is beyond retention and what nothing mentions; raises StoreError where the disk refuses."""
+        """Remove versions beyond retention and unreferenced files; raises StoreError on a disk error."""
         if dry_run:
             return collect(self._transactions, self._blobs, retention, dry_run=True, actor=actor)
         with self._locked(shared=False):
@@ -260,14 +260,14 @@ class MapStore(StoreQueries):
             return garbage
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
-        """Writes a version into one file and returns its size; errors as of `manifest`, StoreError for the disk."""
+        """Write a version into one file and return its size; errors as of `manifest`, StoreError for the disk."""
         head = self._export_head(site, version, archive=archive)
         with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
             write_atomically(path, _export_chunks(head, self._blobs))
             return path.stat().st_size
 
     def version_file(self, site: str, version: int) -> tuple[ExportHead, Callable[[], Iterator[bytes]]]:
-        """The file of a version without its archive: its head, and its bytes in pieces, the same ones every time."""
+        """Return the file of a version without its archive: its head, and its bytes in pieces, always the same."""
         head = self._export_head(site, version, archive=False)
         return head, lambda: _export_chunks(head, self._blobs)
 
@@ -288,10 +288,10 @@ class MapStore(StoreQueries):
         return ExportHead(site=site, version=version, blobs=tuple(entries))
 
     def import_version(self, path: Path, *, actor: Actor = NOBODY) -> VersionInfo:
-        """Takes a version out of an export file, as a draft of its site with its own number; publishing comes after.
+        """Import a version from an export file, as a draft of its site with its own number; publish it afterwards.
 
-        Does nothing where the store has it already. Raises MapFormatError for a file that is not whole, StateError
-        where the site has another version of that number, StoreError where a disk refuses.
+        Does nothing if the store already has it. Raises MapFormatError for an incomplete file, StateError
+        if the site has another version of that number, StoreError on a disk error.
         """
         with open_export(path) as reader, self._locked(shared=True):
             reader.check_whole()
@@ -316,7 +316,7 @@ class MapStore(StoreQueries):
         return self.version(manifest.site, manifest.version)
 
     def _building(self, site: str) -> dict[str, Any]:
-        """The part of a new manifest's configuration that says where the map lies in the building; nothing where that is not known.
+        """Return the configuration entry of a new manifest with the map's pose in the building; empty if unknown.
 
         A first version, without a current one before it, has a frame of its own.
         """
@@ -329,7 +329,7 @@ class MapStore(StoreQueries):
         return TileEntry(x=tile.tile_x, y=tile.tile_y, sha256=sha256, bytes=len(data), landmarks=len(tile))
 
     def _draft_row(self, manifest: Manifest, archive_sha256: str | None, job: int | None) -> VersionInfo:
-        """The row of a new draft; its manifest is on the disk when this returns."""
+        """Return the row of a new draft; its manifest is on the disk when this returns."""
         data = encode_manifest(manifest)
         return VersionInfo(
             site=manifest.site,
@@ -354,7 +354,7 @@ class MapStore(StoreQueries):
     def _known_import(self, manifest: Manifest, sha256: str) -> VersionInfo | None:
         known = self._find_version(manifest.site, manifest.version)
         if known is not None and known.manifest_sha256 != sha256:
-            reason = f"site {manifest.site} has another version {manifest.version}; import it into a store of its own"
+            reason = f"site {manifest.site} has another version {manifest.version}; import it into a separate store"
             raise StateError(reason)
         return known
 
@@ -365,7 +365,7 @@ class MapStore(StoreQueries):
                 self._write_current_file(row["site"])
 
     def _write_current_file(self, site: str) -> None:
-        """Within a transaction, so that of two processes the one that comes last writes what came last."""
+        """Write within a transaction, so that the file always matches the latest change of several processes."""
         path = self._root / current_path(site)
         with self._transactions.write(durable=False):
             current = self._current_row(site)
@@ -376,7 +376,7 @@ class MapStore(StoreQueries):
                 write_atomically(path, [f"{current.manifest_sha256}\n".encode()])
             except OSError as error:
                 raise StoreError(
-                    f"{path} cannot be written ({error.strerror}), though version {current.version} is current; make "
+                    f"{path} cannot be written ({error.strerror}), though version {current.version} is current; free some "
                     "space and open the store again to repair it"
                 ) from error
 
@@ -394,7 +394,7 @@ class MapStore(StoreQueries):
 
 
 def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
-    """The bytes of the file in pieces; MapFormatError, before its end, for damaged bytes in the store."""
+    """Yield the bytes of the file; raises MapFormatError, before its end, for damaged bytes in the store."""
     start = head.start()
     whole = hashlib.sha256(start)
     yield start

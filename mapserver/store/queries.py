@@ -1,4 +1,4 @@
-"""Queries of a store, and rows that change no version: robots' reports, jobs, events."""
+"""Queries of a store, and writes that change no version: robots' reports, jobs, events."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ _SERVED_KINDS = (*_OF_VERSIONS, "grid", *FOR_ROBOTS)
 
 
 class StoreQueries:
-    """The part of an open store that changes no version."""
+    """Methods of an open store that change no version."""
 
     def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         self._root = root
@@ -50,7 +50,7 @@ class StoreQueries:
         self._blobs = BlobFolder(root)
         self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
-        self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of what they were read from
+        self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
         self.operators = OperatorQueries(self._transactions)
 
     @property
@@ -64,9 +64,9 @@ class StoreQueries:
         return {(row["site"], row["robot"]) for row in self._transactions.query("SELECT site, robot FROM robots")}
 
     def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
-        """Forgets what robots of a site said last, and returns those that were known; their counts and failures stay.
+        """Remove the last reports of a site's robots, and return the known ones; their counts and failures stay.
 
-        Raises UsageError for a site that is not known, StoreError where the disk refuses.
+        Raises UsageError for an unknown site, StoreError on a disk error.
         """
         self._check_site(site)
         removed = []
@@ -87,7 +87,7 @@ class StoreQueries:
         )
 
     def versions(self, site: str, *, after: int = 0, limit: int = -1) -> list[VersionInfo]:
-        """Versions of a site, oldest first, behind number `after`; raises UsageError for a site that is not known."""
+        """Return versions of a site, oldest first, after number `after`; raises UsageError for an unknown site."""
         self._check_site(site)
         return self._transactions.rows(
             VersionInfo,
@@ -96,7 +96,7 @@ class StoreQueries:
         )
 
     def version(self, site: str, version: int) -> VersionInfo:
-        """One version; raises UsageError where it does not exist."""
+        """Return one version; raises UsageError if it does not exist."""
         self._check_site(site)
         found = self._find_version(site, version)
         if found is None:
@@ -104,27 +104,27 @@ class StoreQueries:
         return found
 
     def current(self, site: str) -> VersionInfo | None:
-        """The site's current version, None before the first publication; raises UsageError for an unknown site."""
+        """Return the site's current version, None before the first publication; raises UsageError for an unknown site."""
         self._check_site(site)
         return self._current_row(site)
 
     def releases(self, site: str) -> SiteReleases:
-        """What releases of a site are decided by, as it is now; raises UsageError for an unknown site."""
+        """Return the present state of a site's releases, for decisions; raises UsageError for an unknown site."""
         self._check_site(site)
         return site_releases(self._transactions, site)
 
     def manifest(self, site: str, version: int) -> Manifest:
-        """The manifest of a version; errors as of `version` and `blob`."""
+        """Return the manifest of a version; errors as of `version` and `blob`."""
         return decode_manifest(self._blobs.get(self.version(site, version).manifest_sha256))
 
     def blob(self, sha256: str) -> bytes:
-        """The bytes of an address, verified; raises StoreError for missing ones, MapFormatError for damaged ones."""
+        """Return the bytes of an address, verified; raises StoreError for missing ones, MapFormatError for damaged ones."""
         return self._blobs.get(check_sha256(sha256))
 
     def served_kind(self, sha256: str, site: str | None = None) -> str | None:
-        """What robots (of a site) may fetch under this address: manifest, tile, vocabulary, grid, or a site's file.
+        """Return the kind that robots (of a site) may fetch under this address: manifest, tile, vocabulary, grid, or a site's file.
 
-        None for everything else: archives, and what only drafts mention.
+        None for all others: archives, and bytes referenced only by drafts.
         """
         rows = self._transactions.query(
             """SELECT kind FROM version_blobs JOIN versions USING (site, version)
@@ -138,17 +138,17 @@ class StoreQueries:
         return next((kind for kind in _SERVED_KINDS if kind in kinds), None)
 
     def archive(self, site: str, version: int) -> bytes | None:
-        """The archive of a version, if it has one; errors as of `version` and `blob`."""
+        """Return the archive of a version, if it has one; errors as of `version` and `blob`."""
         sha256 = self.version(site, version).archive_sha256
         return None if sha256 is None else self._blobs.get(sha256)
 
     def site_file(self, site: str, kind: str) -> bytes | None:
-        """What a site keeps beside its versions under this kind, such as `plan`; None without. Errors as of `blob`."""
+        """Return a site's file of this kind, such as `plan`; None if absent. Errors as of `blob`."""
         sha256 = self.site_file_sha256(site, kind)
         return None if sha256 is None else self._blobs.get(sha256)
 
     def survey_requests(self, site: str) -> list[SurveyRequest]:
-        """Places that people ask to survey again and that are not done, oldest first; none for an unknown site."""
+        """Return the open survey requests, oldest first; empty for an unknown site."""
         query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND kind GLOB ?"
         rows = self._transactions.query(query, (site, f"{KIND}*"))
         found = [read_request(row["kind"], self._blobs.get(row["sha256"])) for row in rows]
@@ -159,12 +159,12 @@ class StoreQueries:
         return rows[0]["sha256"] if rows else None
 
     def alignment(self, site: str) -> Alignment | None:
-        """Where the site's map lies in the drawing of its building; None for a site that was not aligned."""
+        """Return the pose of the site's map in the drawing of its building; None if not aligned."""
         data = self.site_file(site, ALIGNMENT)
         return None if data is None else decode_alignment(data)
 
     def areas(self, site: str) -> Areas:
-        """The named areas of a site, in `map` as it is aligned now; none for a site without. UsageError where they need an alignment."""
+        """Return the named areas of a site, in `map` by the present alignment; empty if absent. UsageError if an alignment is missing."""
         query = "SELECT sha256 FROM site_files WHERE site = ? AND kind IN (?, ?) ORDER BY kind"
         key = tuple(row["sha256"] for row in self._transactions.query(query, (site, AREAS, ALIGNMENT)))
         known = self._areas.get(site)
@@ -175,7 +175,7 @@ class StoreQueries:
         return known[1]
 
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
-        """What the gate said about a version, oldest first; raises UsageError where it does not exist."""
+        """Return the gate's verdicts on a version, oldest first; raises UsageError if it does not exist."""
         self.version(site, version)
         rows = self._transactions.query(
             """SELECT stamp_ns, accepted, forced, reasons, report FROM verdicts
@@ -190,9 +190,9 @@ class StoreQueries:
         ]
 
     def evidence(self, site: str, version: int) -> Evidence | None:
-        """What was measured of a version when it was built, None for one that came without; errors as of `manifest`.
+        """Return the measurements of a version from its build, None if absent; errors as of `manifest`.
 
-        An imported one has what its manifest carries.
+        For an imported one those in its manifest.
         """
         self.version(site, version)
         rows = self._transactions.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
@@ -203,7 +203,7 @@ class StoreQueries:
         )
 
     def trusted(self, info: VersionInfo) -> list[TrustedCalibration]:
-        """The calibrations of a version that a person trusts; none where its manifest is damaged, which `verify` finds."""
+        """Return the calibrations of a version trusted by an operator; empty for a damaged manifest, which `verify` reports."""
         try:
             return trusted_calibrations(self.manifest(info.site, info.version))
         except (StoreError, MapFormatError):
@@ -212,7 +212,7 @@ class StoreQueries:
     def events(
         self, site: str, span_ns: tuple[int | None, int | None] = (None, None), *, after: int = 0, limit: int = -1
     ) -> list[Event]:
-        """A site's history, oldest first, behind event `after`; span_ns: from when and until before when, None for ever."""
+        """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
         return self._transactions.rows(
             Event,
             f"""SELECT {_EVENT} FROM events WHERE site = ?1 AND id > ?2 AND (?3 IS NULL OR stamp_ns >= ?3)
@@ -221,16 +221,16 @@ class StoreQueries:
         )
 
     def audit(self, kind: str, detail: str, *, actor: Actor = NOBODY, site: str = "") -> None:
-        """One line of the log about something that no other method writes, such as an enrolment, a signature or a refusal."""
+        """Log an event that no other method writes, such as an enrolment, a signature or a refusal."""
         with self._transactions.write() as connection:
             self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
 
     def audit_lines(self, last: int | None = None) -> list[AuditLine]:
-        """The log of all sites and of the store itself, oldest line first, or the last lines of it."""
+        """Return the log of all sites and of the store itself, oldest line first, or its last lines."""
         return self._transactions.audit_lines(last)
 
     def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
-        """Versions that some robots (of a site) tried first, the last one first; those that run alone with `running`."""
+        """Return canaries (of a site), latest first; with `running` only running ones."""
         return canaries(self._transactions, site, running=running)
 
     def last_events(self, site: str, limit: int) -> list[Event]:
@@ -239,7 +239,7 @@ class StoreQueries:
         )
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
-        """What every robot (of a site) said last."""
+        """Return the last report of every robot (of a site)."""
         rows = self._transactions.query(
             "SELECT * FROM robots WHERE ?1 IS NULL OR site = ?1 ORDER BY site, robot", (site,)
         )
@@ -253,7 +253,7 @@ class StoreQueries:
         before: int | None = None,
         limit: int = -1,
     ) -> list[JobInfo]:
-        """Jobs (of a site), newest first, older than job `before`; span_ns: begun from when and until before when, by the second."""
+        """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
         since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
         return self._jobs(
             """WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR started >= ?3)
@@ -262,12 +262,12 @@ class StoreQueries:
         )
 
     def sites_with_jobs(self) -> list[str]:
-        """Sites of which there is a job, also those without any version yet."""
+        """Return the sites with a job, also those without a version."""
         rows = self._transactions.query("SELECT DISTINCT site FROM jobs ORDER BY site")
         return [row["site"] for row in rows]
 
     def tell_progress(self, job: int, progress: object, key: str = "progress") -> None:
-        """Keeps how far a running job is, under a key of its report; nothing for one that has ended. A power cut may take it."""
+        """Store the progress of a running job under a key of its report; ignored for an ended one. A power cut may lose it."""
         with self._transactions.write(durable=False) as connection:
             connection.execute(
                 "UPDATE jobs SET report = json_set(report, '$.' || ?, json(?)) WHERE id = ? AND state = 'running'",
@@ -278,17 +278,17 @@ class StoreQueries:
         return self._jobs("WHERE state = 'running' ORDER BY id", ())
 
     def last_night(self, site: str) -> JobInfo | None:
-        """The site's last nightly job that has ended; None before the first."""
+        """Return the site's last ended nightly job; None before the first."""
         found = self._jobs(
             "WHERE site = ? AND kind = 'nightly' AND state <> 'running' ORDER BY id DESC LIMIT 1", (site,)
         )
         return found[0] if found else None
 
     def job(self, number: int) -> JobInfo:
-        """One job; raises UsageError where it does not exist."""
+        """Return one job; raises UsageError if it does not exist."""
         found = self._jobs("WHERE id = ?", (number,))
         if not found:
-            raise UsageError(f"there is no job {number}; the list of jobs shows those that are kept")
+            raise UsageError(f"job {number} does not exist; the list of jobs shows the stored ones")
         return found[0]
 
     def _jobs(self, which: str, values: tuple[object, ...]) -> list[JobInfo]:
@@ -296,7 +296,7 @@ class StoreQueries:
         return [JobInfo(**row | {"report": json.loads(row["report"])}) for row in rows]
 
     def record_robot_report(self, site: str, robot: str, report: dict[str, Any], version: int | None = None) -> None:
-        """Keeps what a robot said; `version` is what it runs, None where it did not say."""
+        """Store a robot's report; `version` is its running version, None if not reported."""
         check_name(site, "site")
         check_name(robot, "robot")
         with self._transactions.write(durable=False) as connection:
@@ -311,7 +311,7 @@ class StoreQueries:
             return int(done.lastrowid or 0)
 
     def update_job(self, job: int, state: str, message: str, report: dict[str, Any]) -> None:
-        """Keeps how a job goes on, or ended (state done or failed)."""
+        """Store the state of a job: running, or ended (done or failed)."""
         with self._transactions.write() as connection:
             connection.execute(
                 "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?",

@@ -1,4 +1,4 @@
-"""Rows of the store: versions, verdicts, canaries, jobs, robots, failures, and what a release changes of them."""
+"""Rows of the store: versions, verdicts, canaries, jobs, robots, failures, and changes by a release."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from mapserver.quality.figures import Evidence
 
 @dataclass(frozen=True, slots=True)
 class VersionInfo:
-    """One version of a site. state: draft, published, current or retired; job: the job that saved it, if it is known."""
+    """One version of a site. state: draft, published, current or retired; job: the job that saved it, if known."""
 
     site: str
     version: int
@@ -35,7 +35,7 @@ class VersionInfo:
 
     @property
     def map_bytes(self) -> int:
-        """What a robot downloads for the whole site, vocabulary apart."""
+        """Download size for the whole site, vocabulary excluded."""
         return self.manifest_bytes + self.tile_bytes
 
 
@@ -50,7 +50,7 @@ class SiteInfo:
 
 @dataclass(frozen=True, slots=True)
 class RobotInfo:
-    """What a robot said last: the version it runs (None before its first acknowledgement) and its report."""
+    """Last report of a robot: its version (None before its first acknowledgement) and its report."""
 
     site: str
     robot: str
@@ -61,9 +61,9 @@ class RobotInfo:
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """Who acts, and why; empty where the program acts by itself.
+    """Author of a change, and reason; empty for automatic changes.
 
-    operator: the name that was proved by a session or token, empty where `name` was only written; address: where the request came from.
+    operator: the name authenticated by a session or token, empty if `name` was only typed; address: of the request.
     """
 
     name: str = ""
@@ -77,7 +77,7 @@ NOBODY = Actor()
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened to a site, by whom and why."""
+    """An event of a site, with author and reason."""
 
     id: int
     stamp_ns: int
@@ -91,7 +91,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class VerdictRow:
-    """What the gate said about a version: reasons to refuse it (none if accepted), and what it looked at."""
+    """The gate's verdict on a version: reasons to refuse it (none if accepted), and the checked figures."""
 
     stamp_ns: int
     accepted: bool
@@ -115,7 +115,7 @@ class JobInfo:
 
 
 class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of a draft's manifest that only the survey knows; `created` is ISO 8601 in UTC."""
+    """The fields of a draft's manifest known only to the survey; `created` is ISO 8601 in UTC."""
 
     created: str
     tile_size_m: float
@@ -130,7 +130,7 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
 class DraftContent:
     """A new draft. archive: the whole survey; grid, surfels: as of `encode_grid`, `encode_surfels`; evidence: for the gate.
 
-    job: number of the one that made it.
+    job: number of the job that built it.
     """
 
     tiles: Sequence[Tile]
@@ -144,14 +144,14 @@ class DraftContent:
 
 
 AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
-"""What the sums are kept by, each for itself: never robot and tile together, so that they stay small."""
+"""Keys of the sums, each separate: never robot and tile together, so that they stay few."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureRow:
-    """One failure. happened_ns: when it began, by the server's clock; tile: "x,y"; kind `suspected`: an estimate.
+    """One failure. happened_ns: its start, by the server's clock; tile: "x,y"; kind `suspected`: an estimate.
 
-    area: the named area of the position, as the site's areas are now.
+    area: the named area of the position, by the site's present areas.
     """
 
     number: int
@@ -187,7 +187,7 @@ class PictureRow:
 
 @dataclass(frozen=True, slots=True)
 class FailureDetail:
-    """A failure with its context. report: without pictures; pictures: those that are still kept."""
+    """A failure with its context. report: without pictures; pictures: those still stored."""
 
     failure: FailureRow
     report: FailureReport
@@ -205,7 +205,7 @@ class FailureReplay:
 
 @dataclass(frozen=True, slots=True)
 class FailureFilter:
-    """Which failures; None is any. since_ns, until_ns: by `happened_ns`."""
+    """Filter of failures; None matches any. since_ns, until_ns: by `happened_ns`."""
 
     site: str | None = None
     robot: str | None = None
@@ -220,9 +220,9 @@ class FailureFilter:
 
 @dataclass(frozen=True, slots=True)
 class TraceRow:
-    """Where a robot was and what its estimate was worth, thinned; hour: since 1970, by the server's clock.
+    """Position of a robot and quality of its estimate, thinned; hour: since 1970, by the server's clock.
 
-    heard_ns: by the same clock; flags: with commas; frame_ms: CPU of a frame, mean of the last ones.
+    heard_ns: by the same clock; flags: with commas; frame_ms: CPU of a frame, mean of the latest.
     exposure, sharpness: of the left camera's last image.
     """
 
@@ -244,9 +244,9 @@ class TraceRow:
 
 @dataclass(frozen=True, slots=True)
 class CanaryRow:
-    """A version that some robots of a site try before the others. state: running, promoted, rolled_back or stopped.
+    """A version that some robots of a site run before the others. state: running, promoted, rolled_back or stopped.
 
-    threshold: robots whose number (`canary.number_of`) is below it take part. outcome: why it ended, empty while it runs.
+    threshold: robots whose number (`canary.number_of`) is below it take part. outcome: reason of its end, empty while it runs.
     """
 
     id: int
@@ -265,10 +265,10 @@ class CanaryRow:
 
 @dataclass(frozen=True, slots=True)
 class SiteReleases:
-    """What releases of a site are decided by: its versions by number, and the canary that runs, if any.
+    """State of a site's releases: its versions by number, and the running canary, if any.
 
-    rollback_target: the version that was current before, None where none was; rollback_row: its row in the record of what was current.
-    files: addresses of what the site keeps beside its versions and robots may have, by kind.
+    rollback_target: the previous current version, None if absent; rollback_row: its row in the history of current versions.
+    files: addresses of the site's files for robots, by kind.
     """
 
     site: str
@@ -285,7 +285,7 @@ class SiteReleases:
 
 
 class LogEntry(NamedTuple):
-    """One line of a site's history that is to be written."""
+    """A line of a site's history to be written."""
 
     kind: str
     detail: str
@@ -294,7 +294,7 @@ class LogEntry(NamedTuple):
 
 
 class NewCanary(NamedTuple):
-    """A canary that begins."""
+    """A canary to be started."""
 
     version: int
     base_version: int
@@ -304,7 +304,7 @@ class NewCanary(NamedTuple):
 
 
 class CanaryEnd(NamedTuple):
-    """How the canary of this row ends: promoted, rolled_back or stopped, and why."""
+    """End of the canary of this row: promoted, rolled_back or stopped, and the reason."""
 
     id: int
     state: str
@@ -313,10 +313,10 @@ class CanaryEnd(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseChanges:
-    """Rows that one decision changes, all in one transaction.
+    """Rows changed by one decision, all in one transaction.
 
-    states: versions and their new states, in this order: a site never has two current versions. new_current: is appended to the
-    record of what was current; drop_currents_after: rows of that record behind this one go.
+    states: versions and their new states, in this order: a site never has two current versions. new_current: appended to the
+    history of current versions; drop_currents_after: rows of that history after this one are deleted.
     """
 
     states: tuple[tuple[int, str], ...] = ()
@@ -329,8 +329,8 @@ class ReleaseChanges:
 
 @dataclass(frozen=True, slots=True)
 class FleetRetention:
-    """What stays of the fleet's reports: sums and failures by age, failures also by count of each robot, pictures by size, traces by age
-    and count.
+    """Retention of the fleet's reports: sums and failures by age, failures also by number per robot, pictures by size, traces by age
+    and number.
     """
 
     tally_days: float = 400.0

@@ -1,4 +1,4 @@
-"""The tables of the database. A change of them is another migration with a name; one that has landed is never changed."""
+"""The tables of the database. A change is a further named migration; a released one is never changed."""
 
 from sqlite_utils import Database, Migrations
 
@@ -267,15 +267,15 @@ CREATE TABLE failure_replays (
 
 @MIGRATIONS()
 def tables(database: Database) -> None:
-    """The first schema; a store of the last numbered format has it but for one column."""
+    """Create the first schema; a store of the last numbered format has it except for one column."""
     if database["versions"].exists():
         database.execute("ALTER TABLE sites DROP COLUMN vocabulary_sha256")
-        database.execute("DELETE FROM traces WHERE heard_ns IS NULL")  # nobody knows when, and no page shows them
+        database.execute("DELETE FROM traces WHERE heard_ns IS NULL")  # without a time; pages do not show them
         return
     for statement in _TABLES.strip().split("\n\n"):
         database.execute(statement)
 
 
-LAST_UNNAMED = 12  # of the formats that were numbered, before migrations had names
+LAST_UNNAMED = 12  # the last numbered format, before named migrations
 FORMAT = LAST_UNNAMED + len(MIGRATIONS.pending(Database(memory=True)))
-"""SQLite's user_version of a database with all migrations: tells an older one from its head, and is newer for programs of before."""
+"""SQLite's user_version of a database with all migrations: reveals an older database by its header, and is newer for older programs."""

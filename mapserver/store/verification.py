@@ -15,10 +15,10 @@ from mapserver.store.version_rows import references, site_releases
 
 @dataclass(slots=True)
 class StoreFindings:
-    """What was found. faults: each a sentence, none in a sound store.
+    """Result of a verification. faults: each a sentence, empty for an intact store.
 
-    orphans and leftovers are files that nothing mentions, as a killed process leaves them; `gc` removes them. open_to_others: whether
-    other users of the machine may look into the folder or its database.
+    orphans and leftovers: unreferenced files, as left by a killed process; `gc` removes them. open_to_others: True if
+    other users of the machine can read the folder or its database.
     """
 
     sites: int = 0
@@ -32,7 +32,7 @@ class StoreFindings:
 
 
 def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFindings:
-    """Reads everything in the store. Raises StoreError only where the database cannot be read at all."""
+    """Read everything in the store. Raises StoreError only if the database cannot be read at all."""
     found = StoreFindings()
     integrity = [row["integrity_check"] for row in transactions.query("PRAGMA integrity_check")]
     found.faults += [f"database: {text}" for text in integrity if text != "ok"]
@@ -81,7 +81,7 @@ def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFind
 def _version_faults(transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str]) -> list[str]:
     name = f"version {info.version} of {info.site}"
     if info.manifest_sha256 not in sound:
-        return []  # reported with the blobs, unless nothing mentions it
+        return []  # reported with the blobs, unless it is unreferenced
     try:
         manifest = decode_manifest(blobs.get(info.manifest_sha256))
     except FleetmapError as error:
@@ -90,7 +90,7 @@ def _version_faults(transactions: Transactions, blobs: BlobFolder, info: Version
     query = "SELECT kind, sha256 FROM version_blobs WHERE site = ? AND version = ?"
     rows = transactions.query(query, (info.site, info.version))
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
-        faults.append(f"{name}: the database does not mention exactly the bytes of its manifest")
+        faults.append(f"{name}: the database and its manifest reference different bytes")
     names = ("site", "version", "parent", "tile_bytes", "landmarks")
     stored = (*(getattr(info, name) for name in names), info.tiles, info.vocabulary_sha256)
     made = (*(getattr(manifest, name) for name in names), len(manifest.tiles), manifest.vocabulary.sha256)
@@ -99,7 +99,7 @@ def _version_faults(transactions: Transactions, blobs: BlobFolder, info: Version
     wrong = [
         tile for tile in manifest.tiles if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes
     ]
-    return faults + [f"{name}: tile {tile.x},{tile.y} has another size than its manifest says" for tile in wrong]
+    return faults + [f"{name}: tile {tile.x},{tile.y} has another size than in its manifest" for tile in wrong]
 
 
 def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteReleases) -> list[str]:
@@ -109,7 +109,7 @@ def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteRel
     current = [number for number, info in rows.versions.items() if info.state == "current"]
     newest = transactions.query("SELECT version FROM currents WHERE site = ? ORDER BY id DESC LIMIT 1", (rows.site,))
     if [row["version"] for row in newest] != current:
-        faults.append(f"{name}: current is {current}, the record of what was current ends with {newest}")
+        faults.append(f"{name}: current is {current}, but the history of current versions ends with {newest}")
     if not current and any(info.state in {"published", "retired"} for info in rows.versions.values()):
         faults.append(f"{name}: it has published versions, none of them current")
     return faults

@@ -1,4 +1,4 @@
-"""SQL over versions, canaries and the record of what was current. `releases` decides what changes."""
+"""SQL on versions, canaries and the history of current versions. `releases` decides the changes."""
 
 import sqlite3
 from collections.abc import Iterable, Mapping
@@ -9,9 +9,9 @@ from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VersionInfo
 
 EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
-"""By kind: where the bytes stand that a version has beside those that its robots need."""
+"""By kind: table of the bytes of a version not needed by its robots."""
 
-# The newest row of a version that was current before the one that is current now.
+# The newest row of an earlier current version.
 _ROLLBACK_TARGET = """
     SELECT id, version FROM currents
     WHERE site = ?1 AND version <> (SELECT version FROM versions WHERE site = ?1 AND state = 'current')
@@ -19,7 +19,7 @@ _ROLLBACK_TARGET = """
 
 
 def site_releases(transactions: Transactions, site: str) -> SiteReleases:
-    """What releases of a site are decided by; nothing at all for an unknown site."""
+    """Return the state of a site's releases; empty for an unknown site."""
     rows = transactions.query("SELECT * FROM versions WHERE site = ? ORDER BY version", (site,))
     before = transactions.query(_ROLLBACK_TARGET, (site,))
     running = canaries(transactions, site, running=True)
@@ -35,7 +35,7 @@ def site_releases(transactions: Transactions, site: str) -> SiteReleases:
 
 
 def canaries(transactions: Transactions, site: str | None, *, running: bool) -> list[CanaryRow]:
-    """Canaries (of a site), the last one first."""
+    """Return canaries (of a site), latest first."""
     query = "SELECT * FROM canaries WHERE (?1 IS NULL OR site = ?1) AND (?2 = 0 OR state = 'running') ORDER BY id DESC"
     return transactions.rows(CanaryRow, query, (site, int(running)))
 
@@ -43,7 +43,7 @@ def canaries(transactions: Transactions, site: str | None, *, running: bool) -> 
 def apply_changes(
     transactions: Transactions, connection: sqlite3.Connection, site: str, changes: ReleaseChanges
 ) -> None:
-    """Writes what a release changes, within its transaction."""
+    """Write the changes of a release, within its transaction."""
     now_ns = transactions.now_ns()
     for version, state in changes.states:
         set_state(connection, (site, version), state, now_ns)
@@ -66,7 +66,7 @@ def apply_changes(
 
 
 def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: str, now_ns: int) -> None:
-    """Gives (site, number) its new state, published, current or retired, and the moment of the first and the last of them."""
+    """Set the state of (site, number), published, current or retired, with the time of the first and of the last."""
     connection.execute(
         """UPDATE versions SET state = ?1, published_ns = coalesce(published_ns, ?2),
            retired_ns = CASE WHEN ?1 = 'retired' THEN ?2 END WHERE site = ?3 AND version = ?4""",
@@ -77,7 +77,7 @@ def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: s
 def insert_draft(
     transactions: Transactions, connection: sqlite3.Connection, manifest: Manifest, draft: VersionInfo, log: LogEntry
 ) -> None:
-    """The rows of a new draft, within a transaction; its bytes are on the disk already."""
+    """Insert the rows of a new draft, within a transaction; its bytes are already on the disk."""
     row = {name: getattr(draft, name) for name in VersionInfo.__dataclass_fields__}
     connection.execute(f"INSERT INTO versions ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})", row)
     query = "UPDATE sites SET last_version = max(last_version, ?) WHERE site = ?"
@@ -90,14 +90,14 @@ def insert_draft(
 
 
 def insert_extras(connection: sqlite3.Connection, draft: VersionInfo, extras: Mapping[str, Iterable[str]]) -> None:
-    """The bytes of a draft's grid and surfels, by their kind in EXTRA_TABLES, within a transaction."""
+    """Insert the bytes of a draft's grid and surfels, by their kind in EXTRA_TABLES, within a transaction."""
     for kind, addresses in extras.items():
         rows = [(draft.site, draft.version, sha256) for sha256 in sorted(set(addresses))]
         connection.executemany(f"INSERT INTO {EXTRA_TABLES[kind]} (site, version, sha256) VALUES (?, ?, ?)", rows)
 
 
 def extras(transactions: Transactions, site: str, version: int) -> list[tuple[str, str]]:
-    """Kind and address of the bytes of a version's grid and surfels."""
+    """Return kind and address of the bytes of a version's grid and surfels."""
     query = "SELECT sha256 FROM {} WHERE site = ? AND version = ? ORDER BY sha256"
     return [
         (kind, row["sha256"])
@@ -107,7 +107,7 @@ def extras(transactions: Transactions, site: str, version: int) -> list[tuple[st
 
 
 def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:
-    """Kind and address of everything that belongs to a version."""
+    """Return kind and address of all bytes of a version."""
     found = {("manifest", info.manifest_sha256), ("vocabulary", manifest.vocabulary.sha256)}
     found |= {("tile", tile.sha256) for tile in manifest.tiles}
     return found | ({("archive", info.archive_sha256)} if info.archive_sha256 is not None else set())

@@ -1,1 +1,1 @@
-"""A map that renders: surfels of a version, what a camera should see of them, and how a picture differs from that. Pure."""
+"""Surfels: a renderable map of a version, expected views of a camera, and differences of pictures from them. Pure."""

@@ -1,7 +1,7 @@
-"""What stands otherwise in two versions of a site: surfels that one of them alone has, where the other looked. Pure.
+"""Changes between two versions of a site: surfels that only one of them has, at places seen by the other. Pure.
 
-A surfel of one version has changed where views of the other saw through its place, by the rule of the planners' grid. Where no view of
-the other looked nothing is said: it is not seen, not gone.
+A surfel of one version has changed if views of the other saw through its place, by the rule of the planner grid. Without views of
+the other version it counts as not seen, not as gone.
 """
 
 from dataclasses import dataclass
@@ -24,19 +24,19 @@ CELL_M = 0.1
 APPEARED, VANISHED = "appeared", "vanished"
 _VOXEL_LEVEL = 3
 _VOXEL_M = EDGE_M * 2**_VOXEL_LEVEL
-_FINEST = 2  # coarser surfels were seen from so far that their depth says little
-_REACH_M = 0.15  # a surfel of the other version that is so near to a voxel's middle is the same surface
+_FINEST = 2  # coarser surfels come from distant views with inaccurate depth
+_REACH_M = 0.15  # a surfel of the other version this near to a voxel's middle is the same surface
 _LEAST_AREA_M2 = 0.05  # of surfels in a patch: a face of a small carton
 _LEAST_SHARE = 0.3  # of a voxel's face that its surfels cover
 _VIEW_PX = 96
-_CLEAR_PER_M = 0.01  # of a depth that views agreed on, times its square: three standard deviations
+_CLEAR_PER_M = 0.01  # times the squared depth: three standard deviations of a consistent depth
 _MOST_CELLS = 1 << 24
 _UNJUDGED, _SAME, _CHANGED = 0, 1, 2
 _SHADES = {"same": (150, 150, 150), "not_seen": (218, 226, 232), VANISHED: (0, 94, 213), APPEARED: (178, 114, 0)}  # BGR
 
 
 class SeenSite(NamedTuple):
-    """The surfels of a version, and the tangent of the half angle of the cone around the axis that its cameras show whichever way up."""
+    """The surfels of a version, and the tangent of the half angle of the cone that its cameras cover in any orientation."""
 
     surfels: Surfels
     tangent: float
@@ -44,7 +44,7 @@ class SeenSite(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Changed surfels that hang together: kind, corners (2, 3) of their box in `map`, metres, and their area."""
+    """Connected changed surfels: kind, corners (2, 3) of their box in `map`, metres, and their area."""
 
     kind: str
     box_map: Array
@@ -55,7 +55,7 @@ class Patch:
 class Changes:
     """Patches, the largest first, and a plan (H, W) of cells by layer; row 0 has the lowest y, corner_m (2,) of the plan in `map`.
 
-    Layers: same (both versions have something there), not_seen (one alone has something, and the other did not look), appeared, vanished.
+    Layers: same (both have surfels), not_seen (only one has, and the other had no view), appeared, vanished.
     """
 
     patches: tuple[Patch, ...]
@@ -63,14 +63,14 @@ class Changes:
     corner_m: Array
 
     def area_m2(self, kind: str) -> float:
-        """Of all patches of a kind."""
+        """Return the area of all patches of a kind."""
         return sum(patch.area_m2 for patch in self.patches if patch.kind == kind)
 
 
 def changes_between(before: SeenSite, after: SeenSite) -> Changes:
-    """What of `before` vanished and what appeared until `after`. UsageError for versions without surfels or too large a plan."""
+    """Return the surfels of `before` that vanished and those that appeared in `after`. UsageError without surfels or for a large plan."""
     if not len(before.surfels) or not len(after.surfels):
-        raise UsageError("a version without any surfel cannot be compared; choose two that showed something near")
+        raise UsageError("a version without surfels cannot be compared; choose two versions with surfels")
     corner_m, shape = _plan(np.concatenate([before.surfels.points_map, after.surfels.points_map])[:, :2])
     patches, layers = list[Patch](), {name: np.zeros(shape, bool) for name in _SHADES}
     for kind, one, other in ((VANISHED, before, after), (APPEARED, after, before)):
@@ -90,7 +90,7 @@ def changes_between(before: SeenSite, after: SeenSite) -> Changes:
 
 
 def changes_png(changes: Changes) -> bytes:
-    """The plan, y upwards, one pixel for each cell: appeared blue, vanished orange, the same grey, not seen by one of them pale."""
+    """Return the plan as PNG, y upwards, one pixel a cell: appeared blue, vanished orange, same grey, not seen by one pale."""
     height, width = changes.layers["same"].shape
     picture = np.zeros((height, width, 4), np.uint8)
     for name, shade in _SHADES.items():
@@ -101,7 +101,7 @@ def changes_png(changes: Changes) -> bytes:
 
 
 def changes_geojson(changes: Changes) -> dict[str, Any]:
-    """The patches as GeoJSON, whose coordinates are metres in `map` in the place of degrees."""
+    """Return the patches as GeoJSON with metres in `map` instead of degrees."""
     features = []
     for patch in changes.patches:
         (x0, y0, z0), (x1, y1, z1) = patch.box_map.round(2).tolist()
@@ -112,20 +112,20 @@ def changes_geojson(changes: Changes) -> dict[str, Any]:
 
 
 class _Voxels(NamedTuple):
-    """M voxels: mean places (M, 3) of their surfels, and the surfels' areas (M,)."""
+    """M voxels: mean positions (M, 3) of their surfels, and the surfels' areas (M,)."""
 
     points_map: Array
     areas_m2: Array
 
 
 def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
-    """The corner of a plan that holds places (N, 2), and its rows and columns."""
+    """Return the corner of a plan that contains places (N, 2), and its rows and columns."""
     low, high = (
         np.floor(extreme / CELL_M).astype(np.int64) for extreme in (places_m.min(axis=0), places_m.max(axis=0))
     )
     columns, rows = (high - low + 1).tolist()
     if rows * columns > _MOST_CELLS:
-        raise UsageError(f"a plan of {columns} x {rows} cells; at most {_MOST_CELLS} are drawn")
+        raise UsageError(f"a plan of {columns} x {rows} cells; the limit is {_MOST_CELLS}")
     return low * CELL_M, (rows, columns)
 
 
@@ -135,7 +135,7 @@ def _fill(layer: NDArray[np.bool_], points_map: Array | NDArray[np.float32], cor
 
 
 def _only_in(one: Surfels, other: Surfels) -> _Voxels:
-    """Voxels of fine surfels of `one` that `other` has no surfel near to."""
+    """Return voxels of fine surfels of `one` without a near surfel of `other`."""
     fine = one[one.levels <= _FINEST]
     keys = core.voxel_keys(fine.points_map, np.full(len(fine), _VOXEL_LEVEL, np.uint8))
     _, first, of_voxel = np.unique(keys, return_index=True, return_inverse=True)
@@ -151,7 +151,7 @@ def _only_in(one: Surfels, other: Surfels) -> _Voxels:
 
 
 def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
-    """(M,) what the views of the other version say of places."""
+    """Return (M,) verdicts of the other version's views on the voxels."""
     through, seen = np.zeros((2, len(voxels.points_map)))
     focal_px = 0.5 * _VIEW_PX / other.tangent
     centre_px = (_VIEW_PX - 1) / 2
@@ -170,7 +170,7 @@ def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
         columns, lines = np.round(camera.pixel_from_ray(points_cam)).astype(np.int64).clip(0, _VIEW_PX - 1).T
         distance_m, clear_m = np.linalg.norm(points_cam, axis=1), CELL_M + _CLEAR_PER_M * depth_m[lines, columns] ** 2
         near_m, far_m = nearest_m[lines, columns] - clear_m, farthest_m[lines, columns] + clear_m
-        through[rows] += distance_m < near_m  # False for the NaN of pixels of which nothing is known
+        through[rows] += distance_m < near_m  # False for NaN, unknown pixels
         seen[rows] += (distance_m >= near_m) & (distance_m <= far_m)
     score = HIT * seen - through
     verdicts = np.where(seen > 0, _SAME, _UNJUDGED)
@@ -178,7 +178,7 @@ def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
 
 
 def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
-    """Which points are in the cone of a view, of those as of Surfels.exposures."""
+    """Return the points in the cone of a view, a row of Surfels.exposures."""
     off = points_map - view[:3]
     depth_m = off @ view[3:6]
     aside_m = np.sqrt(np.maximum((off**2).sum(axis=1) - depth_m**2, 0.0))
@@ -186,7 +186,7 @@ def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
 
 
 def _facing(view: Array) -> Array:
-    """map_from_cam (4, 4) of a camera at a view's place that looks its way, as level as that allows."""
+    """Return map_from_cam (4, 4) of a camera with a view's position and direction, as level as possible."""
     forward = view[3:6] / np.linalg.norm(view[3:6])
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
@@ -194,7 +194,7 @@ def _facing(view: Array) -> Array:
 
 
 def _joined(points_map: Array) -> list[NDArray[np.int64]]:
-    """Rows of points that hang together by steps of a voxel's diagonal."""
+    """Return rows of points connected by steps of up to a voxel's diagonal."""
     if not len(points_map):
         return []
     pairs = scipy.spatial.cKDTree(points_map).query_pairs(1.8 * _VOXEL_M, output_type="ndarray")

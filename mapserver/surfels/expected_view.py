@@ -1,4 +1,4 @@
-"""What a camera should see at a pose, drawn from surfels."""
+"""Expected images of a camera at a pose, drawn from surfels."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,14 +19,14 @@ Image32 = NDArray[np.float32]
 FAR_M = 40.0
 RADIUS_EDGES = 1.2  # of a disc: more than half of the diagonal of a voxel's face
 MOST_PIXELS = 1 << 21
-_RIM = 0.1  # of the width: discs whose centre is so far outside may reach in
-_ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # views so near to each other have one exposure
-_MOST_SQUARED = 1.0  # tangent of the angle to the axis up to which a survey's lens is known
+_RIM = 0.1  # of the width: discs with a centre this far outside may reach in
+_ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # views this near to each other have the same exposure
+_MOST_SQUARED = 1.0  # limit of the squared tangent of the angle to the axis for the lens model
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedView:
-    """A picture (H, W) uint8, its depths in m along the rays (H, W), NaN where nothing is known, and where that is (H, W)."""
+    """A picture (H, W) uint8, depths in m along the rays (H, W), NaN if unknown, and the mask of unknown pixels (H, W)."""
 
     picture: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -34,13 +34,13 @@ class ExpectedView:
 
 
 def pinhole(camera: StereoCamera) -> CameraCalibration:
-    """The left camera of a rectified pair, without its mounting."""
+    """Return the left camera of a rectified pair, without its mount."""
     intrinsics = np.array([camera.focal_px, camera.focal_px, camera.cx_px, camera.cy_px])
     return CameraCalibration("radial-tangential", camera.width_px, camera.height_px, intrinsics, np.zeros(0), np.eye(4))
 
 
 def resized(camera: CameraCalibration, width_px: int) -> CameraCalibration:
-    """The same lens with smaller or larger pixels; pixel (0, 0) keeps its corner."""
+    """Return the same lens with smaller or larger pixels; pixel (0, 0) keeps its corner."""
     scale = width_px / camera.width_px
     height_px = round(camera.height_px * scale)
     fx, fy, cx, cy = camera.intrinsics_px
@@ -49,17 +49,17 @@ def resized(camera: CameraCalibration, width_px: int) -> CameraCalibration:
 
 
 def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array) -> ExpectedView:
-    """What `camera` should see at map_from_cam (4, 4), as bright as the survey's views. Unknown pixels are filled, and told.
+    """Draw the image of `camera` at map_from_cam (4, 4), as bright as the survey's views. Unknown pixels are filled and marked.
 
-    Raises UsageError for a picture that is too large and for a pose that is none.
+    Raises UsageError for a picture that is too large and for an invalid pose.
     """
     if camera.width_px * camera.height_px > MOST_PIXELS:
         raise UsageError(
-            f"a view of {camera.width_px} x {camera.height_px} px; at most {MOST_PIXELS} pixels are drawn, ask for fewer"
+            f"a view of {camera.width_px} x {camera.height_px} px; the limit is {MOST_PIXELS} pixels, request fewer"
         )
     rotation = map_from_cam[:3, :3]
     if not np.isfinite(map_from_cam).all() or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise UsageError(f"the pose {np.round(map_from_cam[:3], 3).tolist()} is none; give a rotation and metres")
+        raise UsageError(f"invalid pose {np.round(map_from_cam[:3], 3).tolist()}; give a rotation and metres")
     rays, weight, colour, depth_m = _drawn(surfels, camera, map_from_cam, FAR_M)
     unknown = weight <= 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -74,7 +74,7 @@ def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Arr
 
 
 def expected_depth(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array, far_m: float) -> Image32:
-    """(H, W) distances along the rays as of `expected_view`, of surfels up to so far away; NaN where nothing is known."""
+    """Return (H, W) distances along the rays as of `expected_view`, of surfels up to far_m; NaN if unknown."""
     _, weight, _, depth_m = _drawn(surfels, camera, map_from_cam, far_m)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(depth_m / weight, np.float32)
@@ -83,7 +83,7 @@ def expected_depth(surfels: Surfels, camera: CameraCalibration, map_from_cam: Ar
 def _drawn(
     surfels: Surfels, camera: CameraCalibration, map_from_cam: Array, far_m: float
 ) -> tuple[Array, Image32, Image32, Image32]:
-    """The rays (H, W, 3) of a view, and weights, colours and depths (H, W) as of `draw_discs`."""
+    """Return the rays (H, W, 3) of a view, and weights, colours and depths (H, W) as of `draw_discs`."""
     rays, pixels_per_rad, cosine = _lens(
         camera.model, camera.width_px, camera.height_px, tuple(camera.intrinsics_px), tuple(camera.distortion)
     )
@@ -115,7 +115,7 @@ def _drawn(
 
 
 def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The picture (H, W) with its unknown pixels made smoothly from those around them; grey without any. Source: Gortler et al. 1996."""
+    """Fill unknown pixels of the picture (H, W) smoothly from their neighbours; grey without any. Source: Gortler et al. 1996."""
     known = (~unknown).astype(np.float32)
     if not known.any():
         return np.full(picture.shape, 128.0, np.float32)
@@ -133,7 +133,7 @@ def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[
 
 
 def brightness(surfels: Surfels, map_from_cam: Array) -> float:
-    """That of the drives' views near this place that look this way, as their camera chose it."""
+    """Return the brightness of the drives' views near this place with this heading, as exposed by their camera."""
     if not len(surfels.exposures):
         return 1.0
     off_m = np.linalg.norm(surfels.exposures[:, :3] - map_from_cam[:3, 3], axis=1)
@@ -147,7 +147,7 @@ def brightness(surfels: Surfels, map_from_cam: Array) -> float:
 def _lens(
     model: str, width_px: int, height_px: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[Array, NDArray[np.float32], float]:
-    """Rays (H, W, 3), the finest pixels per radian around each (H, W), and the cosine of the cone that holds all rays."""
+    """Return rays (H, W, 3), the finest pixels per radian around each (H, W), and the cosine of the cone that contains all rays."""
     camera = CameraCalibration(model, width_px, height_px, np.array(intrinsics), np.array(distortion), np.eye(4))
     v, u = np.mgrid[0:height_px, 0:width_px].astype(np.float64)
     rays = camera.ray_from_pixel(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(height_px, width_px, 3)

@@ -1,4 +1,4 @@
-"""How bright each view of a drive is, and what its lens loses towards the corners, from points that several views show."""
+"""Brightness of each view of a drive, and vignetting of its lens, from points seen in several views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _ROUNDS, _HUBER, _MIN_SAMPLES, _PRIOR = 3, 0.1, 200, 1e-2
 
 
 class Sample(NamedTuple):
-    """N looks at points: which point and view (N,), squared tangent of the angle to the axis (N,), logarithm of the grey level (N,)."""
+    """N observations of points: point and view (N,), squared tangent of the angle to the axis (N,), logarithm of the grey level (N,)."""
 
     points: NDArray[np.int64]
     views: NDArray[np.int64]
@@ -26,29 +26,29 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Logarithms of the views' brightness (K,), whose mean is 0, and coefficients (FALLOFF,) of the lens."""
+    """Logarithms of the views' brightness (K,) with mean 0, and coefficients (FALLOFF,) of the lens."""
 
     logs: Array
     falloff: Array
 
     def factor(self, view: int, squared: Array) -> Array:
-        """(N,) by which a view shows pixels brighter than the mean view's axis would."""
+        """Return (N,) factors of a view's pixels relative to the mean view's axis."""
         return np.asarray(np.exp(self.logs[view]) * lens_factor(squared, self.falloff))
 
 
 def squared_tangent(pixels: NDArray[np.float32], camera: StereoCamera) -> Array:
-    """(N,) of the angle to the axis, of pixels (N, 2)."""
+    """Return (N,) squared tangents of the angle to the axis, of pixels (N, 2)."""
     off = (pixels.astype(np.float64) - np.array([camera.cx_px, camera.cy_px])) / camera.focal_px
     return np.asarray((off**2).sum(axis=1))
 
 
 def lens_factor(squared: Array, falloff: Array) -> Array:
-    """The share of light that a lens lets through where the squared tangent is this (...,), by its coefficients."""
+    """Return the share of light transmitted by a lens at these squared tangents (...,), by its coefficients."""
     return np.asarray(np.exp(_powers(squared) @ falloff))
 
 
 def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
-    """By least squares on logarithms with Huber's weights; nothing from too few looks.
+    """Estimate by least squares on logarithms with Huber's weights; neutral for too few observations.
 
     Source: Goldman and Chen 2005, vignette and exposure calibration, with the response of the camera taken as linear.
     """
@@ -64,7 +64,7 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     design = scipy.sparse.csr_array(
         (values.ravel(), (rows, columns.ravel().astype(np.int64))), (count, first + len(points))
     )
-    # All views brighter and all points darker would be the same; what is not seen stays at nothing.
+    # Gauge: brighter views with darker points are equivalent. Unobserved values stay 0.
     prior = scipy.sparse.csr_array(
         (np.full(first, _PRIOR), (np.arange(first), np.arange(first))), (first, design.shape[1])
     )

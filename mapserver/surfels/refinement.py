@@ -1,4 +1,4 @@
-"""Colours, sizes and opacities of splats after gradient descent on what a survey's camera saw. Places and normals stay."""
+"""Colours, sizes and opacities of splats, refined by gradient descent on a survey's images. Positions and normals stay fixed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,15 +24,15 @@ from mapserver.survey.survey_map import SurveyMap
 WIDTH_PX = 160
 MOST_FRAMES, MOST_JUDGED = 600, 30
 _HELD_OUT, _HELD_FIRST = 10, 5  # every tenth frame from the sixth on
-_MIN_KNOWN = 0.5  # share of a pixel that the splats must cover before: what nothing covers teaches nothing
-_OUTLIER = 0.05  # difference of grey (0 to 1) from which on it counts as a line
+_MIN_KNOWN = 0.5  # initial share of a pixel covered by splats, to be used
+_OUTLIER = 0.05  # difference of grey (0 to 1) above which the loss is linear
 _RATES = np.array([0.02, 0.02, 0.05])  # of grey, logarithm of the size, logit of the opacity, a step
 _DECAYS, _LITTLE = (0.9, 0.99), 0.1  # of Adam; derivative, in pixels, below which steps are smaller
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A picture (H, W) uint8 of a camera without distortion, from where it was taken, and how bright it shows a splat (H, W)."""
+    """A picture (H, W) uint8 of a camera without distortion, its pose, and the brightness factor of its splats (H, W)."""
 
     camera: CameraCalibration
     map_from_cam: Array
@@ -42,7 +42,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """Means over held-out views, on pixels that the splats cover before; known: the share of these."""
+    """Means over held-out views, on initially covered pixels; known: their share."""
 
     psnr_db: float
     ssim: float
@@ -51,7 +51,7 @@ class Likeness:
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """Splats after refinement, and how alike held-out views were before and are after."""
+    """Splats after refinement, and the similarity of held-out views before and after."""
 
     splats: Splats
     before: Likeness
@@ -66,17 +66,17 @@ class Refined:
 
 
 class Views(NamedTuple):
-    """What to learn from, and what to judge by."""
+    """Training views, and held-out views."""
 
     learned: Sequence[Look]
     held_out: Sequence[Look]
 
 
 def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_rig: bool) -> Views:
-    """Of at most MOST_FRAMES frames, evenly spread, every tenth is held out.
+    """Choose at most MOST_FRAMES frames, evenly spread; every tenth is held out.
 
-    Held-out frames that were keyframes are left out, since the surfels come from them. survey: the version's, in whose trajectory the
-    frames are found by their time stamps. own_rig: the survey's camera is this recording's own.
+    Held-out frames that were keyframes are left out, since the surfels come from them. survey: the version's, with the poses of the
+    frames by their time stamps. own_rig: the survey's camera is this recording's own.
 
     Raises UsageError for a recording of one camera, StateError for one whose frames have no poses in the survey.
     """
@@ -123,18 +123,16 @@ def refine(
     renderer: Renderer = draw,
     progress: Callable[[int], None] = lambda _: None,
 ) -> Refined:
-    """After so many steps, each with one view, by Adam on the splats that the view shows. The same seed gives the same splats.
+    """Run `steps` steps of Adam, each with one view, on its visible splats. The same seed gives the same splats.
 
-    Source of the loss: Charbonnier et al. 1994; of leaving unseen splats alone: Mallick et al. 2024, Taming 3DGS.
+    Source of the loss: Charbonnier et al. 1994; of not updating unseen splats: Mallick et al. 2024, Taming 3DGS.
     """
     parameters, (learned, held_out) = parameters_of(splats), views
     known = [
         1.0 - renderer(splats, parameters, look.camera, look.map_from_cam).through > _MIN_KNOWN for look in held_out
     ]
     if not any(where.any() for where in known):
-        raise StateError(
-            "the held-out views show nothing of the surfels; the recording and the version do not fit together"
-        )
+        raise StateError("the held-out views show no surfels; choose the recording of this version")
     before = _likeness(splats, parameters, held_out, known, renderer)
     low, high = bounds()
     mean, square, seen = np.zeros_like(parameters), np.zeros_like(parameters), np.zeros(len(parameters))
@@ -145,7 +143,7 @@ def refine(
         number = order.pop()
         look = learned[number]
         drawn = renderer(splats, parameters, look.camera, look.map_from_cam)
-        # What the splats cover when a view is first asked stays asked: no splat may leave a picture to be judged no more.
+        # The initially covered pixels of a view stay fixed, so that no splat can leave a picture to reduce its loss.
         where = masks.setdefault(number, 1.0 - drawn.through > _MIN_KNOWN)
         off = np.where(where, look.gain * drawn.picture - look.picture / 255.0, 0.0)
         numbers, gradients = drawn.backward(look.gain * off / np.hypot(off, _OUTLIER))
@@ -177,7 +175,7 @@ def _likeness(
 
 
 def _psnr_db(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
-    """Peak signal over noise of these pixels (H, W)."""
+    """Return the peak signal-to-noise ratio of these pixels (H, W)."""
     squared = (first.astype(np.float64) - second) ** 2
     return float(10 * np.log10(255.0**2 / squared[where].mean()))
 
@@ -186,7 +184,7 @@ _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2
 
 
 def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
-    """Mean structural similarity of windows around these pixels. Source: Wang et al. 2004 (11 x 11 Gaussian window of 1.5 px)."""
+    """Return the mean structural similarity of windows around these pixels. Source: Wang et al. 2004 (11 x 11 Gaussian of 1.5 px)."""
 
     def mean(values: Array) -> Array:
         return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5))
@@ -200,7 +198,7 @@ def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np
 
 
 def _lens(camera: CameraCalibration, surfels: Surfels) -> Array:
-    """(H, W) share of light that the survey's lens lets through."""
+    """Return (H, W) the share of light transmitted by the survey's lens."""
     fx, fy, cx, cy = camera.intrinsics_px
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
     squared = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2

@@ -10,7 +10,7 @@ from mapserver.surfels.surfel_map import Surfels
 
 _FIELDS = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2")
 _ALL = (*_FIELDS, *(f"rot_{i}" for i in range(4)))
-_SH_0 = 0.28209479177387814  # the spherical harmonic of order 0, which colours are divided by
+_SH_0 = 0.28209479177387814  # the spherical harmonic of order 0; colours are divided by it
 SIGMA_EDGES, THICKNESS, OPACITY = 0.6, 0.1, 0.98  # standard deviation in edges, share of it along the normal
 _TINY = 1e-6
 
@@ -30,14 +30,14 @@ class Splats:
 
     @classmethod
     def of(cls, surfels: Surfels) -> "Splats":
-        """Discs as Gaussians, all as opaque."""
+        """Return discs as Gaussians of equal opacity."""
         sigmas_m = SIGMA_EDGES * surfels.edges_m.astype(np.float64)
         greys, opacities = surfels.greys.astype(np.float64), np.full(len(surfels), OPACITY)
         return cls(surfels.points_map, surfels.normals, sigmas_m, greys, opacities)
 
 
 def splat_ply(splats: Splats) -> bytes:
-    """The PLY file, in `map`: scales are logarithms of metres, opacities logits, rotations (w, x, y, z) turn z to the normal."""
+    """Return the PLY file, in `map`: scales are logarithms of metres, opacities logits, rotations (w, x, y, z) turn z to the normal."""
     table = np.zeros(len(splats), [(name, "<f4") for name in _ALL])
     colours = (splats.greys / 255.0 - 0.5) / _SH_0
     scales = np.log(np.maximum(splats.sigmas_m, _TINY))[:, None] + np.log([1.0, 1.0, THICKNESS])
@@ -54,7 +54,7 @@ def splat_ply(splats: Splats) -> bytes:
 
 
 def _quaternions(normals: Array) -> Array:
-    """(N, 4) w, x, y, z of the shortest turns from z to unit normals (N, 3)."""
+    """Return (N, 4) w, x, y, z of the shortest rotations from z to unit normals (N, 3)."""
     turns = np.column_stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))])
     turns[normals[:, 2] < -0.99999] = (0.0, 1.0, 0.0, 0.0)
     return np.asarray(turns / np.linalg.norm(turns, axis=1, keepdims=True))

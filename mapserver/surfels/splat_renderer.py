@@ -1,4 +1,4 @@
-"""Splats drawn as viewers draw them, with the derivatives of a loss by their colours, sizes and opacities."""
+"""Splats rendered as in viewers, with the derivatives of a loss by their colours, sizes and opacities."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ NEAR_M, FAR_M = 0.1, 40.0
 LEAST_OPACITY, MOST_OPACITY = 0.01, 0.985
 _LEAST_GREY, _MOST_GREY = 0.0, 255.0
 _LEAST_SIGMA_M, _MOST_SIGMA_M = 1e-3, 1.0
-_BEYOND = 1.3  # of the picture's half width: beyond it the projection is not linearised farther out
+_BEYOND = 1.3  # in half widths of the picture: limit of the position used to linearise the projection
 GREY, SIZE, OPACITY = range(3)
 
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A picture (H, W), 0 to 1 on black, the share of light that passes all splats (H, W), and the way back.
+    """A picture (H, W), 0 to 1 on black, the share of light that passes all splats (H, W), and the backward pass.
 
-    backward: from the slopes (H, W) of a loss by the picture to the numbers (M,) of the splats that were drawn and the derivatives (M, 3)
-    of the loss by them, in the order of `parameters_of`.
+    backward: from the derivatives (H, W) of a loss by the picture to the numbers (M,) of the drawn splats and the derivatives (M, 3)
+    of the loss by their parameters, in the order of `parameters_of`.
     """
 
     picture: Array
@@ -35,24 +35,24 @@ class Drawn:
 
 
 Renderer = Callable[[Splats, Array, CameraCalibration, Array], Drawn]
-"""From splats (only their places and normals are used), parameters (N, 3), a camera without distortion and map_from_cam (4, 4)."""
+"""From splats (only positions and normals are used), parameters (N, 3), a camera without distortion and map_from_cam (4, 4)."""
 
 
 def parameters_of(splats: Splats) -> Array:
-    """(N, 3) grey of 0 to 1, logarithm of the standard deviation in metres, logit of the opacity."""
+    """Return (N, 3) grey of 0 to 1, logarithm of the standard deviation in metres, logit of the opacity."""
     opacities = np.clip(splats.opacities, LEAST_OPACITY, MOST_OPACITY)
     sigmas_m = np.clip(splats.sigmas_m, _LEAST_SIGMA_M, _MOST_SIGMA_M)
     return np.column_stack([splats.greys / 255.0, np.log(sigmas_m), np.log(opacities / (1 - opacities))])
 
 
 def with_parameters(splats: Splats, parameters: Array) -> Splats:
-    """The same splats with these parameters (N, 3)."""
+    """Return the same splats with these parameters (N, 3)."""
     opacities = 1.0 / (1.0 + np.exp(-parameters[:, OPACITY]))
     return replace(splats, greys=255.0 * parameters[:, GREY], sigmas_m=np.exp(parameters[:, SIZE]), opacities=opacities)
 
 
 def bounds() -> tuple[Array, Array]:
-    """The least and the largest parameters (3,)."""
+    """Return the smallest and the largest parameters (3,)."""
     places = np.zeros((2, 3), np.float32)
     sigmas_m, greys = np.array([_LEAST_SIGMA_M, _MOST_SIGMA_M]), np.array([_LEAST_GREY, _MOST_GREY])
     ends = Splats(places, places, sigmas_m, greys, np.array([LEAST_OPACITY, MOST_OPACITY]))
@@ -70,7 +70,7 @@ class _Flat:
 
 
 def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_cam: Array) -> Drawn:
-    """On the CPU. Both sides of a splat are seen, as in viewers. A splat smaller than a pixel is as much more transparent."""
+    """Render on the CPU. Both sides of a splat are visible. A splat smaller than a pixel is more transparent in proportion."""
     flat = _projected(splats, camera, se3_inverse(map_from_cam))
     chosen = parameters[flat.numbers]
     own = flat.shapes * np.exp(2 * chosen[:, SIZE])[:, None]
@@ -100,7 +100,7 @@ def _determinant(shapes: Array) -> Array:
 
 
 def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -> _Flat:
-    """Source: Zwicker et al. 2001, EWA splatting: a Gaussian through the projection's derivative at its middle."""
+    """Project by EWA splatting: a Gaussian through the projection's derivative at its middle. Source: Zwicker et al. 2001."""
     points = splats.points_map @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
     fx, fy, cx, cy = camera.intrinsics_px
     reach = _BEYOND * np.array([max(cx, camera.width_px - cx) / fx, max(cy, camera.height_px - cy) / fy])

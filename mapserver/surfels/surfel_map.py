@@ -23,7 +23,7 @@ MIN_RANGE_M, MAX_RANGE_M = core.SURFEL_RANGE_M
 TILE_SIZE_M = 16.0  # the size of the map's own tiles
 SURFEL_MAGIC, SURFEL_FORMAT = b"FMSU", 1
 SURFELS_KEY = "surfels"
-"""In `report` of a manifest, where readers of before pass over it; it names the index."""
+"""Key in `report` of a manifest with the index; older readers ignore it."""
 
 NO_FALLOFF = (0.0,) * FALLOFF
 EXPOSURE = 7
@@ -37,10 +37,10 @@ _MOST_EXPOSURES = 1 << 14
 
 @dataclass(frozen=True, slots=True)
 class Surfels:
-    """N discs in `map`: points_map (N, 3), unit normals (N, 3) towards who saw them, level (N,) of their voxels, grey (N,).
+    """N discs in `map`: points_map (N, 3), unit normals (N, 3) towards the camera, level (N,) of their voxels, grey (N,).
 
-    An edge of their voxels is EDGE_M times two to the power of the level. falloff: of the lens through which they were seen (see exposure),
-    which the greys are freed of. exposures (K, 7): places, directions of view and logarithms of the brightness of the drives' views.
+    An edge of their voxels is EDGE_M times two to the power of the level. falloff: vignetting of the lens (see exposure), removed from
+    the greys. exposures (K, 7): positions, viewing directions and logarithms of the brightness of the drives' views.
     """
 
     points_map: NDArray[np.float32]
@@ -59,12 +59,12 @@ class Surfels:
 
     @property
     def edges_m(self) -> NDArray[np.float32]:
-        """(N,)."""
+        """(N,) edges of the voxels."""
         return np.float32(EDGE_M) * np.exp2(self.levels, dtype=np.float32)
 
     @classmethod
     def joined(cls, parts: Iterable["Surfels"]) -> Self:
-        """One after the other, with the lens of the last and its exposures before the others'; none of nothing."""
+        """Concatenate surfels, with the lens of the last part and its exposures first; empty for no parts."""
         none = Surfels(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), *np.zeros((2, 0), np.uint8))
         every = [none, *parts]
         names = ("points_map", "normals", "levels", "greys")
@@ -77,7 +77,7 @@ _Row = Annotated[tuple[float, ...], msgspec.Meta(min_length=EXPOSURE, max_length
 
 
 class SurfelIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the tiles' numbers mean, the lens, and the tiles by place and address; of each `landmarks` counts the surfels."""
+    """Units of the tiles' numbers, the lens, and the tiles by place and address; `landmarks` of each is its number of surfels."""
 
     format_version: Positive = SURFEL_FORMAT
     tile_size_m: float = TILE_SIZE_M
@@ -88,9 +88,9 @@ class SurfelIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class SurfelReport(msgspec.Struct, frozen=True, kw_only=True):
-    """In the report of a build. sha256: of the index, None without surfels; bytes: of it and its tiles; surfels: how many.
+    """Entry in the report of a build. sha256: of the index, None without surfels; bytes: of it and its tiles; surfels: number.
 
-    without: by recording, why it adds none.
+    without: by recording, the reason why it adds none.
     """
 
     sha256: Sha256 | None = None
@@ -100,7 +100,7 @@ class SurfelReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def encode_surfels(surfels: Surfels) -> list[bytes]:
-    """The index and then each tile; nothing for no surfels. The same surfels in any order give the same bytes."""
+    """Return the index and then each tile; empty for no surfels. The bytes do not depend on the order of the surfels."""
     places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
     blobs, entries = [], []
     order = np.lexsort((places[:, 1], places[:, 0]))
@@ -116,28 +116,28 @@ def encode_surfels(surfels: Surfels) -> list[bytes]:
 
 
 def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:
-    """Of what `encode_surfels` returned."""
+    """Return the report of blobs from `encode_surfels`."""
     sha256 = sha256_hex(blobs[0]) if blobs else None
     return SurfelReport(sha256=sha256, bytes=sum(map(len, blobs)), surfels=surfels, without=without)
 
 
 def index_address(manifest: Manifest) -> str:
-    """SHA-256 of the index of a version's surfels; StateError for a version without any, saying why."""
+    """Return the SHA-256 of the index of a version's surfels; StateError with the reason if it has none."""
     where, report = f"version {manifest.version} of site {manifest.site}", report_of(manifest)
     if report is None:
         raise StateError(f"{where} has no surfels: set `surfel_map = true` in [survey] and build the next version")
     if report.sha256 is None:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
-        raise StateError(f"{where} has no surfels: {reasons or 'no recording showed anything near'}")
+        raise StateError(f"{where} has no surfels: {reasons or 'no recording has near surfaces'}")
     return report.sha256
 
 
 def surfels_of(
     manifest: Manifest, blob: Callable[[str], bytes], near: tuple[float, float, float] | None = None
 ) -> Surfels:
-    """The surfels of a version; near: x, y and a distance in m, within which tiles are read. blob: the verified bytes of an address.
+    """Return the surfels of a version; near: x, y and a distance in m that limits the tiles. blob: verified bytes of an address.
 
-    Raises StateError for a version without any, saying why, and MapFormatError or NewerFormatError for bytes that are none.
+    Raises StateError with the reason for a version without any, and MapFormatError or NewerFormatError for invalid bytes.
     """
     where = f"version {manifest.version} of site {manifest.site}"
     parts, index = [], _read_index(blob(index_address(manifest)))
@@ -148,22 +148,20 @@ def surfels_of(
                 continue
         place, surfels = _decode_tile(blob(entry.sha256))
         if place != (entry.x, entry.y) or len(surfels) != entry.landmarks:
-            raise MapFormatError(
-                f"{where}: surfel tile {place} stands in the place of {entry.x}, {entry.y}; it is damaged"
-            )
+            raise MapFormatError(f"{where}: surfel tile {place} is at the place of {entry.x}, {entry.y}; it is damaged")
         parts.append(surfels)
     exposures = np.array(index.exposures, np.float64).reshape(-1, EXPOSURE)
     return replace(Surfels.joined(parts), falloff=index.falloff, exposures=exposures)
 
 
 def known_surfels(manifest: Manifest, blob: Callable[[str], bytes]) -> Surfels:
-    """As `surfels_of`; none for a version without any."""
+    """As `surfels_of`; empty for a version without any."""
     report = report_of(manifest)
     return Surfels.joined([]) if report is None or report.sha256 is None else surfels_of(manifest, blob)
 
 
 def report_of(manifest: Manifest) -> SurfelReport | None:
-    """What the build said of its surfels, None where it was to make none. MapFormatError for words that are none of ours."""
+    """Return the build's report on its surfels, None if they were not enabled. MapFormatError for an invalid entry."""
     found = manifest.report.get(SURFELS_KEY)
     try:
         return None if found is None else msgspec.convert(found, SurfelReport)
@@ -175,7 +173,7 @@ def _read_index(data: bytes) -> SurfelIndex:
     try:
         index = msgspec.json.decode(data, type=SurfelIndex)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"index of surfels: {error}; it is damaged or not ours") from error
+        raise MapFormatError(f"index of surfels: {error}; it is damaged or of another program") from error
     if msgspec.structs.replace(index, tiles=(), falloff=NO_FALLOFF, exposures=()) != SurfelIndex():
         raise NewerFormatError(
             f"index of surfels of format {index.format_version}: made by another fleetmap; update this one"
@@ -190,7 +188,7 @@ def _encode_tile(place: tuple[int, int], surfels: Surfels) -> bytes:
     lowest = int(height.min())
     position = np.column_stack([flat, np.minimum(height - lowest, 65535)]).astype(np.uint16)
     columns: list[AnyArray] = [position, _octahedron(surfels.normals), surfels.levels[:, None], surfels.greys[:, None]]
-    # Neighbours stand together, by centimetres and then all that tells them apart: other orders give the same bytes.
+    # Sorted by place in centimetres and then all values: the bytes do not depend on the order.
     near = [position[:, axis] // step for axis, step in ((0, 256), (1, 256), (2, 64), (0, 32), (1, 32), (2, 8))]
     every = [column[:, i] for column in columns for i in range(column.shape[1])]
     order = np.lexsort([*every[::-1], *near[::-1]])
@@ -224,7 +222,7 @@ def _decode_tile(data: bytes) -> tuple[tuple[int, int], Surfels]:
 
 
 def _octahedron(normals: NDArray[np.float32]) -> NDArray[np.int8]:
-    """(N, 2) of unit vectors (N, 3). Source: Meyer et al. 2010, on floating-point normal vectors."""
+    """Return (N, 2) octahedral codes of unit vectors (N, 3). Source: Meyer et al. 2010, on floating-point normal vectors."""
     flat = normals[:, :2] / np.abs(normals).sum(axis=1, keepdims=True)
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)
     return np.asarray(np.round(np.where(normals[:, 2:] < 0, folded, flat) * _TURN), np.int8)

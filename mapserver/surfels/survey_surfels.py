@@ -1,4 +1,4 @@
-"""What a build's recordings add to the surfels of the version before: their keyframes are looked at again, where the final map has them."""
+"""Update of the previous version's surfels by a build's recordings: their keyframes are matched densely at their final poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -22,18 +22,18 @@ from mapserver.surfels.surfel_map import EDGE_M, EXPOSURE, LEVELS, MAX_RANGE_M, 
 from mapserver.survey.state import Keyframe
 
 _SEEN, _SEEN_THROUGH = 1, 2
-_KEPT_STEP_PX = 4  # of what a view shows every so many pixels are kept, to ask what it sees through
-_BLOCK_M = 4.0  # surfels are judged by the views that are near to their block
+_KEPT_STEP_PX = 4  # pixel step of the depths kept per view, to test for free space
+_BLOCK_M = 4.0  # surfels are judged by the views near their block
 _OWN_LIGHT_M = 2.0
-_DARK, _MIN_ALIKE = 5, 50  # grey levels; voxels of one place that tell how two drives differ
-_SAMPLED, _SATURATED = 16, 250  # one surfel in so many tells the exposure; grey levels from which a pixel tells none
-_MIN_FINER = 2  # voxels of the next finer level that make a coarse one needless
+_DARK, _MIN_ALIKE = 5, 50  # grey levels; common voxels needed to compare the exposure of two drives
+_SAMPLED, _SATURATED = 16, 250  # one surfel of this many is used for exposure; grey level of saturation
+_MIN_FINER = 2  # voxels of the next finer level that replace a coarse one
 
 
 def grow_surfels(
     before: Surfels, sessions: Sequence[GridSession], settings: StereoSettings
 ) -> tuple[Surfels, dict[str, str]]:
-    """The surfels after all sessions, in their order, and by name why a recording adds nothing."""
+    """Return the surfels after all sessions, in order, and by name the reason why a recording adds nothing."""
     surfels, without = before, {}
     for session in sessions:
         if measures_depth(session.survey):
@@ -44,7 +44,7 @@ def grow_surfels(
 
 
 class _Look(NamedTuple):
-    """What a keyframe keeps to be asked again: disparities as of `nearest_around`, their standard deviation, where it looks from."""
+    """Data kept of a keyframe: disparities as of `nearest_around`, their standard deviation, its pose."""
 
     nearest_px: NDArray[np.float32]
     sigma_px: float
@@ -52,7 +52,7 @@ class _Look(NamedTuple):
 
 
 def _grown(before: Surfels, session: GridSession, settings: StereoSettings) -> Surfels:
-    """After one session: what it saw through is gone, and what it saw as finely as it was known takes its place."""
+    """Return the surfels after one session: surfels that it saw through are removed, equally fine or finer new ones replace old ones."""
     camera, table, looks = session.survey.state.camera, core.VoxelTable(), list[_Look]()
     keyframes = session.survey.odometry.keyframes
     for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
@@ -68,14 +68,14 @@ def _grown(before: Surfels, session: GridSession, settings: StereoSettings) -> S
     hits, passes = _judged(before, looks, camera)
     old = before[HIT * hits - passes > -AGAINST]
     new = _as_bright_as(old, new)
-    if len(new.exposures) and len(old.exposures):  # where both drives were, the last one tells how bright a view is
+    if len(new.exposures) and len(old.exposures):  # in the overlap of both drives, the last one defines the brightness
         gaps_m = cKDTree(new.exposures[:, :3]).query(old.exposures[:, :3])[0]
         old = replace(old, exposures=old.exposures[gaps_m > _OWN_LIGHT_M])
     return Surfels.joined([old[~_known_finer(old, new, finer_by=0)], new])
 
 
 def _as_bright_as(old: Surfels, new: Surfels) -> Surfels:
-    """The new surfels at the brightness of the old ones, by the median of those that are of one voxel: each drive has a mean of its own."""
+    """Scale the new surfels to the old ones' brightness, by the median over common voxels: each drive has its own mean."""
     (keys, first), (others, second) = (_of_voxels(surfels) for surfels in (old, new))
     _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
     before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
@@ -89,13 +89,13 @@ def _as_bright_as(old: Surfels, new: Surfels) -> Surfels:
 
 
 def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The voxels of surfels, once each, and the first surfel of each."""
+    """Return the distinct voxels of surfels, and the first surfel of each."""
     found, first = np.unique(core.voxel_keys(surfels.points_map, surfels.levels), return_index=True)
     return found, first
 
 
 def _judged(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> tuple[Array, Array]:
-    """(N,) how many views see each surfel, and how many see through it, as the grid of planners counts them."""
+    """Return (N,) numbers of views that see each surfel and that see through it, counted as in the planner grid."""
     hits, passes = np.zeros((2, len(surfels)))
     for number, rows in _near(surfels, looks):
         marks, weights, _ = _look(surfels, rows, looks[number], camera)
@@ -105,7 +105,7 @@ def _judged(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> t
 
 
 def _near(surfels: Surfels, looks: Sequence[_Look]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Every view with the surfels of blocks that it may see, view by view."""
+    """Yield every view with the surfels of blocks that it may see."""
     places = np.floor(surfels.points_map[:, :2] / _BLOCK_M).astype(np.int64)
     blocks, order = np.unique(places, axis=0, return_inverse=True)
     ends = np.cumsum(np.bincount(order, minlength=len(blocks)))
@@ -121,7 +121,7 @@ def _near(surfels: Surfels, looks: Sequence[_Look]) -> Iterator[tuple[int, NDArr
 def _look(
     surfels: Surfels, rows: NDArray[np.int64], look: _Look, camera: StereoCamera
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Marks, weights and pixels as of `core.look_at` of these surfels."""
+    """Return marks, weights and pixels as of `core.look_at` of these surfels."""
     return core.look_at(
         surfels.points_map[rows], surfels.levels[rows], look.nearest_px, _KEPT_STEP_PX, look.sigma_px, camera.lens, look.cam_from_map,
         core.GRID_CLEAR_SIGMAS, CELL_M,
@@ -129,7 +129,7 @@ def _look(
 
 
 def _coloured(surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera) -> Surfels:
-    """The surfels with the colours that views show, the nearest most, freed of exposure and of what the lens darkens."""
+    """Return the surfels with colours from the views, near ones weighted most, corrected for exposure and vignetting."""
     samples = [
         Sample(rows[fit], np.full(int(fit.sum()), number), squared_tangent(pixels[fit], camera), np.log(greys[fit]))
         for number, rows, pixels, greys in _shown(surfels, keyframes, looks, camera, _SAMPLED)
@@ -155,7 +155,7 @@ def _coloured(surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_
 def _shown(
     surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera, every: int
 ) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float32], Array]]:
-    """By view: its number, the surfels that it shows (N,) of every so many, at which pixels (N, 2), and how bright (N,)."""
+    """Yield per view its number, a sample of its visible surfels (N,), their pixels (N, 2) and brightness (N,)."""
     for number, near in _near(surfels, looks):
         rows = near[near % every == 0]
         marks, _, pixels = _look(surfels, rows, looks[number], camera)
@@ -178,7 +178,7 @@ def _bilinear(picture: NDArray[np.uint8], pixels: NDArray[np.float32]) -> Array:
 
 
 def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[np.bool_]:
-    """(N,) whether `other` has the same place, or the one before or behind it, finer by so many levels or more."""
+    """Return (N,) True if `other` has the same place, or the one in front of or behind it, at least `finer_by` levels finer."""
     known = np.zeros(len(surfels), bool)
     for level in range(LEVELS):
         mine = np.flatnonzero(surfels.levels == level)

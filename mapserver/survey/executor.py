@@ -9,16 +9,16 @@ Shared = TypeVar("Shared")
 
 
 class Executor(Protocol):
-    """Computes batches, in any order and anywhere; function and arguments can be pickled."""
+    """Computes batches, in any order and in any process; function and arguments can be pickled."""
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        """function(shared, batch) of every batch, in their order. `shared` travels once, however many calls it takes part in."""
+        """Yield function(shared, batch) for every batch, in order. `shared` is sent once for any number of calls."""
 
 
 class SerialExecutor:
-    """Computes one batch after the other in the calling thread, each when its result is asked for."""
+    """Computes one batch after the other in the calling thread, each when its result is requested."""
 
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
@@ -30,5 +30,5 @@ SERIAL = SerialExecutor()
 
 
 def in_batches(items: Sequence[Any], size: int) -> list[Any]:
-    """The items, in order, in lists of at most `size`."""
+    """Return the items, in order, in lists of at most `size`."""
     return [list(items[start : start + size]) for start in range(0, len(items), size)]

@@ -1,4 +1,4 @@
-"""Poses of another system in place of odometry: the first stage of a survey whose initial trajectory is given."""
+"""Poses of another system in place of odometry: the first stage of a survey with a given initial trajectory."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,18 +19,18 @@ from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 # Assumed drift of the poses, a random walk: standard deviations after one metre.
 _WALK_RAD, _WALK_M = 0.01, 0.05
-_UPRIGHT = np.cos(np.radians(20.0))  # what a ramp does not exceed
+_UPRIGHT = np.cos(np.radians(20.0))  # larger than on any ramp
 _UNKNOWN_DEPTH_M = 5.0
 
 
 def poses_as_odometry(
     given: Trajectory, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
 ) -> OdometryPass:
-    """The odometry pass that given poses of all F frames amount to, with the points that the tracker follows by them.
+    """Return the odometry pass equivalent to given poses of all F frames, with points tracked by them.
 
-    The poses only predict where points go: what is kept of a point is where it was seen, as of our own odometry. With an IMU the poses are
-    levelled by its mean specific force, and the gyro's bias is estimated from them; without one a frame in which the body begins upright
-    is kept, any other gives way to the body's axes at the first pose, as our odometry has them.
+    The poses only predict positions of points: kept are the observed positions, as in fleetmap's odometry. With an IMU the poses are
+    levelled by its mean specific force, and the gyro's bias is estimated from them; without one a frame with an initially upright body
+    is kept, any other is replaced by the body's axes at the first pose, as in fleetmap's odometry.
     """
     inertial = inputs.calibration.imu is not None and len(inputs.imu) > 0
     offset_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9)
@@ -88,12 +88,12 @@ def poses_as_odometry(
 
 
 def _motion_to(odom_from_cam: Array, number: int) -> MotionSince:
-    """The motion of the camera to a frame from earlier ones, as the poses (F, 4, 4) say."""
+    """Return the motion of the camera to a frame from earlier ones, by the poses (F, 4, 4)."""
     return lambda earlier: np.asarray(se3_inverse(odom_from_cam[number]) @ odom_from_cam[earlier])
 
 
 def _levelled(given: Trajectory, inputs: SurveyInputs) -> Array:
-    """(F, 4, 4) the poses in a frame with z up: specific force is +g upwards on average, as accelerations cancel out."""
+    """Return (F, 4, 4) the poses in a frame with z up: mean specific force is +g upwards, since accelerations cancel out."""
     imu = inputs.imu.between(int(given.stamps_ns[0]), int(given.stamps_ns[-1]) + 1)
     if not len(imu):
         return given.frame_from_body
@@ -104,7 +104,7 @@ def _levelled(given: Trajectory, inputs: SurveyInputs) -> Array:
 
 
 def _gyro_bias(given: Trajectory, inputs: SurveyInputs) -> Array:
-    """(3,) median difference between the gyro's mean rate and that of the poses, over intervals between frames."""
+    """Return (3,) median difference between the gyro's mean rate and that of the poses, over intervals between frames."""
     rotations, found = given.frame_from_body[:, :3, :3], []
     for k in range(len(given) - 1):
         imu = inputs.imu.between(int(given.stamps_ns[k]), int(given.stamps_ns[k + 1]))
@@ -115,7 +115,7 @@ def _gyro_bias(given: Trajectory, inputs: SurveyInputs) -> Array:
 
 
 def _covariances(odom_from_body: Array) -> Array:
-    """(F, 6, 6) of a random walk along the way, with a floor for each step."""
+    """Return (F, 6, 6) of a random walk along the path, with a floor for each step."""
     steps_m = np.diff(odom_from_body[:, :3, 3], axis=0, prepend=odom_from_body[:1, :3, 3])
     of_a_metre, found = np.diag(np.repeat([_WALK_RAD**2, _WALK_M**2], 3)), [np.zeros((6, 6))]
     for step_m in steps_m:
@@ -124,7 +124,7 @@ def _covariances(odom_from_body: Array) -> Array:
 
 
 def _scene_depth_m(pixels: Array, camera: StereoCamera) -> float:
-    """Median depth of the points that were followed, (N, 3) u_left v u_right."""
+    """Return the median depth of the tracked points, (N, 3) u_left v u_right."""
     disparities = pixels[:, 0] - pixels[:, 2]
     known = disparities[np.isfinite(disparities) & (disparities > 0)]
     return float(camera.focal_px * camera.baseline_m / np.median(known)) if len(known) else _UNKNOWN_DEPTH_M

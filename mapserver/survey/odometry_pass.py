@@ -1,4 +1,4 @@
-"""Odometry over all frames, with the keyframes chosen on the way: the first stage of a survey."""
+"""Odometry over all frames, with selection of keyframes: the first stage of a survey."""
 
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +17,15 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
-_LEAD_NS = 30_000_000  # by which IMU and wheels are ahead of a frame, as its stamp may be too early
+_LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
-_AWAY_RAD, _AWAY_MPS = np.pi, 1.0  # in a pause: any turn, and the way at the speed of one who carries a robot
+_AWAY_RAD, _AWAY_MPS = np.pi, 1.0  # during a pause: any rotation, and a person's walking speed
 _NO_IDS = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; whether it becomes a keyframe."""
+    """One frame: its number, pictures and estimate; frame_from_body (4, 4) in the continuous frame; True if it becomes a keyframe."""
 
     number: int
     frame: RectifiedFrame
@@ -35,7 +35,7 @@ class TrackedFrame:
 
 
 class OdometryRun:
-    """Odometry of a recording or of sensors, one frame after the other, with the choice of keyframes."""
+    """Odometry of a recording or of sensors, frame by frame, with selection of keyframes."""
 
     def __init__(
         self,
@@ -44,14 +44,14 @@ class OdometryRun:
         settings: SurveySettings,
         keyframes_at: Container[int] = (),
     ) -> None:
-        """keyframes_at: numbers of frames, counted from 0, that become keyframes whatever they show."""
+        """keyframes_at: numbers of frames, counted from 0, that always become keyframes."""
         mounting = rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s
         self._odometry = make_odometry(calibration, *mounting, settings.odometry, settings.stereo)
         self._policy = KeyframePolicy(settings.keyframes, keyframes_at)
         self.chain = FrameChain()
 
     def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> TrackedFrame:
-        """The next frame, with the samples of the IMU and the wheels up to it that were not given before."""
+        """Process the next frame, with the new samples of the IMU and the wheels up to it."""
         self._odometry.handle_imu(imu)
         self._odometry.handle_wheel(wheel)
         estimate = self._odometry.handle_stereo(frame)
@@ -70,15 +70,15 @@ class SampleFeed:
         self._fed_ns = -(2**62)
 
     def until(self, stamp_ns: int) -> tuple[ImuSamples, Sequence[WheelSample]]:
-        """What came since the last call, up to a frame."""
+        """Return the samples since the last call, up to a frame."""
         since_ns, self._fed_ns = self._fed_ns, stamp_ns + self._offset_ns + _LEAD_NS
         return self._imu.between(since_ns, self._fed_ns), wheel_between(self._wheel, since_ns, self._fed_ns)
 
 
 def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
-    """Feeds frames (in order), the IMU and the wheels up to each into the odometry.
+    """Feed frames (in order), the IMU and the wheels up to each into the odometry.
 
-    While the odometry goes on, the executor finds the features of the keyframes that it has chosen.
+    In parallel the executor extracts the features of the chosen keyframes.
     """
     rectifier = inputs.rectifier
     run = OdometryRun(inputs.calibration, rectifier, settings, inputs.keyframes_at)
@@ -112,7 +112,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
 
 
 class FrameChain:
-    """Estimates of all frames so far, where each frame is in one continuous frame, and how well that is known."""
+    """Estimates of all frames so far, the pose of each frame in one continuous frame, and its covariance."""
 
     def __init__(self) -> None:
         self.estimates: list[OdometryEstimate] = []
@@ -120,9 +120,9 @@ class FrameChain:
         self._covariances, self._own = list[Array](), np.zeros((6, 6))
 
     def append(self, estimate: OdometryEstimate, step_covariance: Array | None = None) -> Array:
-        """frame_from_body (4, 4) of one more frame; applies its corrections of earlier frames.
+        """Return frame_from_body (4, 4) of one more frame; apply its corrections of earlier frames.
 
-        step_covariance (6, 6): that of the motion since the frame before, in axes of the body there, where the odometry knows it.
+        step_covariance (6, 6): of the motion since the previous frame, in axes of the body there, if the odometry has it.
         """
         self._frame_from_body.append(self._frame.handle(estimate))
         self._covariances.append(self._covariance(estimate, step_covariance))
@@ -139,12 +139,11 @@ class FrameChain:
         return self._covariances[-1]
 
     def _covariance(self, estimate: OdometryEstimate, step_covariance: Array | None) -> Array:
-        """What the steps so far add up to: the frame follows them, and not what the filter learns of earlier places later.
+        """Return the accumulated covariance of the steps: the frame follows them, not later corrections by the filter.
 
-        Errors of steps are independent while pictures are followed. A filter that is lost is wrong by its speed at every step alike: by as
-        much as its own covariance gains. Across a restart, where that is zero, the one before goes on; a restart that loses gravity adds
-        a wide one, as the estimate before it is hardly worth more than that it did not jump. After a pause whose motion the images
-        do not show, a robot may be anywhere.
+        Errors of steps are independent while pictures are tracked. A lost filter has a constant error of speed: its covariance grows by as
+        much. Across a restart, where that is zero, the previous one continues; a restart that loses gravity adds a wide one, since the
+        estimate before it is barely reliable. After a pause without motion in the images a robot may be anywhere.
         """
         turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3])
         own_before, self._own = self._own, turn @ estimate.cov_rot_trans @ turn.T
@@ -169,11 +168,11 @@ class FrameChain:
 
     @property
     def level_from_frame(self) -> Array:
-        """(3, 3) turn of the continuous frame that makes it upright, as far as gravity is known by now."""
+        """(3, 3) rotation that makes the continuous frame upright, by the present gravity estimate."""
         return np.asarray(self._frame.frame_from_odom[:3, :3].T)
 
     def odom_from_body(self) -> Array:
-        """(F, 4, 4) in the frame of the last estimate, by which gravity is known best."""
+        """(F, 4, 4) in the frame of the last estimate, with the best gravity estimate."""
         return np.asarray(se3_inverse(self._frame.frame_from_odom) @ np.array(self._frame_from_body).reshape(-1, 4, 4))
 
     def covariances(self) -> Array:
@@ -183,15 +182,15 @@ class FrameChain:
 
 
 def summary_of(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:
-    """What the choice of keyframes needs of a frame."""
+    """Return the data of a frame for the selection of keyframes."""
     e = estimate
     return FrameSummary(frame.stamp_ns, frame_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
 
 
 def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
-    """One camera's longest run of frames in one frame and scale, levelled by the cameras where gravity is unknown.
+    """Return one camera's longest run of frames with one frame and scale, levelled by the cameras if gravity is unknown.
 
-    With an IMU the frames after its start are connected through gaps in the pictures; without one every gap begins another scale.
+    With an IMU the frames after its start are connected through gaps in the pictures; without one every gap starts another scale.
     """
     same = np.array([e.scale_known == odometry.scale_known for e in odometry.estimates], bool)
     placed = same & np.array([e.status is not OdometryStatus.INITIALISING for e in odometry.estimates], bool)
@@ -214,7 +213,7 @@ def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
 def _levelled(
     odom_from_body: Array, covariances: Array, body_from_cam: Array, chosen: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """The same turned so that z points up, for want of an accelerometer: cameras are taken to be upright on average."""
+    """Rotate the pass so that z points up, without an accelerometer: cameras are assumed upright on average."""
     down = (odom_from_body[chosen, :3, :3] @ body_from_cam[:3, 1]).mean(axis=0)
     if np.linalg.norm(down) < 1e-6:
         return odom_from_body, covariances

@@ -1,7 +1,7 @@
-"""Long surveys in segments that overlap: each is followed and adjusted in parallel with others, and joined to the one before. Pure.
+"""Long surveys in overlapping segments: each is tracked and adjusted in parallel, and joined to the previous one. Pure.
 
-Two neighbours share a keyframe, the last of one and the first of the other: it says exactly where they lie to each other, so that
-every edge between neighbouring keyframes is one that some segment has measured and adjusted. What cannot be joined is made in one piece.
+Two neighbours share a keyframe, the last of one and the first of the other: it gives their exact relative pose, so that
+every edge between neighbouring keyframes was measured and adjusted in some segment. Segments that cannot be joined are processed as one.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,14 +21,14 @@ from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.state import Cut, FrameTracks, ImageStore, Landmarks, MemoryImageStore, OdometryPass, SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
-_MARGIN_NS = 1_000_000_000  # of IMU and wheels behind the last frame
+_MARGIN_NS = 1_000_000_000  # of IMU and wheels after the last frame
 _GATE = 22.46  # 0.999 of chi-square with 6 degrees of freedom
 Begin = Callable[[SurveyInputs, SurveySettings, SurveyTools], AdjustedChain]
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """Frames begin..last of a survey; its odometry starts at frame `lead`. All but the first begin where the one before has its last."""
+    """Frames begin..last of a survey; its odometry starts at frame `lead`. All but the first begin at the previous one's last frame."""
 
     lead: int
     begin: int
@@ -36,13 +36,13 @@ class Segment:
 
     @property
     def settled_from(self) -> int:
-        """The frame from which on its odometry must be sure of itself."""
+        """The frame from which on its odometry must be reliable."""
         return (self.lead + self.begin) // 2
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A segment with its frames and the samples of IMU and wheels between them. images: takes the pictures of its keyframes."""
+    """A segment with its frames and the samples of IMU and wheels between them. images: store for the pictures of its keyframes."""
 
     segment: Segment
     frames: Iterable[CameraFrame]
@@ -54,7 +54,7 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class _Shared:
-    """All that a process needs beside a task. begin: makes the chain of one piece."""
+    """Data of a process common to all tasks. begin: computes the chain of one piece."""
 
     begin: Begin
     calibration: RigCalibration
@@ -64,11 +64,11 @@ class _Shared:
 
 @dataclass(frozen=True, slots=True)
 class SegmentSurvey:
-    """Odometry of a segment's frames and state of its keyframes, those at both its ends included.
+    """Odometry of a segment's frames and state of its keyframes, including those at both ends.
 
-    Keyframes have their frame's number in the survey, and their pictures in the store that the task named, or one of the process that made
-    them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
-    odometry. unsettled, lost: why its beginning, or its end, cannot be joined to a neighbour.
+    Keyframes have their frame's number in the survey, and their pictures in the store named by the task, or one of the process that
+    made them. matched: pairs of its keyframes. led (4, 4), led_covariance (6, 6): body at `settled_from` from body at `begin` by
+    odometry. unsettled, lost: why its start, or its end, cannot be joined to a neighbour.
     """
 
     segment: Segment
@@ -82,14 +82,14 @@ class SegmentSurvey:
     lost: str | None
 
 
-_Made = tuple[Segment, SegmentSurvey | str]  # in words why there is none
+_Made = tuple[Segment, SegmentSurvey | str]  # text of the reason if there is none
 
 
 def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
-    """As `begin`; a survey that is long enough, and whose odometry has metres of its own, is cut. Where goes by its frames alone.
+    """As `begin`; a survey that is long enough, with odometry of known scale, is cut. The cuts depend only on its frames.
 
-    A segment whose odometry starts on the way, in the overlap, may fail to find its feet there. Then the one before goes on in its
-    place, as it would have without the cut, and `cuts` of the odometry say so.
+    The odometry of a segment starts in the overlap and may fail to initialise there. Then the previous segment is continued
+    instead, as without the cut, and `cuts` of the odometry record this.
     """
     if inputs.parts is None or inputs.initial_trajectory is not None or inputs.rectifier.camera.baseline_m == 0:
         return begin(inputs, settings, tools)
@@ -113,8 +113,8 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
 
 
 def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
-    """Segments of equal time, at least as long as the settings say; a single one of what is too short to be cut."""
-    if settings.seconds and len(stamps_ns):  # a gap, of days where a clock was set, is not cut into segments
+    """Return segments of equal time, at least as long as configured; a single one if too short to be cut."""
+    if settings.seconds and len(stamps_ns):  # a gap (of days if a clock was set) is not cut into segments
         steps_ns = np.minimum(np.diff(stamps_ns), int(settings.seconds * 1e9))
         stamps_ns = stamps_ns[0] + np.concatenate([[0], np.cumsum(steps_ns)])
     seconds = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
@@ -132,7 +132,7 @@ def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
 def _in_parallel(
     segments: Sequence[Segment], shared: _Shared, inputs: SurveyInputs, tools: SurveyTools, images: ImageStore
 ) -> Iterator[_Made]:
-    """What became of each; what processes return of pictures goes into the survey's own store as it comes."""
+    """Yield the result of each; pictures returned by processes are put into the survey's own store as they arrive."""
     tasks = (_task_of(segment, inputs, images) for segment in segments)
     for segment, survey in zip(segments, tools.executor.map(_survey_segment, shared, tasks), strict=True):
         tools.at("odometry", segment.last + 1, inputs.frame_count)
@@ -149,9 +149,9 @@ def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
 
 
 def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Task:
-    """The segment with its part of the inputs, and with the store of its pictures.
+    """Return the segment with its part of the inputs, and with the store of its pictures.
 
-    No sample from before its first frame: what the IMU felt while no picture was there would pass for rest where the robot drove evenly.
+    Samples before its first frame are excluded: IMU data without a picture would look like rest during constant motion.
     """
     assert inputs.parts is not None
     offset_ns, stamps_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9), inputs.parts.stamps_ns
@@ -169,7 +169,7 @@ def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Tas
 
 
 def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
-    """The survey of one segment in any process; in words why there is none."""
+    """Return the survey of one segment in any process, or the text of the reason if there is none."""
     segment = task.segment
     inputs = SurveyInputs(
         task.frames,
@@ -188,7 +188,7 @@ def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = No
 
 
 def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
-    """A segment's chain from `begin` on; nothing of the IMU, which the whole survey has."""
+    """Return a segment's chain from `begin` on; without IMU data, which the whole survey has."""
     odometry, lead = chain.odometry, segment.lead
     first, end, settled = segment.begin - lead, segment.last - lead + 1, segment.settled_from - lead
     chosen = np.array([frame >= first for frame in odometry.keyframe_frames])
@@ -220,16 +220,16 @@ def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
 
 
 def _doubt(chain: AdjustedChain, frames: slice) -> str | None:
-    """Why the odometry is not sure of itself at these frames, counted from the lead; None where it is."""
+    """Return why the odometry is unreliable at these frames, counted from the lead; None if it is reliable."""
     if not chain.odometry.tracked[frames].all():
         return "it saw too little there"
     if chain.state.motion.noise is not None and not all(e.inertial for e in chain.odometry.estimates[frames]):
-        return "it did not know gravity there"
+        return "gravity was unknown there"
     return None
 
 
 def _refusals(made: Sequence[_Made]) -> dict[int, str]:
-    """Why neighbours cannot be joined, by the frame between them."""
+    """Return why neighbours cannot be joined, by the frame between them."""
     found = {}
     for (_, before), (segment, after) in pairwise(made):
         if isinstance(before, str):
@@ -242,7 +242,7 @@ def _refusals(made: Sequence[_Made]) -> dict[int, str]:
 
 
 def refusal(before: SegmentSurvey, after: SegmentSurvey) -> str | None:
-    """Why two neighbours cannot be joined, None where they can: both were sure of themselves, and saw the robot drive there alike."""
+    """Return why two neighbours cannot be joined, None if they can: both were reliable, and agree on the motion there."""
     if before.lost is not None:
         return f"the odometry before it was in doubt: {before.lost}"
     if after.unsettled is not None:
@@ -272,7 +272,7 @@ def _made_again(
     tools: SurveyTools,
     images: ImageStore,
 ) -> Iterator[_Made]:
-    """Neighbours that could not be joined as one segment each; nothing if that is the whole survey, which needs no segments."""
+    """Yield merged neighbours that could not be joined, each as one segment; none if that is the whole survey, which needs no segments."""
     groups: list[list[_Made]] = []
     for each in made:
         if groups and each[0].begin in refused:
@@ -286,13 +286,13 @@ def _made_again(
             yield group[0]
             continue
         whole = Segment(group[0][0].lead, group[0][0].begin, group[-1][0].last)
-        # Here, not in a process elsewhere: it may be long, and the survey's own store keeps its pictures out of memory.
+        # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
         yield whole, _survey_segment(shared, _task_of(whole, inputs, images), tools)
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """A segment in the frame of the whole: joined_from_odom and joined_from_map (4, 4), its first keyframe's number, its tracks' first."""
+    """A segment in the common frame: joined_from_odom and joined_from_map (4, 4), its first keyframe's number, its tracks' first."""
 
     made: SegmentSurvey
     joined_from_odom: Array
@@ -302,7 +302,7 @@ class _Placed:
 
 
 def _joined(segments: Sequence[SegmentSurvey], cuts: tuple[Cut, ...], inputs: SurveyInputs) -> AdjustedChain:
-    """One chain of segments that can be joined, in the frame of the first one."""
+    """Join segments into one chain, in the frame of the first one."""
     level = inputs.calibration.imu is not None
     placed = [_Placed(segments[0], np.eye(4), np.eye(4), 0, 0)]
     for before, after in pairwise(segments):
@@ -323,9 +323,9 @@ def _joined(segments: Sequence[SegmentSurvey], cuts: tuple[Cut, ...], inputs: Su
 
 
 def _laid_on(joined_from_body: Array, segment_from_body: Array, level: bool) -> Array:
-    """joined_from_segment (4, 4) by one body in both. level: both know gravity, which a turn about z alone leaves as it is.
+    """Return joined_from_segment (4, 4) by one body in both. level: both know gravity, so only a rotation about z is used.
 
-    So no segment adds its error of tilt to those behind it.
+    So no segment adds its error of tilt to later ones.
     """
     if not level:
         return np.asarray(joined_from_body @ se3_inverse(segment_from_body))
@@ -336,7 +336,7 @@ def _laid_on(joined_from_body: Array, segment_from_body: Array, level: bool) -> 
 
 
 def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
-    """Every frame is of the segment that begins with it or before it; what two saw of a shared frame, it has of both."""
+    """Assign every frame to the segment that begins with it or before it; a shared frame has the tracks of both."""
     covariances, reached = list[Array](), placed[0].made.odometry.covariances[0]
     starts, ids, pixels, size = [np.zeros(1, np.int64)], [], [], 0
     for each in placed:
@@ -347,7 +347,7 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
         covariances.append(own + np.array([carried(gained, lever_m) for lever_m in levers_m]))
         reached = covariances[-1][-1]
         tracks = each.made.tracks
-        # A shared frame ends where its rows of the later segment do.
+        # A shared frame ends after its rows of the later segment.
         starts[-1] = starts[-1][:-1] if size else starts[-1]
         starts.append(size + tracks.starts[1:])
         ids.append(tracks.ids + np.int32(each.first_track))
@@ -366,12 +366,12 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
 
 
 def _in_turn(parts: Sequence[Array]) -> Array:
-    """Rows of all, each without its last, which the next one has first."""
+    """Concatenate rows of all, each without its last, which is the next one's first."""
     return np.concatenate([*(part[:-1] for part in parts[:-1]), parts[-1]])
 
 
 def _joined_state(placed: Sequence[_Placed], odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
-    """Landmarks of all segments; what two have seen is two landmarks, until landmarks are made anew."""
+    """Return landmarks of all segments; one seen in two is two landmarks, until landmarks are built again."""
     velocities, places, points, marks, number = [], [], [], [], 0
     for each in placed:
         own, turn = each.made.state, each.joined_from_map

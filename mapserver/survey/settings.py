@@ -9,7 +9,7 @@ from fleetmap.odometry import OdometrySettings
 
 
 class KeyframeSettings(Section, frozen=True):
-    """When a frame becomes a keyframe."""
+    """Selection of keyframes."""
 
     policy: Literal["overlap", "every", "every-nth"] = "overlap"
     every_nth: int = 5
@@ -22,7 +22,7 @@ class KeyframeSettings(Section, frozen=True):
 
 
 class PairSettings(Section, frozen=True):
-    """Which keyframes are matched with each other, and how."""
+    """Selection of keyframe pairs, and their matching."""
 
     previous: int = 6  # keyframes that each one is matched with
     covisible: int = 10  # further keyframes, those with the largest predicted overlap
@@ -37,7 +37,7 @@ class PairSettings(Section, frozen=True):
 
 
 class LoopSettings(Section, frozen=True):
-    """Which revisits are looked for and believed."""
+    """Search and acceptance of revisits."""
 
     top: int = 8
     depth: int = 128  # earlier keyframes, by similarity, that pass through the position gate
@@ -45,7 +45,7 @@ class LoopSettings(Section, frozen=True):
     min_gap_keyframes: int = 8
     max_innovation: float = 22.458  # 0.999 of chi-square with 6 degrees of freedom
     view_range_depths: float = 1.0  # largest distance between keyframes with common view, in median scene depths
-    # How far apart aisles that look alike are, where the site's people know it; 0 where they do not.
+    # Distance of aisles that look alike, if known; else 0.
     repeats_every_m: float = 0.0
     min_inliers: int = 15  # of one rigid motion
     alone_inliers: int = 30  # the same without a neighbouring keyframe that confirms the revisit
@@ -54,13 +54,13 @@ class LoopSettings(Section, frozen=True):
 
 
 class NoiseSettings(Section, frozen=True):
-    """What the bundle adjustment believes of its measurements."""
+    """Assumed noise of measurements in the bundle adjustment."""
 
     aligned_sigma_px: float = 0.35  # of a feature that patch alignment refined
     descriptor_sigma_px: float = 0.9  # of one that it could not refine, at the finest image scale
     disparity_sigma_px: float = 0.2
     cut_sigmas: float = 4.0  # observations farther off are removed between adjustments
-    # Of the estimated stereo yaw with an exact calibration: depth edges of long aisles pretend 0.06 px, most scenes 0.01
+    # Of the estimated stereo yaw with an exact calibration: depth edges of long aisles cause 0.06 px, most scenes 0.01
     turn_floor_px: float = 0.04
     turn_sigmas: float = 3.0  # significance at which that yaw is corrected
     accel_noise_scale: float = 5.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
@@ -69,7 +69,7 @@ class NoiseSettings(Section, frozen=True):
 
 
 class BundleSettings(Section, frozen=True):
-    """How hard bundle adjustment tries. Widths are in sigmas of an observation's residual."""
+    """Effort of bundle adjustment. Widths are in sigmas of an observation's residual."""
 
     max_iterations: int = 10  # Levenberg-Marquardt steps
     huber_sigmas: float = 2.5  # where the loss turns from quadratic to linear
@@ -80,7 +80,7 @@ class BundleSettings(Section, frozen=True):
 
 
 class SingleCameraSettings(Section, frozen=True):
-    """How the survey of one camera places features and lets the scale wander."""
+    """Depths and scale drift in the survey of one camera."""
 
     depth_views: int = 5  # keyframes before and after each that triangulate its features
     match_sigma_px: float = 1.0  # of a matched feature
@@ -90,7 +90,7 @@ class SingleCameraSettings(Section, frozen=True):
 
 
 class BudgetSettings(Section, frozen=True):
-    """How much of a survey robots get."""
+    """Share of a survey that robots get."""
 
     landmarks_per_m: float = 65.0
     min_landmarks: int = 2000
@@ -100,7 +100,7 @@ class BudgetSettings(Section, frozen=True):
 
 
 class CullSettings(Section, frozen=True):
-    """What a finished survey does not hand on, and what takes no part in adjusting it."""
+    """Parts removed from a finished survey, and parts left out of its adjustment."""
 
     # Candidates for one landmark; it also needs overlapping 3 sigma regions, no keyframe that sees both, and
     duplicate_m: float = 0.05
@@ -114,7 +114,7 @@ class CullSettings(Section, frozen=True):
 
 
 class SessionSettings(Section, frozen=True):
-    """How a survey is found in the map, what may move there, and when landmarks come and go."""
+    """Localization of a survey in the map, allowed motion there, and addition and removal of landmarks."""
 
     fix_keyframes: int = 60  # spread over the survey, that are localized in the map
     top_places: int = 6  # candidates for each of them
@@ -138,7 +138,7 @@ class SessionSettings(Section, frozen=True):
 
 
 class SegmentSettings(Section, frozen=True):
-    """How a long survey is cut into segments, which are followed and adjusted in parallel."""
+    """Division of a long survey into segments, which are tracked and adjusted in parallel."""
 
     seconds: float = 120.0  # of a segment, at least; 0: never cut. A survey shorter than two of them stays whole
     overlap_s: float = 10.0  # before its first frame, in which its odometry starts
@@ -146,12 +146,12 @@ class SegmentSettings(Section, frozen=True):
     def __post_init__(self) -> None:
         if self.seconds and not 0 < self.overlap_s <= self.seconds / 2:
             raise ValueError(
-                f"an overlap of {self.overlap_s} s is no more than half of a segment of {self.seconds} s, and above 0"
+                f"an overlap of {self.overlap_s} s is invalid: give a value above 0 and at most half of a segment of {self.seconds} s"
             )
 
 
 class SurveySettings(Section, frozen=True):
-    """All of it."""
+    """All settings of a survey."""
 
     seed: int = 0
     occupancy_grid: bool = False
@@ -167,7 +167,7 @@ class SurveySettings(Section, frozen=True):
     monocular: SingleCameraSettings = SingleCameraSettings()
     noise: NoiseSettings = NoiseSettings()
     bundle: BundleSettings = BundleSettings(max_iterations=20, relative_cost_tolerance=1e-6)
-    # Outliers go on creeping for long: they are cut after a few steps, and the rest converges without them.
+    # Outliers converge slowly: they are cut after a few steps, and the rest converges without them.
     rough_bundle: BundleSettings = BundleSettings(max_iterations=8, relative_cost_tolerance=1e-3)
     final_bundle: BundleSettings = BundleSettings(
         max_iterations=20, relative_cost_tolerance=1e-4, huber_sigmas=0.7, cutoff_sigmas=2.5

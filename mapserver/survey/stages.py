@@ -1,17 +1,17 @@
-"""A survey from a recording to a map: its stages in order, each a function of what the ones before it have found.
+"""A survey from a recording to a map: its stages in order, each a function of the earlier results.
 
 | stage | takes | gives |
 |---|---|---|
 | `follow` | frames, IMU, wheels, or given poses | `OdometryPass`: odometry of all frames, keyframes with their features |
 | `adjust_chain` | that | `AdjustedChain`: keyframes matched with their neighbours, landmarks, both adjusted |
-| `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` with keyframes where the pose graph says, and the `Loops` |
-| `adjust_globally` | keyframes after loops, pairs that are matched | all views matched anew and adjusted; the pair's error of yaw |
+| `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` with keyframes after the pose graph, and the `Loops` |
+| `adjust_globally` | keyframes after loops, matched pairs | all views matched again and adjusted; the pair's error of yaw |
 | `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
-| `place_frames`, `assemble` | the state that is kept | all frames, and the map; observations that do not fit are culled |
+| `place_frames`, `assemble` | the kept state | all frames, and the map; inconsistent observations are culled |
 
-Of a long recording, the first two go segment by segment. `mapserver build` calls `begin_survey`, measures the calibration by what that
-has found, and calls `finish_survey` (drafting/survey_recordings.py); drafting/draft.py goes on with the map: the site's current map, tiles.
-Settings are given to every stage; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each of them.
+For a long recording, the first two run segment by segment. `mapserver build` calls `begin_survey`, measures the calibration from its
+result, and calls `finish_survey` (drafting/survey_recordings.py); drafting/draft.py continues with the map: the site's current map, tiles.
+Every stage receives the settings; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each stage.
 """
 
 from collections.abc import Callable
@@ -63,10 +63,9 @@ _ADJUSTED_SIGMA_RAD = 0.02  # of the rotation between adjusted keyframes, and be
 class Survey:
     """The result of a survey.
 
-    odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation.
-    landmarks_in_map: rows of the state's landmarks that the map has. components: the connected components, of which one is the map.
-    stereo_yaw: the extrinsic yaw error of the pair. seen (F,): frames that points of the map place; the others are where odometry or
-    the IMU carries them.
+    odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation. landmarks_in_map:
+    rows of the state's landmarks in the map. components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw
+    error of the pair. seen (F,): frames located by points of the map; the others by odometry or the IMU.
     """
 
     map: SurveyMap
@@ -82,7 +81,7 @@ class Survey:
 
 
 def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
-    """Maps one recording. Raises SurveyError where it holds too little to map."""
+    """Map one recording. Raises SurveyError if it contains too little to map."""
     tools = tools or SurveyTools()
     return finish_survey(begin_survey(inputs, config.settings, tools), inputs, config, tools)
 
@@ -90,13 +89,13 @@ def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None
 def survey_from(
     odometry: OdometryPass, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None
 ) -> Survey:
-    """All stages after the initial trajectory."""
+    """Run all stages after the initial trajectory."""
     tools = tools or SurveyTools()
     return finish_survey(adjust_chain(odometry, inputs, config.settings, tools), inputs, config, tools)
 
 
 def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
-    """The stages before loops are looked for, of a long recording by segments. Raises SurveyError where there is too little."""
+    """Run the stages before loop closure, for a long recording by segments. Raises SurveyError if there is too little."""
     return in_segments(_whole, inputs, settings, tools)
 
 
@@ -105,13 +104,13 @@ def _whole(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -
 
 
 def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
-    """The stages after `begin_survey`. The caller lets go of the chain, or a long survey is in memory twice."""
+    """Run the stages after `begin_survey`. The caller must drop its reference to the chain, or a long survey is in memory twice."""
     settings, depths = config.settings, chain.depths
     state, loops = close_loops(chain, inputs, config, tools)
-    # Neighbours need not be matched again. Of one camera they are, as depths by which they were matched have changed.
+    # Neighbours need not be matched again, except for one camera: the depths used for matching have changed.
     matched, tracks = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
     odometry = chain.odometry
-    # The landmarks so far are those of neighbours; all are made anew, and nobody may hold the old ones meanwhile.
+    # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     del chain
     state = replace(state, landmarks=Landmarks.empty())
     odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
@@ -127,7 +126,7 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
 
 
 def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
-    """Odometry of all frames, or the poses of another system in its place, with the keyframes."""
+    """Run odometry over all frames, or use the poses of another system instead, with the keyframes."""
     if inputs.initial_trajectory is None:
         return run_odometry(inputs, settings, tools)
     return poses_as_odometry(inputs.initial_trajectory, inputs, settings, tools)
@@ -136,10 +135,10 @@ def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -
 def adjust_chain(
     odometry: OdometryPass, inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
 ) -> AdjustedChain:
-    """Keyframes matched with their neighbours and adjusted, before loops are looked for; SurveyError where there is too little."""
+    """Match keyframes with their neighbours and adjust them, before loop closure; SurveyError if there is too little."""
     if len(odometry.keyframes) < _MIN_KEYFRAMES:
         raise SurveyError(
-            f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} keyframe(s) that belong together; a map needs "
+            f"{len(odometry.estimates)} frames gave {len(odometry.keyframes)} connected keyframe(s); a map needs "
             f"motion, at least {_MIN_KEYFRAMES}"
         )
     state = initial_state(odometry, inputs)
@@ -164,16 +163,16 @@ def adjust_chain(
         state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
     if len(landmarks.points_map) < _MIN_LANDMARKS:
         raise SurveyError(
-            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; look at the recording with "
+            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; check the recording with "
             "`mapserver doctor`: dark, blurred, or the wrong calibration?"
         )
     matched = {(p.i, p.j) for p in pairs}
     del pairs, landmarks, finder  # as large as all else in a long survey
     tools.at("local adjustment", 0, 1)
     if state.motion.inertial:
-        # All at once: windows hold what came before them, and so lose the direction that odometry has from the gyro.
+        # All at once: windows fix earlier keyframes, and so lose the heading that odometry has from the gyro.
         held = [state]
-        del state  # or its observations would be in memory twice
+        del state  # otherwise its observations would be in memory twice
         state = bundle_rounds(held.pop(), settings, rounds=2)
     else:
         state = local_windows(state, settings)
@@ -183,7 +182,7 @@ def adjust_chain(
 def close_loops(
     begun: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools
 ) -> tuple[SurveyState, Loops]:
-    """Finds loops; the keyframes are then where the pose graph with them says. Position priors are known to the gate alone."""
+    """Find loops, and return the keyframes after the pose graph with them. Only the gate uses position priors."""
     odometry, state, settings = begun.odometry, begun.state, config.settings
     chain, scale_walk = chain_edges(odometry, state), settings.monocular.scale_walk
     known = chain if odometry.scale_known else gate_covariances(chain, scale_walk)
@@ -224,9 +223,9 @@ def adjust_globally(
     settings: SurveySettings,
     tools: SurveyTools,
 ) -> tuple[OdometryPass, SurveyState, StereoYaw]:
-    """Matches all views where the loops put them and adjusts them together, twice: the first result gives the stereo yaw error.
+    """Match all views at the poses after loop closure and adjust them together, twice: the first result gives the stereo yaw error.
 
-    matched: pairs that need not be matched again, and the tracks that they have joined.
+    matched: pairs that need not be matched again, and their tracks.
     """
     yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
     finder = _pair_finder(odometry, state, settings, tools)
@@ -252,10 +251,10 @@ def adjust_globally(
             landmarks = build_landmarks(posed, joined, settings, tools.executor, redundant)
             observed_from = posed.map_from_cam
             del pairs, joined
-        else:  # a second search finds hardly a match more; its coordinates are finer
+        else:  # a second search finds almost no further matches; its coordinates are more accurate
             landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
         held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))]
-        del landmarks, state  # or observations would be in memory twice
+        del landmarks, state  # otherwise observations would be in memory twice
         tools.release()
         state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
         if round_number == 0:
@@ -266,13 +265,13 @@ def adjust_globally(
 def keep_largest(
     state: SurveyState, odometry: OdometryPass, loops: Loops, settings: SurveySettings
 ) -> tuple[SurveyState, OdometryPass, Loops, Components]:
-    """The largest connected component, which becomes the map, and what all components are."""
+    """Return the largest connected component, which becomes the map, and all components."""
     components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
     return *only_kept(state, odometry, loops, components.kept), components
 
 
 def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
-    """The keyframes of one camera with depths by where they are now; unchanged for rigs that measure depth."""
+    """Return the keyframes of one camera with depths by their present poses; unchanged for rigs that measure depth."""
     if depths is None:
         return odometry
     return replace(odometry, keyframes=depths.keyframes_at(state.map_from_body, state.body_from_cam))
@@ -294,5 +293,5 @@ def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
 
 
 def _progress_of(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
-    """Reports steps of a stage, numbered from 0."""
+    """Report steps of a stage, numbered from 0."""
     return lambda number: tools.at(stage, number + 1, total)

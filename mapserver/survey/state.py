@@ -1,4 +1,4 @@
-"""State of a survey under way: its keyframes, the odometry that led to them, their motion, and the landmarks that they see. Pure values."""
+"""State of a survey in progress: its keyframes, odometry, motion, and landmarks. Pure values."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -31,26 +31,26 @@ class Pictures:
 
 
 class ImageStore(Protocol):
-    """Storage for the pictures of keyframes, and for what is found in them: those of a long survey do not fit in memory. For any thread."""
+    """Storage for pictures and features of keyframes: those of a long survey do not fit in memory. Thread-safe."""
 
     def put(self, pictures: Pictures) -> int:
-        """The number under which `get` gives them back."""
+        """Store pictures and return their number for `get`."""
 
     def get(self, number: int) -> Pictures:
-        """The pictures as they were put."""
+        """Return the stored pictures."""
 
     def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        """The same arrays, where memory need not hold them all the time."""
+        """Return the same arrays, not necessarily held in memory."""
 
     def release(self) -> None:
-        """A stage is over: what `keep` returned may leave memory until it is read again."""
+        """End a stage: results of `keep` may leave memory until they are read again."""
 
     def apart(self) -> AbstractContextManager["ImageStore"]:
-        """Another one, for a survey that nobody goes on with: what it holds goes with the last who uses it."""
+        """Return a separate store, for a survey that is not continued: it is freed with its last reference."""
 
 
 class MemoryImageStore:
-    """Keeps all pictures as they are."""
+    """Keeps all pictures in memory, unchanged."""
 
     def __init__(self) -> None:
         self._numbers = count()
@@ -78,8 +78,8 @@ class MemoryImageStore:
 class Keyframe:
     """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
 
-    from_views: the disparities come from other keyframes, so they place points but measure nothing of their own. nodes (N, 2): the
-    vocabulary's branches that are nearest to each feature; None where all descriptors are compared.
+    from_views: the disparities come from other keyframes, so they locate points but are not measurements. nodes (N, 2): the
+    vocabulary's branches nearest to each feature; None if all descriptors are compared.
     """
 
     frame_index: int
@@ -105,21 +105,21 @@ class Keyframe:
         return self.pictures.pyramid
 
     def with_pyramid(self) -> "Keyframe":
-        """The same keyframe with the left picture's pyramid and the depth image in memory, and no right picture."""
+        """Return the same keyframe with the left picture's pyramid and the depth image in memory, and no right picture."""
         images, pyramid = MemoryImageStore(), self.pyramid
         frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, self.frame.disparity_px)
         return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)))
 
     def without_pictures(self) -> "Keyframe":
-        """The same keyframe with an empty image store, cheap to send where only features are compared."""
+        """Return the same keyframe with an empty image store, cheap to send if only features are compared."""
         return replace(self, images=MemoryImageStore(), image_number=0)
 
     def measured(self, features: NDArray[np.integer]) -> Array:
-        """(n, 2) disparities of features (n,) and their sigmas as its own pictures have them; NaN where other keyframes say them."""
+        """Return (n, 2) measured disparities of features (n,) and their sigmas; NaN if they come from other keyframes."""
         return np.full((len(features), 2), np.nan) if self.from_views else self.disparities[features]
 
     def measured_at(self, features: NDArray[np.integer], pixels: Array, settings: StereoSettings) -> Array:
-        """As `measured`, of features that are at left pixels (n, 2) now: depth images are read there, pairs are not matched again."""
+        """As `measured`, of features now at left pixels (n, 2): depth images are read there, pairs are not matched again."""
         depth = self.frame.disparity_px
         if depth is None:
             return self.measured(features)
@@ -127,14 +127,14 @@ class Keyframe:
 
     @property
     def median_depth_m(self) -> float:
-        """Median depth of its stereo points; 5 m without any."""
+        """Return the median depth of its stereo points; 5 m without any."""
         depths = self.points_cam[np.isfinite(self.disparities[:, 0]), 2]
         return float(np.median(depths)) if len(depths) else 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class PosedKeyframes:
-    """K keyframes at map_from_body (K, 4, 4), seen by one camera with the mounting body_from_cam (4, 4)."""
+    """K keyframes at map_from_body (K, 4, 4), of one camera with the mount body_from_cam (4, 4)."""
 
     keyframes: list[Keyframe]
     map_from_body: Array
@@ -149,7 +149,7 @@ class PosedKeyframes:
 
 @dataclass(frozen=True, slots=True)
 class FrameTracks:
-    """Points that odometry followed, as F frames saw them: starts (F + 1,) delimits each one's track ids (M,) and pixels (M, 3), u_left v
+    """Points tracked by odometry in F frames: starts (F + 1,) delimits each frame's track ids (M,) and pixels (M, 3), u_left v
     u_right. Compact, since a long survey has millions of observations.
     """
 
@@ -159,25 +159,25 @@ class FrameTracks:
 
     @classmethod
     def of_frame(cls, estimate: OdometryEstimate) -> "FrameTracks":
-        """Those of one frame."""
+        """Return those of one frame."""
         pixels = np.zeros((0, 3)) if estimate.track_pixels is None else estimate.track_pixels
         ids = estimate.track_ids[: len(pixels)].astype(np.int32)
         return cls(np.array([0, len(ids)]), ids, pixels.astype(np.float32))
 
     @classmethod
     def joined(cls, frames: "Sequence[FrameTracks]") -> "FrameTracks":
-        """Those of single frames that come one after the other."""
+        """Concatenate those of single consecutive frames."""
         ids = [np.zeros(0, np.int32), *(f.ids for f in frames)]
         pixels = np.concatenate([np.zeros((0, 3), np.float32), *(f.pixels for f in frames)])
         return cls(np.cumsum([len(i) for i in ids]), np.concatenate(ids), pixels)
 
     def part(self, first: int, end: int) -> "FrameTracks":
-        """Those of the frames first..end - 1."""
+        """Return those of the frames first..end - 1."""
         a, b = self.starts[[first, end]]
         return FrameTracks(self.starts[first : end + 1] - a, self.ids[a:b], self.pixels[a:b])
 
     def of(self, frames: Indices) -> tuple[Indices, Indices, Array]:
-        """Observations of some frames: track ids (m,), which of the frames (m,) by its place in `frames`, pixels (m, 3)."""
+        """Return observations of some frames: track ids (m,), index (m,) of the frame in `frames`, pixels (m, 3)."""
         counts = self.starts[frames + 1] - self.starts[frames]
         which = np.repeat(np.arange(len(frames)), counts)
         rows = np.arange(len(which)) + (self.starts[frames] - np.cumsum(counts) + counts)[which]
@@ -186,7 +186,7 @@ class FrameTracks:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """A frame at which a survey was to be cut into segments, seconds after its first one; refused: why it could not, None where it was."""
+    """A planned cut of a survey at a frame, seconds after its first one; refused: reason, None if it was cut."""
 
     frame: int
     after_s: float
@@ -197,10 +197,10 @@ class Cut:
 class OdometryPass:
     """Odometry of F frames and K keyframes.
 
-    odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): whether the frame is tied to the
-    ones before; inertial: whether gravity was found; scale_known: whether lengths are metres; has_wheels: whether wheel odometry
-    took part; tracks: the points that were followed, None where none were; cuts: where segments were to begin. Of one camera only tracked
-    frames are in one frame and scale, and only they give keyframes.
+    odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): True for frames connected to
+    earlier ones; inertial: True if gravity was estimated; scale_known: True if lengths are metres; has_wheels: True if wheel odometry
+    was used; tracks: the tracked points, None if absent; cuts: planned starts of segments. With one camera only tracked
+    frames have one frame and scale, and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]
@@ -216,7 +216,7 @@ class OdometryPass:
 
     @property
     def keyframe_frames(self) -> list[int]:
-        """The frame number of each keyframe."""
+        """Frame number of each keyframe."""
         return [k.frame_index for k in self.keyframes]
 
 
@@ -241,7 +241,7 @@ class Landmarks:
 
     @classmethod
     def concatenated(cls, points_map: Array, parts: "Sequence[Landmarks]") -> "Landmarks":
-        """Landmarks (N, 3) with the observations of all parts, which number keyframes and landmarks alike, one part after the other."""
+        """Return landmarks (N, 3) with the concatenated observations of all parts, which share numbers of keyframes and landmarks."""
         return cls(
             points_map,
             np.concatenate([p.obs_keyframe for p in parts]),
@@ -252,12 +252,12 @@ class Landmarks:
         )
 
     def taken(self, rows: Indices | Mask, points_map: Array, keyframes: AnyArray, landmarks: AnyArray) -> "Landmarks":
-        """Some observations, rows (m,), of landmarks (N, 3), with new numbers of their keyframes and landmarks (m,)."""
+        """Return some observations, rows (m,), of landmarks (N, 3), with new numbers of their keyframes and landmarks (m,)."""
         features, pixels, sigmas = self.obs_feature[rows], self.obs_pixels[rows], self.obs_sigma_px[rows]
         return Landmarks(points_map, keyframes.astype(np.int32), landmarks.astype(np.int32), features, pixels, sigmas)
 
     def keep_observations(self, keep: Mask, min_observations: int) -> "Landmarks":
-        """Without the other observations, and without landmarks that are then seen too rarely."""
+        """Return the landmarks without the other observations, and without landmarks that are then seen too rarely."""
         counts = np.bincount(self.obs_landmark[keep], minlength=len(self.points_map))
         lasting = counts >= min_observations
         keep = keep & lasting[self.obs_landmark]
@@ -265,22 +265,22 @@ class Landmarks:
         return self.taken(keep, self.points_map[lasting], self.obs_keyframe[keep], number[self.obs_landmark[keep]])
 
     def of_features(self, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """Values of each observation's feature: columns are one array for each keyframe, a row for each feature."""
+        """Return values of each observation's feature: columns are one array for each keyframe, a row for each feature."""
         return of_features(self.obs_keyframe, self.obs_feature, columns)
 
     @property
     def firsts(self) -> Indices:
-        """(N,) the row of each landmark's reference."""
+        """Return (N,) the row of each landmark's reference."""
         return np.searchsorted(self.obs_landmark, np.arange(len(self.points_map)))
 
     @property
     def starts(self) -> Indices:
-        """(N + 1,) delimits each landmark's observations."""
+        """Return (N + 1,) limits of each landmark's observations."""
         return np.searchsorted(self.obs_landmark, np.arange(len(self.points_map) + 1))
 
 
 def of_features(owners: NDArray[Any], features: Indices, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Values of features (M,) of keyframes `owners` (M,); a site's columns one after the other would be gigabytes."""
+    """Return values of features (M,) of keyframes `owners` (M,); concatenated columns of a site would be gigabytes."""
     out = np.empty((len(owners), *columns[0].shape[1:]), columns[0].dtype)
     order = np.argsort(owners, kind="stable")
     ends = np.cumsum(np.bincount(owners, minlength=len(columns)))
@@ -301,10 +301,10 @@ class RelativeTerm:
 
 @dataclass(frozen=True)
 class KeyframeMotion:
-    """Velocities and biases at K keyframes; inertial is False for a rig whose gravity was never found.
+    """Velocities and biases at K keyframes; inertial is False for a rig without a gravity estimate.
 
-    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used where there is no IMU, and where
-    pictures show nothing. goes_on (K,): whether an inertial factor joins a keyframe with the one before; True everywhere for None.
+    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used without an IMU, and if
+    pictures show nothing. goes_on (K,): True if an inertial factor connects a keyframe with the previous one; None means all True.
     """
 
     inertial: bool
@@ -318,7 +318,7 @@ class KeyframeMotion:
     goes_on: Mask | None = None
 
     def of(self, chosen: Mask) -> "KeyframeMotion":
-        """That of the chosen keyframes (K,), numbered anew."""
+        """Return that of the chosen keyframes (K,), renumbered."""
         number = np.cumsum(chosen) - 1
         kept = [r for r in self.relative if chosen[r.i] and chosen[r.j]]
         return replace(
@@ -343,7 +343,7 @@ class SurveyState:
     is_depth_camera: bool = False
 
     def of(self, chosen: Mask) -> "SurveyState":
-        """A state of its own of the chosen keyframes (K,) and of the landmarks that two of them see."""
+        """Return a separate state of the chosen keyframes (K,) and of the landmarks seen by two of them."""
         number = np.cumsum(chosen) - 1
         marks = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2)
         marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
@@ -353,12 +353,12 @@ class SurveyState:
         )
 
     def moved(self, map_from_body: Array) -> "SurveyState":
-        """The state with its keyframes, and their velocities with them, at map_from_body (K, 4, 4)."""
+        """Return the state with its keyframes, and their velocities, moved to map_from_body (K, 4, 4)."""
         rotations = map_from_body[:, :3, :3] @ self.map_from_body[:, :3, :3].transpose(0, 2, 1)
         velocities = np.einsum("kij,kj->ki", rotations, self.motion.velocities_mps)
         return replace(self, map_from_body=map_from_body, motion=replace(self.motion, velocities_mps=velocities))
 
 
 def survey_camera(camera: StereoCamera) -> StereoCamera:
-    """The camera that a survey reckons with: a single one gets a baseline, so that depths have disparities, as a depth sensor's have."""
+    """Return the camera model of a survey: a single camera gets a baseline, so that depths have disparities, as with a depth sensor."""
     return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)

@@ -1,4 +1,4 @@
-"""Arguments that travel through all stages of a survey: its data, its options, its tools."""
+"""Arguments passed through all stages of a survey: its data, its options, its tools."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import ImageStore, OdometryPass, SurveyState
 from mapserver.survey.tracks.mono_depths import MonoDepths
 
-_RELEASED_EVERY = 4096  # steps of a stage: the features that these have read are far fewer than a site's
+_RELEASED_EVERY = 4096  # steps of a stage: they read far fewer features than a site has
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
 
@@ -27,18 +27,18 @@ class FrameParts(Protocol):
 
     @property
     def stamps_ns(self) -> Stamps:
-        """(F,) of all."""
+        """(F,) of all frames."""
 
     def part(self, first: int, end: int) -> Iterable[CameraFrame]:
-        """Those from first to before end, to be gone through once, in any process: it can be pickled."""
+        """Return those from first to before end, to be iterated once, in any process: it can be pickled."""
 
 
 @dataclass(frozen=True)
 class SurveyInputs:
-    """One recording: frames in order, raw or rectified ahead of the survey, and how many; IMU, wheels, calibration, position priors.
+    """One recording: frames in order, raw or rectified in advance, and their number; IMU, wheels, calibration, position priors.
 
     initial_trajectory: frame_from_body of every frame by another system, in metres; None to run the odometry. parts: the same frames in
-    parts, None where they come only once. keyframes_at: frames that become keyframes whatever they show.
+    parts, None if they can be read only once. keyframes_at: frames that always become keyframes.
     """
 
     frames: Iterable[CameraFrame | RectifiedFrame]
@@ -55,7 +55,7 @@ class SurveyInputs:
 
 @dataclass(frozen=True)
 class SurveyConfig:
-    """Choices that are the same for all recordings of a site."""
+    """Options common to all recordings of a site."""
 
     settings: SurveySettings
     vocabulary: Vocabulary
@@ -71,20 +71,20 @@ class SurveyTools:
     executor: Executor = SERIAL
 
     def at(self, stage: str, done: int, total: int) -> None:
-        """Reports progress; what is found in keyframes leaves memory now and then, and when the stage is over."""
+        """Report progress; features of keyframes leave memory periodically, and at the end of the stage."""
         self.progress(stage, done, total)
         if done == total or done % _RELEASED_EVERY == 0:
             self.release()
 
     def release(self) -> None:
-        """What was found in keyframes may leave memory until it is read again."""
+        """Allow features of keyframes to leave memory until they are read again."""
         if self.images is not None:
             self.images.release()
 
 
 @dataclass(frozen=True)
 class AdjustedChain:
-    """The keyframes of a survey before its loops are closed: matched holds the pairs that were matched already.
+    """The keyframes of a survey before loop closure; matched: pairs already matched.
 
     depths: of one camera's features; None for rigs that measure depth.
     """

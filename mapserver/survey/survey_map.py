@@ -12,10 +12,10 @@ from fleetmap.sensors.samples import Stamps, Trajectory
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """History of K keyframes and N landmarks over the versions of a site. An id is never used twice.
+    """History of K keyframes and N landmarks over the versions of a site. Ids are never reused.
 
-    keyframe_ids (K,); is_place (K,): robots are offered the keyframe as a place. landmark_expected, landmark_seen (N,): in how many
-    keyframes of later surveys a landmark should have been seen, and was; landmark_missed (N,): how often it was not since it was seen last.
+    keyframe_ids (K,); is_place (K,): True for keyframes used as places by robots. landmark_expected, landmark_seen (N,): numbers of
+    keyframes of later surveys that should have seen the landmark, and did; landmark_missed (N,): misses since it was last seen.
     """
 
     keyframe_ids: NDArray[np.uint32]
@@ -33,10 +33,10 @@ class SurveyMap:
 
     map_from_body (K, 4, 4). points_map (N, 3), descriptors (N, 32) uint8, point_sigma_m (N,) largest standard deviation. obs_keyframe and
     obs_landmark (M,) index the arrays here; obs_pixels (M, 3) is u_left, v, u_right (NaN without a right match); obs_sigma_px (M, 2) of u
-    and v, and of the disparity; the first observation of each landmark is its reference. trajectory holds all F frames; where
-    trajectory_estimated (F,) is false the transform is a guess between neighbours. patches (N, P, P) uint8 are cut from each landmark's
-    reference keyframe at its octave. history: None for a survey that no other was compared with yet. scale_known is False for one camera's
-    map whose metres are of the survey's own making.
+    and v, and of the disparity; the first observation of each landmark is its reference. trajectory has all F frames; if
+    trajectory_estimated (F,) is False the pose is interpolated between neighbours. patches (N, P, P) uint8 are cut from each landmark's
+    reference keyframe at its octave. history: None for a survey not compared with another yet. scale_known is False for one camera's
+    map with an arbitrary scale.
     """
 
     camera: StereoCamera
@@ -60,7 +60,7 @@ class SurveyMap:
 
 
 def history_of(survey_map: SurveyMap) -> History:
-    """Its history; for a survey without one, that of a map nobody has come back to."""
+    """Return its history; for a survey without one, that of a map without later surveys."""
     if survey_map.history is not None:
         return survey_map.history
     keyframes, landmarks = len(survey_map.map_from_body), len(survey_map.landmark_ids)

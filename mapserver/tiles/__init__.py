@@ -1,1 +1,1 @@
-"""From a survey to tiles: which landmarks robots get, and in which tile."""
+"""From a survey to tiles: choice of landmarks for robots, and their tiles."""

@@ -1,10 +1,9 @@
-"""Choice of the landmarks that robots get: those that localize best, within a budget per metre of path. Pure.
+"""Choice of the landmarks for robots: those best for localization, within a budget per metre of path. Pure.
 
-A survey finds many times what a robot needs. Every keyframe stands for the robots that will look from there: its picture is
-divided into bins, and what a landmark adds to a bin shrinks with those that it holds already, so that they are spread over the
-picture and over near and far. Every view gets what a robot needs to be sure of its place there before any gets more: at the end
-of a drive few keyframes see what others do not. Landmarks that were seen often, from far apart, and that are known well count for
-more, because they will be found again.
+A survey has many more landmarks than a robot needs. Every keyframe represents future views of robots: its picture is divided into bins, and
+a landmark's gain in a bin shrinks with the number already there, so that they are spread over the picture and over near and far. Every view
+gets the landmarks for a certain fix before any gets more: at the end of a drive few keyframes see landmarks that others do not. Landmarks
+seen often, from many directions, and with small uncertainty count more, because they will be seen again.
 """
 
 import numpy as np
@@ -16,20 +15,20 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 
-# One thing differs from its twin by some 30 bits, two things by 128; twins stand equally high on the same floor.
+# An object differs from its identical copy by about 30 bits, two objects by 128; copies have the same height on the same floor.
 _ALIKE_BITS, _HEIGHT_M = 60, 0.15
-_OWN_M = 2.0  # within it the same thing may have been mapped twice
-_REACH = 6  # among those that agree in two bytes
-_MOST_COMPARED = 10_000  # what repeats not once among so many is as good as alone
+_OWN_M = 2.0  # within it the same object may have been mapped twice
+_REACH = 6  # neighbours compared among those that agree in two bytes
+_MOST_COMPARED = 10_000  # a landmark without a copy among these counts as unique
 
 
 def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(N,) which landmarks (N, 3) with descriptors (N, 32) have no twin: none equally high and further off that looks the same.
+    """Return (N,) which landmarks (N, 3) with descriptors (N, 32) have no copy: no similar one at the same height farther off.
 
-    Twins mostly agree in some two bytes, and are found side by side where all are sorted by those; the few without are then compared
-    with all that stand equally high, in a large survey with a part of it, evenly chosen.
+    Copies mostly agree in two bytes, and are neighbours after sorting by those; the few without are then compared
+    with all at the same height, in a large survey with an evenly chosen part of them.
     """
-    by_height = np.argsort(points_map[:, 2], kind="stable")  # the second search goes along it
+    by_height = np.argsort(points_map[:, 2], kind="stable")  # used by the second search
     points, words = np.ascontiguousarray(points_map[by_height]), packed(descriptors[by_height])
     distinct = np.empty(len(points), bool)
     distinct[by_height] = ~core.twins(words, points, _REACH, _MOST_COMPARED, _ALIKE_BITS, _HEIGHT_M, _OWN_M)
@@ -38,7 +37,7 @@ def distinctive_landmarks(points_map: Array, descriptors: NDArray[np.uint8]) -> 
 
 _COLUMNS, _ROWS, _DEPTHS = 4, 3, 2
 _NO_LIMIT = 1 << 40
-_LONGEST_STEP_M = 10.0  # between keyframes; beyond it lies a break, not a path
+_LONGEST_STEP_M = 10.0  # between keyframes; a longer step is a break, not a path
 _CLOSE_BASELINES = 40.0
 _WIDE_RAD = np.radians(20.0)
 _SAME_WAY_M, _SAME_WAY_AFTER_M, _SAME_WAY_COSINE = 1.0, 5.0, 0.5
@@ -47,13 +46,13 @@ _SAME_WAY_M, _SAME_WAY_AFTER_M, _SAME_WAY_COSINE = 1.0, 5.0, 0.5
 def choose_landmarks(
     survey: SurveyMap, settings: BudgetSettings, tile_size_m: float, published: NDArray[np.uint32] | None = None
 ) -> NDArray[np.bool_]:
-    """(N,) which landmarks of the survey robots get.
+    """Return (N,) which landmarks of the survey robots get.
 
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
-    covers a whole room), and tile_landmarks in a tile. Landmarks whose ids are in `published` come before all others, so that
-    robots do not fetch another choice of equal worth every night. Of those and of the others, those come first that give every
-    keyframe view_distinctive_landmarks that look like nothing else in the survey, then those that give it view_landmarks, or as many as
-    it sees. What nothing observes is not chosen.
+    covers a whole room), and tile_landmarks in a tile. Landmarks with ids in `published` come before all others, so that
+    robots do not fetch another equally good choice every night. Among those and among the others, first come those that give every
+    keyframe view_distinctive_landmarks unlike any other in the survey, then those that give it view_landmarks, or as many as
+    it sees. Landmarks without observations are not chosen.
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
     starts, bins, weights = _views(survey)
@@ -78,9 +77,9 @@ def choose_landmarks(
 
 
 def covered_path_m(survey: SurveyMap) -> float:
-    """Metres from keyframe to keyframe, without breaks and what was driven before the same way.
+    """Return the length in metres from keyframe to keyframe, without breaks and repeated paths in the same direction.
 
-    Without the latter every night would add to a site's budget though its aisles are no longer than before.
+    With the latter every night would increase a site's budget although its aisles are no longer than before.
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
     places, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
@@ -96,7 +95,7 @@ def covered_path_m(survey: SurveyMap) -> float:
 
 
 def _views(survey: SurveyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Where each landmark's bins begin (N + 1,), the bins (M,) of all observations by landmark, and weights (N,)."""
+    """Return the start of each landmark's bins (N + 1,), the bins (M,) of all observations by landmark, and weights (N,)."""
     count, camera = len(survey.landmark_ids), survey.camera
     landmark, keyframe = survey.obs_landmark, survey.obs_keyframe
     map_from_cam = survey.map_from_body @ survey.body_from_cam
@@ -115,9 +114,9 @@ def _views(survey: SurveyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], Arr
 
 
 def _weights(survey: SurveyMap, map_from_cam: Array, seen: NDArray[np.int64]) -> Array:
-    """(N,) how likely a landmark is found again, and how much it then says.
+    """Return (N,) weights: probability that a landmark is seen again, times its information.
 
-    Laplace's rule for n - 1 times found again; up to twice that for views 20 degrees apart; less the more pixels its own
+    Laplace's rule for n - 1 repeated observations; up to twice that for views 20 degrees apart; less the more pixels its own
     uncertainty spans.
     """
     landmark, count = survey.obs_landmark, len(seen)
@@ -136,7 +135,7 @@ def _weights(survey: SurveyMap, map_from_cam: Array, seen: NDArray[np.int64]) ->
 
 
 def _cells(survey: SurveyMap, size_m: float, limit: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(N,) the tile of each landmark, numbered, and how many each tile may hold."""
+    """Return (N,) the tile of each landmark, numbered, and the limit of landmarks in each tile."""
     squares = np.floor(survey.points_map[:, :2] / size_m)
     names, cells = np.unique(squares, axis=0, return_inverse=True)
     return cells.reshape(-1).astype(np.int64), np.full(len(names), limit, np.int64)

@@ -1,4 +1,4 @@
-"""Cutting of a survey into the tiles that robots download. Pure."""
+"""Division of a survey into the tiles for robots. Pure."""
 
 from itertools import pairwise
 
@@ -22,12 +22,12 @@ def tiles_from_survey(
     max_place_landmarks: int = MAX_PLACE_LANDMARKS,
     chosen: NDArray[np.bool_] | None = None,
 ) -> list[Tile]:
-    """The survey cut into squares of `tile_size_m`, ordered by x, then y.
+    """Return the survey divided into squares of `tile_size_m`, ordered by x, then y.
 
-    Landmarks lie in the tile of their position, places (the keyframes that are offered as such, under their ids) in that
+    Landmarks lie in the tile of their position, places (keyframes offered as such, under their ids) in that
     of their camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
-    observations in the survey. Landmarks that nothing observes are left out: nothing says from where they are seen.
-    chosen (N,): the landmarks that robots get, all if None.
+    observations in the survey. Landmarks without observations are left out: their viewing directions are unknown.
+    chosen (N,): the landmarks for robots, all if None.
     Raises SurveyError for a survey with values that are not finite.
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
@@ -80,7 +80,7 @@ def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:
 
 
 def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int, chosen: NDArray[np.bool_]) -> list[_Ids]:
-    """For each keyframe the sorted ids of the best observed of the chosen landmarks seen in it."""
+    """Return for each keyframe the sorted ids of the best observed chosen landmarks seen in it."""
     ids = survey.landmark_ids
     order = np.lexsort((ids[survey.obs_landmark], -counts[survey.obs_landmark], survey.obs_keyframe))
     order = order[chosen[survey.obs_landmark[order]]]

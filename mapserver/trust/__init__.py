@@ -1,4 +1,4 @@
-"""Signed lists of what robots may run: the store's TUF repository, its keys, and when something is signed. docs/security.md explains it."""
+"""Signed lists of the versions allowed on robots: the store's TUF repository, its keys, and times of signing. See docs/security.md."""
 
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import SignedLists

@@ -1,10 +1,10 @@
 """The two authorities of the bus and the server's certificate.
 
-KEYS/servers-ca.crt                 who signs servers: robots trust it. Its key, servers-ca.pem, may lie on a stick
-KEYS/robots-ca.pem robots-ca.crt    who signs robots: the server's own; the .crt holds the one before, too, after a rotation
+KEYS/servers-ca.crt                 authority of servers, trusted by robots. Its key, servers-ca.pem, may lie on a USB stick
+KEYS/robots-ca.pem robots-ca.crt    authority of robots: the server's own; after a rotation the .crt also holds the previous one
 KEYS/server.pem                     the server's key and certificate in one file
 
-A robot's certificate cannot play the server: another authority signed it, for another use.
+A robot's certificate cannot be used as the server's: another authority signed it, for another use.
 """
 
 import ipaddress
@@ -37,17 +37,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Authority:
-    """Who signs certificates."""
+    """A certificate authority."""
 
     key: ec.EllipticCurvePrivateKey
     certificate: x509.Certificate
 
     def sign(self, key: ec.EllipticCurvePublicKey, name: str, days: float, *, hosts: Sequence[str] = ()) -> bytes:
-        """PEM of a certificate: of a server with these hosts, of a robot without any."""
+        """Return PEM of a certificate: of a server with these hosts, of a robot without any."""
         use = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
         names: list[x509.GeneralName] = [_host(host) for host in hosts]
         built = (
-            # Valid since its authority is: where the clock was ahead when it was signed, it would be refused once that is right.
+            # Valid since its authority is: signed by a clock ahead, it would otherwise be refused once that is corrected.
             _builder(name, self.certificate.subject, key, days)
             .not_valid_before(self.certificate.not_valid_before_utc)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -62,7 +62,7 @@ class Authority:
 
 
 class Authorities:
-    """The files of one folder of keys. now: the moment that certificates begin at."""
+    """The files of one folder of keys. now: start of new certificates."""
 
     def __init__(self, folder: Path, now: datetime) -> None:
         self.folder, self._now = folder, now.astimezone(UTC)
@@ -86,15 +86,15 @@ class Authorities:
         return tuple(str(name.value) for name in names)
 
     def init(self, hosts: Sequence[str], servers_key: Path | None, passphrase: str | None) -> None:
-        """Both authorities and the server's certificate. servers_key: where the servers' key goes; None: among the others.
+        """Create both authorities and the server's certificate. servers_key: path of the servers' key; None: in the same folder.
 
-        Raises StateError where there are some, UsageError for hosts that are none, StoreError where the disk refuses.
+        Raises StateError if they exist, UsageError for invalid hosts, StoreError on a disk error.
         """
         if self.are_there:
-            raise StateError(f"{self.folder} has a server's certificate already; `mapserver trust status` shows it")
+            raise StateError(f"{self.folder} already has a server's certificate; `mapserver trust status` shows it")
         checked, path = _checked(hosts), servers_key or self._path(f"{SERVERS_CA}.pem")
         if path.exists():
-            raise StateError(f"{path} is a key already, and none is overwritten; name another folder")
+            raise StateError(f"{path} is an existing key, which is not overwritten; name another folder")
         servers = self._make(SERVERS_CA)
         self._write_key(path, servers.key, passphrase)
         self._write(f"{SERVERS_CA}.crt", servers.certificate.public_bytes(_PEM))
@@ -102,10 +102,10 @@ class Authorities:
         self._sign_server(servers, checked)
 
     def rotate_server(self, servers_key: Path | None, passphrase: str | None, hosts: Sequence[str] = ()) -> None:
-        """Another key and certificate of the server, for the same hosts unless others are named. Errors as of `init`."""
+        """Replace key and certificate of the server, for the same hosts by default. Errors as of `init`."""
         path = servers_key or self._path(f"{SERVERS_CA}.pem")
         if not path.is_file():
-            raise UsageError(f"{path} is not there: name the servers' key by --key, where `trust init` put it")
+            raise UsageError(f"{path} is missing: name the servers' key by --key, where `trust init` put it")
         key = _load(path, passphrase)
         certificates = x509.load_pem_x509_certificates(self._read(f"{SERVERS_CA}.crt"))
         own = [c for c in certificates if c.public_key() == key.public_key()]
@@ -114,17 +114,17 @@ class Authorities:
         self._sign_server(Authority(key, own[0]), _checked(hosts or self.hosts))
 
     def rotate_robots_ca(self, *, is_stolen: bool) -> None:
-        """Another authority of robots. is_stolen: nothing that the last one signed counts any more, else it does till the next time."""
+        """Replace the authority of robots. is_stolen: invalidate all that the last one signed, else it is valid until the next rotation."""
         self._renew_robots_ca(before=b"" if is_stolen else self._robots_ca().certificate.public_bytes(_PEM))
 
     def sign_robot(self, key: bytes, name: str, purpose: str = "robot") -> bytes:
-        """PEM of a certificate for a public key (DER). purpose: robot, enrol or survey."""
+        """Return PEM of a certificate for a public key (DER). purpose: robot, enrol or survey."""
         public = s.load_der_public_key(key)
         assert isinstance(public, ec.EllipticCurvePublicKey)
         return self._robots_ca().sign(public, name, DAYS[purpose])
 
     def make_own(self, name: str, purpose: str) -> bytes:
-        """PEM of a new key and its certificate, for a bundle or a program of this account."""
+        """Return PEM of a new key and its certificate, for a bundle or a program of this account."""
         key = ec.generate_private_key(ec.SECP256R1())
         return key_pem(key, None) + self._robots_ca().sign(key.public_key(), name, DAYS[purpose])
 
@@ -134,17 +134,17 @@ class Authorities:
         return {file: (end - self._now).total_seconds() / 86_400 for file, end in ends.items()}
 
     def check(self) -> None:
-        """Raises UsageError for certificates of the bus that ended or have not begun, and for a key that does not fit."""
+        """Raise UsageError for certificates of the bus that expired or are not yet valid, and for a key that does not fit."""
         for file, step in (
             (f"{SERVER}.pem", "`mapserver trust rotate server`"),
-            (f"{ROBOTS_CA}.crt", "`mapserver trust rotate robots-ca`, and enrol all robots anew"),
-            (f"{SERVERS_CA}.crt", "make a new store of keys, and enrol all robots anew"),
+            (f"{ROBOTS_CA}.crt", "`mapserver trust rotate robots-ca`, and enrol all robots again"),
+            (f"{SERVERS_CA}.crt", "make a new store of keys, and enrol all robots again"),
         ):
             found = x509.load_pem_x509_certificate(self._read(file))
             check_times(self._path(file), found, self._now, step)
             left = (found.not_valid_after_utc - self._now).days
             if left < ENDS_SOON_DAYS:
-                _log.warning("%s ends in %d days, then no robot connects; %s", self._path(file), left, step)
+                _log.warning("%s expires in %d days, then robots cannot connect; %s", self._path(file), left, step)
         if fault := self.tls.fault():
             raise UsageError(f"{fault}; restore it, or make another one: `mapserver trust rotate server`")
 
@@ -154,7 +154,7 @@ class Authorities:
 
     def _renew_robots_ca(self, before: bytes) -> None:
         made = self._make(ROBOTS_CA)
-        # The key first: a certificate without its key would make nobody's.
+        # The key first: a certificate without its key would be useless.
         self._write_key(self._path(f"{ROBOTS_CA}.pem"), made.key, credential(ROBOTS_CA))
         self._write(f"{ROBOTS_CA}.crt", made.certificate.public_bytes(_PEM) + before)
 
@@ -195,7 +195,7 @@ class Authorities:
 def _load(path: Path, passphrase: str | None) -> ec.EllipticCurvePrivateKey:
     key = load_private(path, passphrase)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise UsageError(f"{path} is a key of another kind than authorities have; bring the right one")
+        raise UsageError(f"{path} has the wrong key type for an authority; bring the right one")
     return key
 
 
@@ -220,7 +220,7 @@ def _checked(hosts: Sequence[str]) -> tuple[str, ...]:
         try:
             _host(host)
         except ValueError as error:
-            raise UsageError(f"--host {host!r} is no name or address that robots can reach ({error})") from error
+            raise UsageError(f"--host {host!r} is an invalid name or address ({error}); correct it") from error
     return tuple(dict.fromkeys(hosts))
 
 

@@ -1,6 +1,6 @@
-"""The robots that may speak on the bus: enrolled by a bundle, renewed by themselves, revoked by a command.
+"""The robots allowed on the bus: enrolled by a bundle, renewed automatically, revoked by a command.
 
-STORE/keys/robots.json names them. Whoever stands there is in the rules of the bus, and nobody else.
+STORE/keys/robots.json lists them. The rules of the bus contain these robots only.
 """
 
 import hashlib
@@ -26,20 +26,20 @@ from mapserver.trust.authorities import DAYS, Authorities
 from mapserver.trust.lists import SignedLists
 
 LISTENING = "tls/0.0.0.0:7447"
-"""The endpoint that robots are enrolled for unless another is named; its host is the server's name."""
+"""Default endpoint for enrolled robots; its host is the server's name."""
 
 SURVEY = Holder("live.survey", purpose=Purpose.SURVEY)
 _DAY_NS = 86_400_000_000_000
 _RULES_NS = _DAY_NS // 2
 _MAX_ROBOTS = 20_000
-_NAME_LENGTH = 40  # a certificate's name has 64 signs at most; the mark behind it makes it unique
+_NAME_LENGTH = 40  # a certificate's name has 64 characters at most; the mark after it makes it unique
 
 
 class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
-    """One robot. key: fingerprint of the key that may renew; before: of the one whose place it took, for an answer that was lost.
+    """One robot. key: fingerprint of the key that may renew; before: of the key that it replaced, in case the answer was lost.
 
-    mark: at the end of the name in its certificates, another one after each renewal, so that rules can tell them apart; mark_before:
-    of the certificate before. renewed_ns: when it got its last certificate, None while its bundle waits.
+    mark: suffix of the name in its certificates, changed by each renewal, so that rules can distinguish them; mark_before:
+    of the previous certificate. renewed_ns: time of its last certificate, None while its bundle is unused.
     """
 
     site: str
@@ -57,12 +57,12 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def next_mark(self) -> str:
-        """Mark of its next certificate: known before, so that a renewal need not change the rules."""
+        """Mark of its next certificate: known in advance, so that a renewal need not change the rules."""
         return hashlib.sha256(self.mark.encode()).hexdigest()[:8]
 
     def holders(self, now_ns: int) -> Iterator[Holder]:
-        """Who may speak as this robot. A certificate that was renewed ends after 12 to 24 hours, for all robots in the same moment,
-        because new rules interrupt everybody: from then on it may only ask for the renewal, whose answer may have been lost."""
+        """Yield the certificates allowed for this robot. A renewed one ends after 12 to 24 hours, for all robots at the same
+        time, because new rules interrupt all connections: from then on it may only repeat the renewal, whose answer may have been lost."""
         yield Holder(self.certificate, self.site, self.robot)
         started_ns = (now_ns // _RULES_NS - 1) * _RULES_NS
         is_new = self.renewed_ns is None or started_ns <= self.renewed_ns <= now_ns + _RULES_NS
@@ -81,11 +81,11 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         return f"{self.certificate}.enrol"
 
     def row(self, now_ns: int) -> dict[str, str | int | float]:
-        """What `robots list` shows. certificate: the name in it; days_left: of it, or of the bundle that waits."""
+        """Return the row of `robots list`. certificate: the name in it; days_left: of it, or of the unused bundle."""
         since_ns = self.enrolled_ns if self.renewed_ns is None else self.renewed_ns
         left = DAYS["enrol" if self.renewed_ns is None else "robot"] - (now_ns - since_ns) / _DAY_NS
         if self.renewed_ns is None:
-            state = f"bundle waits, {24 * left:.0f} h left" if left > 0 else "bundle expired: enrol again"
+            state = f"bundle unused, {24 * left:.0f} h left" if left > 0 else "bundle expired: enrol again"
         else:
             state = f"certificate for {left:.0f} days" if left > 0 else "certificate expired: revoke and enrol again"
         named = {"site": self.site, "robot": self.robot, "certificate": self.certificate}
@@ -93,7 +93,7 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RobotRegister:
-    """The enrolled robots of a store. For any thread; sees at once what other processes write."""
+    """The enrolled robots of a store. Thread-safe; sees writes of other processes at once."""
 
     def __init__(self, store: MapStore) -> None:
         self._store = store
@@ -106,21 +106,21 @@ class RobotRegister:
 
     @property
     def tls(self) -> TlsFiles:
-        """The server's files; StateError where it has none."""
+        """The server's files; StateError if absent."""
         authorities = self.authorities
         if not authorities.are_there:
             folder = self._store.folder
             raise StateError(
                 f"{folder} has no certificate for its server; `mapserver trust init --here --host NAME --store {folder}` "
-                "makes one, with the NAME or address by which robots reach this machine"
+                "makes one, with the NAME or address of this machine for robots"
             )
         return authorities.tls
 
     def robots(self, site: str | None = None) -> list[Enrolled]:
-        """All (of a site), by site and name; StoreError where the file cannot be read."""
+        """Return all robots (of a site), by site and name; StoreError if the file is unreadable."""
         if not self._path.is_file():
             return []
-        with disk_errors(f"{self._path} cannot be read", "check whose account this is"):
+        with disk_errors(f"{self._path} cannot be read", "check the account"):
             data = self._path.read_bytes()
         try:
             found = msgspec.json.decode(data, type=list[Enrolled])
@@ -129,17 +129,17 @@ class RobotRegister:
         return [entry for entry in found if site in {None, entry.site}]
 
     def access(self) -> Access:
-        """The rules for the bus as of now."""
+        """Return the present rules for the bus."""
         now_ns, holders = self._store.now_ns(), [SURVEY]
         for entry in self.robots():
             holders.extend(entry.holders(now_ns))
-            # Used ones too, for as long as their certificate lasts: a copy then hears why it is refused, and stands in the log.
+            # Used ones too, while their certificate is valid: the owner of a copy then gets a reason, and it is logged.
             if now_ns - entry.enrolled_ns < DAYS["enrol"] * _DAY_NS:
                 holders.append(Holder(entry.bundle, entry.site, entry.robot, Purpose.ENROL))
         return Access(holders)
 
     def state(self) -> object:
-        """Something that is another after robots, an authority or the server's certificate changed."""
+        """Return a value that changes with robots, an authority or the server's certificate."""
         return (_stamp(self._path), self.tls_state())
 
     def tls_state(self) -> object:
@@ -147,10 +147,9 @@ class RobotRegister:
         return (_stamp(tls.authority), _stamp(tls.own))
 
     def enrol(self, site: str, robots: Sequence[str], endpoint: str, *, actor: Actor = NOBODY) -> dict[str, bytes]:
-        """The bundle of each robot. One whose bundle was not used gets another, and the old one is worth nothing.
+        """Return the bundle of each robot. An unused earlier bundle is replaced and becomes invalid.
 
-        Raises StateError for robots that are enrolled, UsageError for names that are none and an endpoint that is not in the
-        server's certificate.
+        Raises StateError for enrolled robots, UsageError for invalid names and an endpoint that is not in the server's certificate.
         """
         check_name(site, "site")
         self._check_endpoint(endpoint)
@@ -164,7 +163,7 @@ class RobotRegister:
                         f"robot {robot} of site {site} is enrolled; if it lost its key: `mapserver robots revoke {robot}` first"
                     )
                 if known is None and len(entries) >= _MAX_ROBOTS:
-                    raise StateError(f"{len(entries)} robots are enrolled, more than that no server has; revoke some")
+                    raise StateError(f"{len(entries)} robots are enrolled, the limit of a server; revoke some")
                 mark = secrets.token_hex(4)
                 entry = Enrolled(site=site, robot=robot, mark=mark, key="", enrolled_ns=self._store.now_ns())
                 own = authorities.make_own(entry.bundle, "enrol")
@@ -184,7 +183,7 @@ class RobotRegister:
         return bundles
 
     def revoke(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
-        """Takes robots out of the rules and returns those that were in them; a server that runs follows within two seconds."""
+        """Remove robots from the rules and return those removed; a running server follows within two seconds."""
         with self._changing() as entries:
             gone = [robot for robot in dict.fromkeys(robots) if entries.pop((site, robot), None) is not None]
         for robot in gone:
@@ -192,17 +191,17 @@ class RobotRegister:
         return gone
 
     def revoke_all(self, *, actor: Actor = NOBODY) -> int:
-        """Takes all robots of all sites out of the rules, and returns how many those were."""
+        """Remove all robots of all sites from the rules, and return their number."""
         entries = self.robots()
         for site in sorted({entry.site for entry in entries}):
             self.revoke(site, [entry.robot for entry in entries if entry.site == site], actor=actor)
         return len(entries)
 
     def renew(self, site: str, robot: str, payload: bytes) -> bytes:
-        """The encoded answer to a robot that asks for a certificate of its new key; its name is ours to say, not the request's.
+        """Return the encoded answer to a robot's request for a certificate of its new key; the name in the request is ignored.
 
-        The same question with the same keys is answered again, because answers get lost. Raises LinkError for anybody else; refusals
-        go into the log.
+        A repeated request with the same keys is answered again, because answers get lost. Raises LinkError for all others; refusals
+        are logged.
         """
         try:
             asked = check_request(payload)
@@ -212,7 +211,7 @@ class RobotRegister:
                     raise LinkError(f"robot {robot} of site {site} is not enrolled")
                 is_repeated = (asked.old_fingerprint, asked.new_fingerprint) == (entry.before, entry.key)
                 if asked.old_fingerprint != entry.key and not is_repeated:
-                    raise LinkError("this key may not renew; was the bundle used before, or a key restored?")
+                    raise LinkError("key may not renew: the bundle was already used, or a key restored; enrol again")
                 if not is_repeated:
                     marks = {"mark": entry.next_mark, "mark_before": entry.mark} if entry.renewed_ns is not None else {}
                     entry = msgspec.structs.replace(
@@ -231,22 +230,22 @@ class RobotRegister:
         return encode_message(RenewalAnswer(certificate=certificate.decode(), servers=self.authorities.servers))
 
     def note_copied(self, site: str, robot: str) -> None:
-        """Notes in the site's history that a robot's certificate was on two connections."""
+        """Log in the site's history that a robot's certificate was on two connections."""
         self._store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
 
     def survey_tls(self) -> TlsFiles:
-        """Files for a survey of this account that shows itself on the bus; StateError where the store has no authorities."""
+        """Return files for a survey of this account on the bus; StateError if the store has no authorities."""
         own = self._keys / "survey.pem"
         authorities = self.authorities
         if not authorities.are_there:
             raise StateError(f"{self._store.folder} has no certificates; run the survey where the server's store is")
         if not own.is_file() or (certificate_info(own.read_bytes()).ends - datetime.now(UTC)).days < 1:
-            with disk_errors(f"{own} cannot be written", "check whose account this is"):
+            with disk_errors(f"{own} cannot be written", "check the account"):
                 write_atomically(own, [authorities.make_own(SURVEY.certificate, "survey")])
         return TlsFiles(self._keys / "servers-ca.crt", own)
 
     def default_endpoint(self, listening: str) -> str:
-        """Where robots reach a server that listens at an endpoint: by the first name in its certificate."""
+        """Return the robots' endpoint of a server that listens here: with the first name in its certificate."""
         host = self.authorities.hosts[0]
         return f"{listening.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{listening.rpartition(':')[2]}"
 
@@ -268,8 +267,8 @@ class RobotRegister:
 
     @contextmanager
     def _changing(self) -> Iterator[dict[tuple[str, str], Enrolled]]:
-        """The robots, to be changed by one process at a time; written at the end unless something was raised."""
-        with disk_errors(f"{self._path} cannot be written", "make space, and check whose account this is"):
+        """Yield the robots, to be changed by one process at a time; written at the end unless an error was raised."""
+        with disk_errors(f"{self._path} cannot be written", "free some space, and check the account"):
             make_folder(self._keys)
             with locked(self._keys / "lock", shared=False):
                 before = {(entry.site, entry.robot): entry for entry in self.robots()}

@@ -1,4 +1,4 @@
-"""The certificate of HTTP: the names in it, and how a renewed one is taken while the server runs."""
+"""The certificate of HTTP: its names, and its renewal while the server runs."""
 
 import logging
 import ssl
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 class HttpCertificate:
-    """A certificate and its key as PEM files; UsageError where they cannot be served."""
+    """A certificate and its key as PEM files; UsageError if they are unusable."""
 
     def __init__(self, certificate: Path, key: Path) -> None:
         self.certificate, self.key = certificate, key
@@ -25,64 +25,64 @@ class HttpCertificate:
         self._loaded = self._mark()
 
     def warn(self, names: frozenset[str] = frozenset()) -> None:
-        """Says in the log what clients will refuse soon, or already. names: by which the server is to be reached."""
+        """Log reasons why clients will refuse it, soon or now. names: names of the server for clients."""
         from cryptography.x509.oid import ExtensionOID
 
         chain = self._chain()
         left = (chain[0].not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86_400
         if left < ENDS_SOON_DAYS:
             ends = f"{chain[0].not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
-            _log.warning("%s ends at %s, in %.1f days; put a renewed one in its place", self.certificate, ends, left)
+            _log.warning("%s expires at %s, in %.1f days; replace it by a renewed one", self.certificate, ends, left)
         own = _names(chain[0])
         for name in sorted(names):
             if name not in own and f"*.{name.partition('.')[2]}" not in own:
                 _log.warning(
                     "%s is not for %s: it names %s", self.certificate, name, ", ".join(sorted(own)) or "nothing"
                 )
-        # Authorities that everybody knows sign by others of theirs, which clients do not know.
+        # Public authorities sign by intermediate ones, which clients do not know.
         is_public = any(ext.oid == ExtensionOID.AUTHORITY_INFORMATION_ACCESS for ext in chain[0].extensions)
         followers = list(pairwise(chain))
         if (is_public and not followers) or any(one.issuer != by.subject for one, by in followers):
             issuer = chain[0].issuer.rfc4514_string()
-            _log.warning("%s does not go on with the certificate of %s; give the full chain", self.certificate, issuer)
+            _log.warning("%s lacks the certificate of its issuer %s; give the full chain", self.certificate, issuer)
         with disk_errors(f"{self.key} cannot be read", "check the path and its rights", UsageError):
             is_open = self.key.stat().st_mode & 0o007
         if is_open:
             _log.warning("every account of this machine can use the key %s; `chmod o= %s`", self.key, self.key)
 
     def names(self) -> frozenset[str]:
-        """The DNS names that the certificate is for, those with a wildcard left out."""
-        return frozenset(name for name in _names(self._chain()[0]) if "*" not in name)  # addresses are let in anyway
+        """Return the DNS names of the certificate, without wildcards."""
+        return frozenset(name for name in _names(self._chain()[0]) if "*" not in name)  # addresses are always accepted
 
     def renew(self, context: ssl.SSLContext) -> None:
-        """Gives new connections the files' present content, where it is another one and fits together; else goes on with the old."""
+        """Load the present files for new connections, if changed and consistent; otherwise keep the old ones."""
         mark = self._mark()
         if mark == self._loaded:
             return
         try:
-            # Into one that nobody uses first: half of a new pair would end every connection.
+            # Into an unused context first: an inconsistent pair would break every connection.
             self._load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER))
             self._load(context)
         except UsageError as error:
-            _log.warning("HTTP goes on with its last certificate: %s", error)
+            _log.warning("HTTP keeps its last certificate: %s", error)
             return
         self._loaded = mark
         _log.info("HTTP has a renewed certificate")
 
     def _load(self, context: ssl.SSLContext) -> None:
         try:
-            # An encrypted key is refused; without a password here the library would ask for one on the terminal.
+            # An encrypted key is refused; without a password here the library would prompt on the terminal.
             context.load_cert_chain(self.certificate, self.key, password="")
         except (OSError, ssl.SSLError) as error:
             raise UsageError(
                 f"--http-cert {self.certificate} and --http-key {self.key} cannot be served ({error}); give a certificate and its "
                 "unencrypted key as PEM files"
             ) from error
-        step = "put a renewed one and its key in their place"
+        step = "replace both by a renewed certificate and its key"
         check_times(self.certificate, self._chain()[0], datetime.now(UTC), step)
 
     def _chain(self) -> "list[x509.Certificate]":
-        """The certificate, and those behind it in the file; UsageError where there is none now, as while it is replaced."""
+        """Return the certificate, and those after it in the file; UsageError if there is none, for example during replacement."""
         from cryptography import x509
 
         with disk_errors(f"{self.certificate} cannot be read", "check the path and its rights", UsageError):
@@ -90,7 +90,7 @@ class HttpCertificate:
         try:
             return x509.load_pem_x509_certificates(data)
         except ValueError as error:
-            raise UsageError(f"{self.certificate} holds no certificate ({error}); put a whole one there") from error
+            raise UsageError(f"{self.certificate} holds no certificate ({error}); put a complete one there") from error
 
     def _mark(self) -> tuple[int, ...]:
         with disk_errors(f"{self.certificate} or {self.key} cannot be read", "check the paths and their rights"):
@@ -100,12 +100,12 @@ class HttpCertificate:
 
 
 def check_times(path: Path, certificate: "x509.Certificate", now: datetime, step: str) -> None:
-    """Raises UsageError for a certificate that clients refuse by their clocks. step: what to do about it."""
+    """Raise UsageError for a certificate that clients refuse because of its dates. step: the remedy."""
     begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     if not begins <= now < ends:
         words = f"ended at {ends:%Y-%m-%d %H:%M}" if now >= ends else f"begins at {begins:%Y-%m-%d %H:%M}"
         raise UsageError(
-            f"the certificate in {path} {words} UTC, and the clock says {now:%Y-%m-%d %H:%M} UTC: nobody would connect. Where the clock is "
+            f"the certificate in {path} {words} UTC, and the clock says {now:%Y-%m-%d %H:%M} UTC: no client would connect. If the clock is "
             f"right, {step}; else set it (`timedatectl`)"
         )
 

@@ -1,9 +1,9 @@
-"""The store's signed lists as files, as robots get them.
+"""The store's signed lists as files, in the robots' format.
 
-STORE/trust/1.root.json 2.root.json ...        which keys sign what; never removed, because robots follow them one by one
-STORE/trust/N.targets.json                     which keys sign the list of which site
-STORE/trust/N.site-SITE.json                   the versions of a site that robots may run
-STORE/trust/N.snapshot.json timestamp.json     which of these files are the present ones
+STORE/trust/1.root.json 2.root.json ...        keys of each role; never removed, because robots follow them one by one
+STORE/trust/N.targets.json                     keys of each site's list
+STORE/trust/N.site-SITE.json                   the versions of a site allowed on robots
+STORE/trust/N.snapshot.json timestamp.json     the present files of these
 """
 
 import re
@@ -27,15 +27,15 @@ _NUMBERED = re.compile(r"([0-9]{1,10})\.([a-z0-9_-]+)\.json")
 
 
 def is_fresh(role: str, expires: datetime, now: datetime) -> bool:
-    """Whether a list (of `site`, `snapshot` or `timestamp`) need not be signed anew.
+    """True if a list (of `site`, `snapshot` or `timestamp`) need not be signed again.
 
-    One that lasts for longer than any was signed while the clock was ahead: it would be believed until then, whoever shows it.
+    An expiry too far in the future was signed by a clock ahead: the list would be valid until then, even from an attacker.
     """
     return now + timedelta(days=_RENEWED_DAYS_BEFORE[role]) <= expires <= now + timedelta(days=DAYS[role], hours=1)
 
 
 class SignedLists:
-    """The folder of one store. For any thread; sees at once what other processes write."""
+    """The folder of one store. Thread-safe; sees writes of other processes at once."""
 
     def __init__(self, store: Path) -> None:
         self.folder = store / "trust"
@@ -46,7 +46,7 @@ class SignedLists:
         return (self.folder / "1.root.json").is_file()
 
     def file(self, site: str, name: str) -> bytes:
-        """A file for the robots of a site; empty where they have none of that name."""
+        """Return a file for the robots of a site; empty if absent."""
         named = _NAME.fullmatch(name)
         if named is None or ((named[2] or "").startswith("site-") and named[2] != site_role(site)):
             return b""
@@ -64,8 +64,8 @@ class SignedLists:
         return sorted(int(name[1]) for name in found if name is not None and name[2] == role)
 
     def metadata(self, role: str, number: int | None = None) -> "Metadata[Any]":
-        """The newest file of a role, or that of this number; StoreError where it cannot be read. No signature is verified."""
-        from tuf.api.exceptions import RepositoryError  # late: who only lists versions needs none of it
+        """Return the newest file of a role, or that of this number; StoreError if unreadable. Signatures are not verified."""
+        from tuf.api.exceptions import RepositoryError  # imported late: listing versions does not need it
         from tuf.api.metadata import Metadata
 
         path = self.path(role, self.newest(role) if number is None else number)
@@ -75,16 +75,16 @@ class SignedLists:
             raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
 
     def read(self, role: str, number: int | None = None) -> Any:
-        """What that file says: a Root, Targets, Snapshot or Timestamp of tuf. Errors as of `metadata`."""
+        """Return the content of that file: a Root, Targets, Snapshot or Timestamp of tuf. Errors as of `metadata`."""
         return self.metadata(role, number).signed
 
     def site_roles(self) -> "dict[str, DelegatedRole]":
-        """Who signs for which site, by the role's name, as the newest targets say; errors as of `metadata`."""
+        """Return the signing key role of each site, by the role's name, from the newest targets; errors as of `metadata`."""
         delegations = self.read("targets").delegations
         return {} if delegations is None else dict(delegations.roles)
 
     def is_signed(self, role: "DelegatedRole") -> bool:
-        """Whether a site's newest list bears the name of its present key; the signature is not verified."""
+        """True if a site's newest list has a signature of its present key, which is not verified."""
         try:
             signatures = self.metadata(role.name).signatures
         except StoreError:
@@ -92,7 +92,7 @@ class SignedLists:
         return any(keyid in role.keyids for keyid in signatures)
 
     def retired(self) -> dict[str, str]:
-        """By role, what an earlier fleetmap set up and this one cannot go on with: several keys, a token's, no predecessors."""
+        """Return by role setups of an earlier fleetmap that are no longer supported: several keys, a token's, no predecessors."""
         root, found = self.read("root"), {}
         for name in ("root", "targets"):
             role = root.roles[name]
@@ -102,15 +102,15 @@ class SignedLists:
                 if role.threshold == 1:
                     fault = f"a key of {name} is of the kind {min(kinds)}, as PKCS#11 tokens have"
                 found[name] = (
-                    f"{self.folder}: {fault}; fleetmap signs with one root key in a file now. Go on with the fleetmap that made it, "
-                    "or begin anew: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
+                    f"{self.folder}: {fault}; fleetmap now signs with one root key in a file. Continue with the fleetmap that made it, "
+                    "or start again: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
                 )
         for name, signed_by in self.site_roles().items():
-            # Lists of before may leave the version before out.
+            # Lists of earlier versions may omit the previous version.
             if signed_by.threshold > 1 or not signed_by.unrecognized_fields.get("previous", 1):
                 site, fault = name.removeprefix("site-"), f"{signed_by.threshold} keys must sign its lists"
                 if signed_by.threshold == 1:
-                    fault = "its lists admit no version but the current one"
+                    fault = "its lists admit only the current version"
                 found[name] = (
                     f"site {site}: {fault}, which is no longer supported; `mapserver trust admit {site} --key ROOT` lets one key of "
                     "this server sign lists that admit the version before, too"
@@ -121,7 +121,7 @@ class SignedLists:
         return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
 
     def site_list(self, site: str, number: int) -> SiteList:
-        """The list of this number; errors as of `read`."""
+        """Return the list of this number; errors as of `read`."""
         path = self.path(site_role(site), number)
         try:
             return read_site_list(path.read_bytes(), site)
@@ -129,7 +129,7 @@ class SignedLists:
             raise StoreError(f"{path} cannot be read ({error}); restore the store's folder trust") from error
 
     def served(self, site: str) -> SiteList | None:
-        """The list that robots of a site get now; None before the first."""
+        """Return the present list for robots of a site; None before the first."""
         try:
             status = self.path(TIMESTAMP, 0).stat()
         except FileNotFoundError:
@@ -147,7 +147,7 @@ class SignedLists:
         return known[site]
 
     def admitted_or_current(self, wanted: WantedVersion) -> WantedVersion:
-        """The version that a robot is told to run: the wanted one where the list admits it, else the list's current one."""
+        """Return the version sent to a robot: the wanted one if the list admits it, else the list's current one."""
         if not self.are_there or wanted.version is None:
             return wanted
         found = self.served(wanted.site)

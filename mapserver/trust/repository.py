@@ -1,4 +1,4 @@
-"""Writing of signed lists with tuf. Every function takes the keys that it needs: who lacks them cannot call it with success."""
+"""Writing of signed lists with tuf. Every function takes the keys that it needs and fails without them."""
 
 import logging
 from collections.abc import Sequence
@@ -30,65 +30,65 @@ from mapserver.store.files import make_folder
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh
 
-_MOST_FILES = 5  # of a role that robots ask for by number: one may have read the timestamp before the last change
+_MOST_FILES = 5  # of a role that robots fetch by number: a robot may have read an earlier timestamp
 _ONLINE = ("snapshot", TIMESTAMP)
 _log = logging.getLogger(__name__)
 _COMPACT = JSONSerializer(compact=True)
 
 
 class ListRepository:
-    """The signed lists of one store, for writing, and its keys. now: the moment that times of expiry are counted from."""
+    """The signed lists of one store, for writing, and its keys. now: reference time of expiry."""
 
     def __init__(self, store: Path, now: datetime) -> None:
         self.lists, self.keys = SignedLists(store), KeyFolder(store / "keys")
         self.now = now.astimezone(UTC).replace(microsecond=0)
 
     def root(self) -> Root:
-        """What the newest root says; errors as of `SignedLists.metadata`."""
+        """Content of the newest root; errors as of `SignedLists.metadata`."""
         return cast(Root, self.lists.read("root"))
 
     def targets(self) -> Targets:
-        """What the newest targets say; errors as of `SignedLists.metadata`."""
+        """Content of the newest targets; errors as of `SignedLists.metadata`."""
         return cast(Targets, self.lists.read("targets"))
 
     # --- with the root key --------------------------------------------------------------------------------------------
 
     def check_empty(self) -> None:
-        """Raises StateError where the store has lists."""
+        """Raise StateError if the store has lists."""
         if self.lists.are_there:
-            raise StateError(f"{self.lists.folder} has signed lists already; `mapserver trust status` shows them")
+            raise StateError(f"{self.lists.folder} already has signed lists; `mapserver trust status` shows them")
 
     def init(self, root_key: Signer) -> None:
-        """The first root and targets; StateError where the store has some."""
+        """Write the first root and targets; StateError if the store has some."""
         self.check_empty()
         online, root = self.keys.signer("online") or self.keys.make("online"), Root(consistent_snapshot=True)
         for role in ("root", "targets"):
             root.add_key(root_key.public_key, role)
         for role in _ONLINE:
             root.add_key(online.public_key, role)
-        # The root last: with it the store counts as signed.
+        # The root last: once it exists the store counts as signed.
         self._sign("targets", Targets(delegations=Delegations(keys={}, roles={})), root_key)
         self._sign("root", root, root_key)
 
     def check_root_key(self, root_key: Signer) -> None:
-        """Raises StateError for a key that is not the root key, before anything is changed."""
+        """Raise StateError for a key that is not the root key, before any change."""
         roles, keyid = self.root().roles, root_key.public_key.keyid
         if not all(keyid in roles[name].keyids for name in ("root", "targets")):
             raise StateError(f"key {keyid[:8]} is not the root key of {self.lists.folder}; name its file by --key")
 
     def replace_online(self, root_key: Signer) -> None:
-        """Another key for snapshot and timestamp; robots then forget the numbers of the old one."""
+        """Replace the key of snapshot and timestamp; robots then discard the numbers of the old one."""
         self._change_root(_ONLINE, self.keys.replace("online").public_key, [root_key])
 
     def replace_root(self, root_key: Signer, new: Signer) -> None:
-        """The next root and targets, signed by `new` in the place of `root_key`, or by the same key for longer."""
+        """Write the next root and targets, signed by `new` in place of `root_key`, or extended with the same key."""
         self._change_root(("root", "targets"), new.public_key, [root_key, new])
         targets = self.targets()
         targets.version += 1
         self._sign("targets", targets, new, judges=(self.root(),))
 
     def _change_root(self, roles: Sequence[str], key: Key, signers: Sequence[Signer]) -> None:
-        """The next root, in which `key` alone signs these roles; StateError unless the last root's key and its own signed it."""
+        """Write the next root, in which only `key` signs these roles; StateError unless the last root's key and its own signed it."""
         before, root = self.root(), self.root()
         for role in roles:
             for keyid in list(root.roles[role].keyids):
@@ -98,7 +98,7 @@ class ListRepository:
         self._sign("root", root, *signers, judges=(before, root))
 
     def delegate(self, site: str, key: Key, root_key: Signer) -> None:
-        """This key, and no other, signs the list of a site. StateError unless the root key signed."""
+        """Make this key the only one that signs the list of a site. StateError unless the root key signed."""
         targets, name = self.targets(), site_role(site)
         held = targets.delegations or Delegations(keys={}, roles={})
         role = DelegatedRole(name, [], 1, terminating=True, paths=[manifest_target(site, "*")])
@@ -111,23 +111,23 @@ class ListRepository:
         self._sign("targets", targets, root_key, judges=(self.root(),))
 
     def forget_site(self, site: str) -> None:
-        """Removes all lists of a site, so that its numbers begin anew; robots follow only after another online key."""
+        """Remove all lists of a site, so that its numbers restart; robots accept this only after another online key."""
         for path in self.lists.folder.glob(f"*.{site_role(site)}.json"):
             path.unlink(missing_ok=True)
 
     # --- with the keys of the server ----------------------------------------------------------------------------------
 
     def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], key: Signer) -> int:
-        """The next list of a site, and its number; StateError unless the site's key signed."""
+        """Write the next list of a site, and return its number; StateError unless the site's key signed."""
         name = site_role(site)
         signed = site_targets(site, admitted, self.lists.newest(name) + 1)
         self._sign(name, signed, key, judges=(self.targets(),))
         return signed.version
 
     def sign_online(self, online: Signer) -> None:
-        """Snapshot, where something changed, and timestamp. Names only what it has verified with the store's own root.
+        """Write the snapshot, if something changed, and the timestamp. Only files verified with the store's own root are included.
 
-        Raises StateError where root and targets do not let this key sign.
+        Raises StateError if root and targets do not allow this key.
         """
         root, targets = self.root(), self.lists.metadata("targets")
         _check(root, "targets", targets)
@@ -146,7 +146,7 @@ class ListRepository:
         self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), online, judges=(root,))
 
     def _last_snapshot(self, root: Root) -> Snapshot | None:
-        """The one that can stay, None where none can: one that a replaced key signed cannot, although it says the same."""
+        """Return the last one if it can stay, else None: one signed by a replaced key cannot, despite the same content."""
         if not self.lists.newest("snapshot"):
             return None
         last = self.lists.metadata("snapshot")
@@ -157,9 +157,9 @@ class ListRepository:
         return cast(Snapshot, last.signed)
 
     def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
-        """What a snapshot says of a site: its newest list, or what it said before where another key must sign first.
+        """Return the snapshot's entry of a site: its newest list, or the previous entry while another key must sign first.
 
-        Robots refuse a snapshot that has lost a role, those of other sites too.
+        Robots refuse a snapshot that has lost a role, including roles of other sites.
         """
         try:
             _check(targets, name, self.lists.metadata(name))
@@ -182,7 +182,7 @@ class ListRepository:
     def _write(self, role: str, metadata: Metadata[Any]) -> None:
         number = metadata.signed.version
         path = self.lists.path(role, number)
-        with disk_errors(f"{path} cannot be written", "make space, and run the command again"):
+        with disk_errors(f"{path} cannot be written", "free some space, and run the command again"):
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])
             if role not in ("root", TIMESTAMP):
@@ -194,7 +194,7 @@ class ListRepository:
 
 
 def site_targets(site: str, admitted: Sequence[AdmittedVersion], number: int) -> Targets:
-    """The list of a site with this number, unsigned."""
+    """Return the list of a site with this number, unsigned."""
     targets = Targets(version=number)
     for entry in admitted:
         about = {name: value for name, value in msgspec.structs.asdict(entry.about).items() if value not in (None, {})}
@@ -209,5 +209,5 @@ def _check(judge: Root | Targets, role: str, metadata: Metadata[Any]) -> None:
         judge.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
     except (UnsignedMetadataError, ValueError) as error:
         raise StateError(
-            f"{role}.json is not signed as robots demand ({error}); sign it with the right keys"
+            f"{role}.json is not signed as robots require ({error}); sign it with the right keys"
         ) from error

@@ -1,6 +1,6 @@
-"""When something is signed: after releases, at night, and every few hours, as far as the keys that this account can use go.
+"""Signing of lists: after releases, at night, and every few hours, with the keys available to this account.
 
-And what takes the root key: the first lists, other keys.
+Also the operations with the root key: the first lists, and replacement of keys.
 """
 
 import logging
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 
 def admitted_versions(rows: SiteReleases) -> tuple[AdmittedVersion, ...]:
-    """What robots of a site may run: also the version before, so that a rollback needs no key."""
+    """Return the versions of a site allowed on robots, including the previous one, so that a rollback needs no key."""
     states: dict[int, str] = {}
     if rows.rollback_target is not None:
         states[rows.rollback_target] = "previous"
@@ -40,11 +40,11 @@ def admitted_versions(rows: SiteReleases) -> tuple[AdmittedVersion, ...]:
 
 
 def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
-    """Signs what releases changed and what expires soon. Nothing where the store has no lists, or the key is elsewhere.
+    """Sign lists changed by releases or expiring soon. No effect if the store has no lists, or the key is elsewhere.
 
     all_anew: snapshot and timestamp too, after another key or root.
 
-    Raises StoreError where the disk refuses or a key cannot be read, StateError for lists that robots would refuse.
+    Raises StoreError on a disk error or an unreadable key, StateError for lists that robots would refuse.
     """
     lists = SignedLists(store.folder)
     if not lists.are_there:
@@ -58,7 +58,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
             try:
                 if number := _update_site(repository, store.releases(info.site)):
                     store.audit("list signed", f"site {info.site}, list {number}")
-            except FleetmapError as error:  # of one site: the others' robots, and the timestamp, must not wait for it
+            except FleetmapError as error:  # of one site: it must not block the other sites and the timestamp
                 faults.append(error)
         online = keys.signer("online")
         if online is not None and (all_anew or _online_is_due(lists, now)):
@@ -68,26 +68,26 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
 
 
 def try_update_lists(store: MapStore) -> None:
-    """As `update_lists`; what is in the way goes into the log, because a release stands in any case and the server tries again."""
+    """As `update_lists`; errors are logged, because a release is valid in any case and the server tries again."""
     try:
         update_lists(store)
     except FleetmapError as error:
-        _log.error("the lists of what robots may run are not signed: %s", error)
+        _log.error("the lists of allowed versions are not signed: %s", error)
 
 
 def prepare_lists(store: MapStore, endpoint: str) -> None:
-    """Before a server listens at `endpoint`: makes the lists where only this machine can ask for them, and signs what is due.
+    """Prepare the lists before a server listens at `endpoint`: create them for loopback only, and sign those due.
 
-    Raises UsageError where a store without lists would be served to other machines, and for lists that nothing here can go on with:
-    several keys, a token, or another account sign them.
+    Raises UsageError if a store without lists would be served to other machines, and for unsupported lists:
+    signed by several keys, a token, or another account.
     """
-    from fleetmap.bus import is_loopback  # late: zenoh comes with it, and builds need none
+    from fleetmap.bus import is_loopback  # imported late: it needs zenoh, builds do not
 
     lists, keys = SignedLists(store.folder), KeyFolder(store.folder / "keys")
     if not lists.are_there:
         if not is_loopback(endpoint):
             raise UsageError(
-                f"the maps of {store.folder} are not signed, and robots on other machines can ask at {endpoint}; sign them "
+                f"the maps of {store.folder} are not signed, and robots on other machines can connect to {endpoint}; sign them "
                 f"first: `mapserver trust init --here --store {store.folder}`"
             )
         init_here(store)
@@ -105,9 +105,9 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
 
 
 def init_here(store: MapStore) -> None:
-    """Signed lists with all keys on this machine, without passphrases: who takes the machine can publish.
+    """Create signed lists with all keys on this machine, without passphrases: an attacker on this machine can publish.
 
-    Errors as of `update_lists`; StateError where there are lists already.
+    Errors as of `update_lists`; StateError if there are lists already.
     """
     with _held(store) as repository:
         repository.init(repository.keys.signer("root") or repository.keys.make("root"))
@@ -115,7 +115,7 @@ def init_here(store: MapStore) -> None:
 
 
 def init_offline(store: MapStore, folder: Path) -> tuple[Path, str]:
-    """Signed lists whose root key lies in `folder`, encrypted; its file and passphrase. Errors as of `init_here`."""
+    """Create signed lists with an encrypted root key in `folder`; return its file and passphrase. Errors as of `init_here`."""
     with _held(store) as repository:
         repository.check_empty()
         key, made = _offline_key(folder, 1)
@@ -125,22 +125,22 @@ def init_offline(store: MapStore, folder: Path) -> tuple[Path, str]:
 
 
 def admit_site(store: MapStore, site: str, root_key: "Signer") -> None:
-    """Another key in the store's folder of keys signs the lists of a site from now on; StateError unless `root_key` is the root key."""
+    """Let another key in the store's folder of keys sign the lists of a site; StateError unless `root_key` is the root key."""
     with _changing(store, root_key, f"site {site}: another key signs its lists") as repository:
         repository.delegate(site, repository.keys.replace(site_role(site)).public_key, root_key)
 
 
 def rotate_online(store: MapStore, root_key: "Signer") -> None:
-    """Another online key, after a theft of the server or of the key; robots forget what the old one signed. Errors as of `admit_site`."""
+    """Replace the online key, after a theft of the server or of the key; robots discard its old lists. Errors as of `admit_site`."""
     with _changing(store, root_key, "another online key") as repository:
         repository.replace_online(root_key)
 
 
 def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
-    """Another key for a site and for the server in one step, after a theft of the site's key.
+    """Replace the keys of a site and of the server in one step, after a theft of the site's key.
 
-    The site's key alone would not do: robots refuse numbers below those that the thief signed until the online key is another one.
-    Errors as of `admit_site`, UsageError for a site that nothing was signed for.
+    Replacing the site's key is not enough: robots refuse numbers below those signed by the thief until the online key is replaced.
+    Errors as of `admit_site`, UsageError for a site without lists.
     """
     with _changing(store, root_key, f"site {site}: another key for it and for the server") as repository:
         if site_role(site) not in repository.lists.site_roles():
@@ -151,7 +151,7 @@ def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
 
 
 def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None) -> tuple[Path, str] | None:
-    """Root and targets for two and one more years; with a folder, signed by a new root key in it, whose file and passphrase are returned.
+    """Sign root and targets for two and one more years; with a folder, by a new root key in it, whose file and passphrase are returned.
 
     Errors as of `admit_site`.
     """
@@ -168,7 +168,7 @@ def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None)
 
 @contextmanager
 def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["ListRepository"]:
-    """The lists for one change, checked before it; afterwards `words` stand in the log, and the server signs what follows from it."""
+    """Yield the lists for one change, checked before it; afterwards `words` are logged, and the server signs resulting lists."""
     lists = SignedLists(store.folder)
     if not lists.are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
@@ -183,7 +183,7 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
 
 @contextmanager
 def _held(store: MapStore) -> Iterator["ListRepository"]:
-    """The lists, which nobody else begins or changes meanwhile: of two that make a key, one would replace that of the other."""
+    """Yield the lists under a lock: of two processes that create a key, one would overwrite the other's."""
     repository = _repository(store)
     with disk_errors(f"{repository.lists.folder} cannot be changed", "check its rights"):
         make_folder(repository.lists.folder)
@@ -192,7 +192,7 @@ def _held(store: MapStore) -> Iterator["ListRepository"]:
 
 
 def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":
-    """A root key with its file and passphrase. number: of the root in which it begins to count."""
+    """Return a root key with its file and passphrase. number: of the first root with this key."""
     path, passphrase = folder / f"root-{number}.pem", make_passphrase()
     return make_key(path, passphrase), (path, passphrase)
 
@@ -208,9 +208,9 @@ def _now(store: MapStore) -> datetime:
 
 
 def check_base(store: MapStore, info: VersionInfo) -> None:
-    """Raises StateError where the database names other bytes for a version, its archive too, than what was signed last.
+    """Raise StateError if the database has other bytes for a version, archive included, than the last signed list.
 
-    The next map is built on it: otherwise whoever writes into the database decides what is built.
+    The next map is built on it: otherwise an attacker with write access to the database could decide its content.
     """
     lists = SignedLists(store.folder)
     number = lists.newest(site_role(info.site)) if lists.are_there else 0
@@ -219,7 +219,7 @@ def check_base(store: MapStore, info: VersionInfo) -> None:
 
 
 def _check_unchanged(site: str, last: SiteList, entries: Sequence[AdmittedVersion]) -> None:
-    """A version is never another one afterwards; only its archive may be removed."""
+    """Raise unless versions are unchanged; only their archive may be removed."""
     known = {entry.about.version: entry for entry in last.admitted}
     for entry in entries:
         before = known.get(entry.about.version, entry)
@@ -228,7 +228,7 @@ def _check_unchanged(site: str, last: SiteList, entries: Sequence[AdmittedVersio
         if same != (entry.sha256, entry.length, entry.about.vocabulary) or len(archives) > 1:
             raise StateError(
                 f"the database names other bytes for version {entry.about.version} of site {site} than its signed list; "
-                "restore the database, or find out who wrote into it"
+                "restore the database, or find out what changed it"
             )
 
 
@@ -244,7 +244,7 @@ def _entry(info: VersionInfo, state: str, files: Mapping[str, str] = MappingProx
 
 
 def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) -> bool:
-    """Whether anything is to be signed that can be signed here; asked every second."""
+    """True if a list that can be signed here is due; called every second."""
     if keys.has("online") and _online_is_due(lists, now):
         return True
     known = lists.site_roles()
@@ -264,7 +264,7 @@ def _online_is_due(lists: SignedLists, now: datetime) -> bool:
     present = {"targets.json": lists.newest("targets")}
     for name, role in lists.site_roles().items():
         if newest := lists.newest(name):
-            # One that waits for another key is named as before, or not at all.
+            # A list that waits for another key keeps its previous entry, or has none.
             number_now = newest if lists.is_signed(role) else named.get(f"{name}.json", 0)
             present |= {f"{name}.json": number_now} if number_now else {}
     return (
@@ -287,7 +287,7 @@ def _site_is_due(lists: SignedLists, rows: SiteReleases, now: datetime) -> bool:
 
 
 def _update_site(repository: "ListRepository", rows: SiteReleases) -> int | None:
-    """The number of the list that was signed, None where none was due or the key is elsewhere."""
+    """Return the number of the signed list, None if none was due or the key is elsewhere."""
     lists, keys, role = repository.lists, repository.keys, site_role(rows.site)
     if not _site_is_due(lists, rows, repository.now):
         return None

@@ -1,4 +1,4 @@
-"""State of the signed lists: who holds what, how long it lasts, and which keys lie where a thief of the server finds them."""
+"""State of the signed lists: keys, expiry, and keys exposed to a thief of the server."""
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -11,7 +11,7 @@ from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import TIMESTAMP, SignedLists
 
-# Days before its end at which a role is to be signed again: by a person with the root key; by the server.
+# Days before expiry at which a role is to be signed again: by an operator with the root key; by the server.
 _ENDS_SOON = {"root": 60, "targets": 30, "snapshot": 1, TIMESTAMP: 0.25}
 _SITE_ENDS_SOON = 7
 _CERTIFICATE_ENDS_SOON = 30
@@ -19,7 +19,7 @@ _CERTIFICATE_ENDS_SOON = 30
 
 @dataclass(frozen=True)
 class RoleStatus:
-    """One role. number: of its newest file, 0 where there is none."""
+    """One role. number: of its newest file, 0 if absent."""
 
     role: str
     number: int
@@ -30,7 +30,7 @@ class RoleStatus:
 
 @dataclass
 class TrustStatus:
-    """All roles. faults: what stops robots from new maps, now or soon; risks: what a thief of this machine could do."""
+    """All roles. faults: reasons why robots cannot get new maps, now or soon; risks: actions possible for a thief of this machine."""
 
     roles: list[RoleStatus] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -38,7 +38,7 @@ class TrustStatus:
 
 
 def trust_status(store: MapStore) -> TrustStatus:
-    """What stands in the store's lists; StateError where it has none, StoreError where they cannot be read."""
+    """Return the state of the store's lists; StateError if absent, StoreError if unreadable."""
     lists, found = SignedLists(store.folder), TrustStatus()
     if not lists.are_there:
         raise StateError(
@@ -63,9 +63,9 @@ def trust_status(store: MapStore) -> TrustStatus:
                 f"`mapserver trust admit {info.site}`"
             )
         if own.has(role):
-            found.risks.append(f"{own.path(role)}: who takes this machine can publish maps of {info.site}")
+            found.risks.append(f"{own.path(role)}: a thief of this machine can publish maps of {info.site}")
     if own.has("root"):
-        found.risks.append(f"{own.path('root')}: who takes this machine can do everything, and nobody can take it back")
+        found.risks.append(f"{own.path('root')}: a thief of this machine can do everything, irrevocably")
     _look_at_certificates(RobotRegister(store).authorities, found)
     return found
 
@@ -76,9 +76,9 @@ def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
     for file, left in authorities.days_left().items():
         if left < _CERTIFICATE_ENDS_SOON:
             step = "`mapserver trust rotate server`" if file == "server.pem" else "make it again"
-            found.faults.append(f"{file}: {left:.1f} days are left, then no robot connects; {step}")
+            found.faults.append(f"{file}: expires in {left:.1f} days, then robots cannot connect; {step}")
     if (authorities.folder / "servers-ca.pem").is_file():
-        found.risks.append(f"{authorities.folder}/servers-ca.pem: who takes this machine can play the server")
+        found.risks.append(f"{authorities.folder}/servers-ca.pem: a thief of this machine can act as the server")
 
 
 def _role(lists: SignedLists, role: str, now: datetime) -> RoleStatus:
@@ -91,5 +91,5 @@ def _role(lists: SignedLists, role: str, now: datetime) -> RoleStatus:
     days_left = (expires - now).total_seconds() / 86_400
     fault = ""
     if days_left < _ENDS_SOON.get(role, _SITE_ENDS_SOON):
-        fault = "expired: robots take no new map" if days_left <= 0 else f"ends in {days_left:.1f} days: sign it again"
+        fault = "expired: robots refuse new maps" if days_left <= 0 else f"ends in {days_left:.1f} days: sign it again"
     return RoleStatus(role, number, expires.isoformat(), round(days_left, 2), fault)

@@ -74,7 +74,7 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
     assert {path.name for path in folder.iterdir()} == {"identity.json", "robot.pem", "root.json", "servers.ca"}
     with pytest.raises(StateError, match="holds the identity of r1 at lab"):
         RobotIdentity.enrol(folder, bundle)
-    with pytest.raises(LinkError, match="was the bundle used before"):
+    with pytest.raises(LinkError, match="the bundle was already used"):
         RobotIdentity.enrol(tmp_path / "thief", bundle)
     assert RobotIdentity.load(tmp_path / "thief") is None
     before = identity.certificate()

@@ -75,7 +75,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
         with site.serving("tls/127.0.0.1:0"):
             one, two = site.enrol("r1"), site.enrol("r2")
             bundle, elsewhere = site.folder / "r1.fleetmap", site.folder / "thief"
-            assert "was the bundle used before" in site.run("locclient", "enrol", bundle, "--identity", elsewhere)
+            assert "the bundle was already used" in site.run("locclient", "enrol", bundle, "--identity", elsewhere)
             listed = site.run("mapserver", "robots", "list", "--store", site.store)
             assert listed.count("certificate for 365 days") == 2
             # Row 1: a robot that answers in the server's place.

@@ -231,7 +231,7 @@ def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         assert "version 2 stays active: freeze: " in note
         result = CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)])
         assert result.exit_code == 1
-        assert "root: expired: robots take no new map" in result.output
+        assert "root: expired: robots refuse new maps" in result.output
         drill.run("rotate", "root", *drill.key)
         assert robot.ready() == (3, "")
         assert CliRunner().invoke(cli.app, ["trust", "status", "--store", str(drill.store)]).exit_code == 0

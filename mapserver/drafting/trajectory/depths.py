@@ -1,4 +1,4 @@
-"""Depths that DROID-SLAM keeps beside its poses, as depth images of a single camera's recording."""
+"""Depths stored by DROID-SLAM beside its poses, as depth images of a single camera's recording."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fleetmap.recordings.recording import FrameSource
 
 _MOST_SIDE = 8192
-_EDGE_RATIO = 1.25  # between neighbouring depths: what lies between them is neither surface
+_EDGE_RATIO = 1.25  # between neighbouring depths: depths between them belong to neither surface
 _ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay well below
 _NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
 
@@ -32,10 +32,10 @@ _NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes 
 def with_depths(
     recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory | None
 ) -> tuple[Recording, NDArray[np.int64]]:
-    """A single camera's recording as one with depth, and those of the selected frames that have one: by `disps.npy` beside DROID's poses.
+    """Return a single camera's recording with depth from `disps.npy` beside DROID's poses, and the selected frames that have a depth.
 
-    The same recording and selection where there is no such file or the recording needs none. The scale must be said, as one camera does
-    not show it: UsageError. RecordingError for a file that is not of these poses and this camera.
+    Unchanged if there is no such file or the recording needs none. UsageError without a scale, which one camera cannot
+    observe. RecordingError for a file that does not match these poses and this camera.
     """
     if other is None or recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
         return recording, indices
@@ -44,14 +44,14 @@ def with_depths(
         return recording, indices
     if other.scale is None:
         raise UsageError(
-            f"{file} holds depths of one camera, which does not show their unit; say the metres in it with --trajectory-scale"
+            f"{file} holds depths of one camera, which cannot show their unit; set its metres with --trajectory-scale"
         )
     written, camera = read_poses(other.file), recording.calibration.cameras[0]
     _check(file, len(written.map_from_it), camera)
     frame_of_row = _frames_at(stamps_on_clock(written, recording, indices, other), recording.frame_stamps_ns)
     if (frame_of_row >= 0).mean() <= 0.5:
         raise RecordingError(
-            f"{other.file} belongs to another recording: most of its stamps are at no frame; pass the recording's own"
+            f"{other.file} belongs to another recording: most of its stamps match no frame; pass the recording's own"
         )
     row_of_frame = np.full(len(recording), -1)
     row_of_frame[frame_of_row[frame_of_row >= 0]] = np.flatnonzero(frame_of_row >= 0)
@@ -72,7 +72,7 @@ def with_depths(
 
 
 def _check(file: Path, count: int, camera: CameraCalibration) -> None:
-    """RecordingError unless the file holds one image of inverse depths per pose, each of the camera's shape."""
+    """Raise RecordingError unless the file holds one image of inverse depths per pose, each of the camera's shape."""
     inverse = array_in(file)
     if (
         inverse.ndim != 3
@@ -88,12 +88,12 @@ def _check(file: Path, count: int, camera: CameraCalibration) -> None:
     for number, image in enumerate(inverse):
         if not (np.isfinite(image).all() and (image >= 0).all()):
             raise RecordingError(
-                f"{file}: image {number + 1} has values that are no inverse depths: they must be finite and not negative"
+                f"{file}: image {number + 1} has invalid inverse depths: they must be finite and not negative"
             )
 
 
 def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
-    """(N,) the frame at each moment, -1 for none."""
+    """Return (N,) the frame at each stamp, -1 if absent."""
     after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
     before = np.maximum(after - 1, 0)
     off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
@@ -101,9 +101,9 @@ def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
 
 
 def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> Array:
-    """(4,) fx, fy, cx, cy of depth images (height, width): by `intrinsics.npy`, else of the whole picture resized.
+    """Return (4,) fx, fy, cx, cy of depth images (height, width): by `intrinsics.npy`, else of the whole picture resized.
 
-    DROID writes them for the network's cells, and the depths there or at eight times that; what fits the centre is taken.
+    DROID writes them for the network's cells, and depths at that size or eight times it; the scale is chosen by the centre.
     """
     written, (height, width) = file.with_name("intrinsics.npy"), shape
     if written.exists():
@@ -127,7 +127,7 @@ def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> A
 
 @dataclass(frozen=True)
 class DispImages:
-    """The images in `disps.npy`, one for each pose: rows (F,) of the recording's frames, -1 for none; scale: metres in its unit."""
+    """The images in `disps.npy`, one per pose: rows (F,) of the recording's frames, -1 if absent; scale: metres in its unit."""
 
     file: Path
     rows: NDArray[np.int64]
@@ -146,7 +146,7 @@ class DispImages:
         return _pinhole(self.file, self.camera, self.shape)
 
     def inverse(self, frame: int) -> NDArray[np.float32] | None:
-        """(h, w) that of a frame by its number in the recording, 0 where unknown; None for a frame without."""
+        """Return (h, w) for a frame by its number in the recording, 0 if unknown; None for a frame without."""
         row = int(self.rows[frame])
         return None if row < 0 else np.array(self._images[row], np.float32)
 
@@ -157,7 +157,7 @@ class DispImages:
 
 @dataclass(frozen=True)
 class _DepthFrames:
-    """Frames of `source`, whose numbers in `images` are numbers (F,), each with its depth image. What was recorded is hashed alone."""
+    """Frames of `source` with depth images; numbers (F,): their numbers in `images`. Hashes cover only the recorded data."""
 
     source: "FrameSource"
     images: DispImages
@@ -182,7 +182,7 @@ class _DepthFrames:
         self.source.close()
 
     def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Metres at recorded pixels: inverse depth is linear on planes, and so between neighbours that are of one surface."""
+        """Return metres at recorded pixels: inverse depth is linear on planes, so it is interpolated between neighbours of one surface."""
         x, y = self._places
         (height, width), ones = inverse.shape, np.ones((2, 2), np.uint8)
         high, low = (each(inverse, ones, anchor=(0, 0)) for each in (cv2.dilate, cv2.erode))
@@ -201,7 +201,7 @@ class _DepthFrames:
 
 
 def _places(camera: CameraCalibration, pinhole: Array) -> Array:
-    """(2, H, W) for each recorded pixel its place x, y in images of a camera without distortion; -9 for none."""
+    """Return (2, H, W) for each recorded pixel its position x, y in images of a camera without distortion; -9 if outside."""
     size = camera.height_px, camera.width_px
     v, u = np.indices(size, np.float64)
     rays = camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))

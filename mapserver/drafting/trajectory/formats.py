@@ -1,6 +1,6 @@
-"""Poses of another SLAM system as its files have them: TUM and KITTI text, and DROID-SLAM's arrays.
+"""Poses in files of other SLAM systems: TUM and KITTI text, and DROID-SLAM's arrays.
 
-Files are hostile: their size is looked at before they are read, and nothing that is pickled is unpacked.
+Files are untrusted: their size is checked before they are read, and nothing is unpickled.
 """
 
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ _EXPECTED = "TUM or KITTI text, or DROID's poses.npy, is expected"
 
 @dataclass(frozen=True, slots=True)
 class WrittenPoses:
-    """N poses of a file of a kind, TUM, KITTI or DROID.
+    """N poses of a file; kind: TUM, KITTI or DROID.
 
-    stamps_ns (N,): 10^9 times what is written, seconds or numbers of frames; None where each frame has one row.
-    map_from_it (N, 4, 4), where the camera or body is, in the file's unit of length.
+    stamps_ns (N,): 10^9 times the written number, seconds or frame numbers; None if each frame has one row.
+    map_from_it (N, 4, 4): poses of the camera or body, in the file's unit of length.
     """
 
     kind: str
@@ -36,7 +36,7 @@ class WrittenPoses:
 
 
 def read_poses(path: Path) -> WrittenPoses:
-    """The poses in a file, of the kind that its content shows; RecordingError for anything else."""
+    """Read the poses of a file, detecting its format from the content; RecordingError for unknown formats."""
     if path.is_dir() or path.suffix == ".npy":
         written = _droid(path / "poses.npy" if path.is_dir() else path)
     else:
@@ -57,17 +57,17 @@ def read_poses(path: Path) -> WrittenPoses:
 
 
 def _matrices(path: Path, rows: list[list[str]]) -> Array:
-    """(N, 4, 4) of rows of twelve numbers, the upper rows of matrices."""
+    """Return (N, 4, 4) from rows of twelve numbers, the upper rows of matrices."""
     try:
         upper = np.array([[float(field) for field in fields] for fields in rows]).reshape(-1, 3, 4)
     except ValueError as error:
-        raise RecordingError(f"{path} is no trajectory in KITTI's form: each line is to have twelve numbers") from error
+        raise RecordingError(f"{path} is an invalid KITTI trajectory: each line must have twelve numbers") from error
     turns = np.where(np.isfinite(upper), upper, 0.0)[:, :, :3]
     off = np.abs(turns @ np.swapaxes(turns, 1, 2) - np.eye(3)).max(axis=(1, 2))
     good = (off < 2 * _UNIT_WITHIN) & (np.linalg.det(turns) > 0)
     if not good.all():
         row = int(np.argmin(good))
-        raise RecordingError(f"{path}: pose {row + 1} has no rotation: {upper[row].tolist()}; leave it out")
+        raise RecordingError(f"{path}: pose {row + 1} has an invalid rotation: {upper[row].tolist()}; leave it out")
     u, _, vt = np.linalg.svd(turns)
     map_from_it = np.tile(np.eye(4), (len(upper), 1, 1))
     map_from_it[:, :3, :3], map_from_it[:, :3, 3] = u @ vt, upper[:, :, 3]
@@ -75,7 +75,7 @@ def _matrices(path: Path, rows: list[list[str]]) -> Array:
 
 
 def _droid(path: Path) -> WrittenPoses:
-    """`poses.npy` (N, 7), cam_from_map as position and quaternion x y z w, and `tstamps.npy` beside it where there is one."""
+    """Read `poses.npy` (N, 7), cam_from_map as position and quaternion x y z w, and `tstamps.npy` beside it if present."""
     mapped, file, stamps_ns = array_in(path), path.with_name("tstamps.npy"), None
     if mapped.shape[1:] != (7,) or len(mapped) > _MOST_ROWS:
         raise RecordingError(f"{path} is of shape {mapped.shape}; (N, 7), position and quaternion x y z w, is expected")
@@ -98,20 +98,20 @@ def _droid(path: Path) -> WrittenPoses:
 
 
 def array_in(path: Path) -> AnyArray:
-    """The numbers in a .npy file, mapped; RecordingError for anything else, of which nothing is unpacked."""
+    """Return the numbers in a .npy file, memory-mapped; RecordingError for anything else; pickles are never loaded."""
     try:
         found = np.load(sized(path, 4 << 30), mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, OverflowError, SyntaxError, TokenError, TypeError, MemoryError) as error:
-        raise RecordingError(f"{path} is no .npy file of numbers; save it again with numpy.save") from error
+        raise RecordingError(f"{path} is not a .npy file of numbers; save it again with numpy.save") from error
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu" or found.ndim == 0:
-        raise RecordingError(f"{path} is no .npy file of numbers")
+        raise RecordingError(f"{path} is not a .npy file of numbers")
     if found.ndim < 3 and found.size > 16 * _MOST_ROWS:
         raise RecordingError(f"{path} holds {found.size} numbers, too many for a trajectory")
     return found
 
 
 def sized(path: Path, most_bytes: int = _MOST_BYTES) -> Path:
-    """The path of a file of at most so many bytes; RecordingError for anything else."""
+    """Return the path of a file of at most `most_bytes`; RecordingError for anything else."""
     try:
         size = path.stat().st_size
     except OSError as error:

@@ -1,7 +1,7 @@
-"""The initial trajectory that a file of poses gives: read as it is said to be, compared with the recording, in metres, at every frame.
+"""The initial trajectory from a file of poses: read in its stated convention, compared with the recording, scaled, for every frame.
 
-Poses that are right move as the recording does. Those of another convention turn about other axes or backwards, go another way, or are
-unrelated; their errors are then as large as the motion itself. Truth plays no part.
+Correct poses move as the recording does. Poses of another convention rotate about other axes or backwards, move in another
+direction, or are unrelated; their errors are then as large as the motion itself. Ground truth is not used.
 """
 
 from dataclasses import dataclass
@@ -31,18 +31,16 @@ from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
 
 FRAMES = ("camera", "body")
-GAP_NS = 200_000_000  # between poses that are interpolated
-NEAR_NS = 2_000_000  # a pose so close to a frame is that frame's
+GAP_NS = 200_000_000  # largest gap of interpolated poses
+NEAR_NS = 2_000_000  # a pose this close to a frame belongs to it
 _STRETCH_RAD, _STRETCH_M, _STRETCH_NS = 0.15, 0.3, 1_000_000_000
-_LEAST_RAD, _LEAST_M = 0.05, 0.1  # of a motion, below which errors count as if it were so large
+_LEAST_RAD, _LEAST_M = 0.05, 0.1  # lower bounds of a motion in relative errors
 LEAST_STRETCHES = 6
 _STANDARD_ERRORS = 4.0
-_OWN_SCALE_WITHIN = (
-    0.01  # what stereo and depth show of scale: a tenth of a pixel in ten of disparity, which no averaging takes away
-)
+_OWN_SCALE_WITHIN = 0.01  # systematic error of scale by stereo and depth: 0.1 px in 10 px of disparity
 _OUTLIER_MEDIANS = 4.0  # of the distances between translations: 3 standard deviations and more
-FITS_WITHIN = 0.5  # of the motion: a guess that is further off is worse than none for the larger half
-SCALE_WITHIN = 0.05 * _STANDARD_ERRORS  # by what the survey assumes of a given trajectory's drift
+FITS_WITHIN = 0.5  # of the motion: a trajectory further off is worse than none for most motions
+SCALE_WITHIN = 0.05 * _STANDARD_ERRORS  # from the drift that the survey assumes for a given trajectory
 _WINDOWS, _WINDOW_FRAMES = 5, 60
 _LEAST_SPAN = 0.5  # of the frames' time
 _MARGIN_NS = 1_000_000_000
@@ -52,7 +50,7 @@ _MARGIN_NS = 1_000_000_000
 class OtherTrajectory:
     """A file of another system's poses: TUM or KITTI text, DROID-SLAM's `poses.npy` or its folder.
 
-    frame: camera (the left one) or body. scale: metres in its unit of length, None where the recording shows it.
+    frame: camera (the left one) or body. scale: metres in its unit of length, None if the recording shows it.
     """
 
     file: Path
@@ -60,16 +58,18 @@ class OtherTrajectory:
     scale: float | None = None
 
     def __post_init__(self) -> None:
-        """UsageError for words that mean nothing."""
+        """Raise UsageError for an unknown frame or an invalid scale."""
         if self.frame not in FRAMES:
-            raise UsageError(f"--trajectory-frame {self.frame}: it is one of {', '.join(FRAMES)}")
+            raise UsageError(f"--trajectory-frame {self.frame}: unknown frame; use one of {', '.join(FRAMES)}")
         if self.scale is not None and not 0 < self.scale < np.inf:
-            raise UsageError(f"--trajectory-scale {self.scale}: it is the metres in the file's unit of length, above 0")
+            raise UsageError(
+                f"--trajectory-scale {self.scale}: invalid; give the metres in the file's unit of length, above 0"
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class PoseReading:
-    """A convention of poses: whose they are, and what of the file is to be turned round to read it so."""
+    """A convention of poses: their frame, and the inversions needed to read the file that way."""
 
     frame: str
     is_inverted: bool = False
@@ -80,7 +80,7 @@ class PoseReading:
         return f"poses of the {self.frame}{inverted}{', quaternions w x y z' if self.is_w_first else ''}"
 
     def instead(self, said: str) -> str:
-        """What makes the file readable where this convention fits and `said` is the frame that was named."""
+        """Return the steps that make the file readable if this convention fits and `said` is the named frame."""
         steps = [f"say --trajectory-frame {self.frame}"] if self.frame != said else []
         steps += ["write map_from_pose, the inverse of each pose"] if self.is_inverted else []
         steps += ["write quaternions as x y z w"] if self.is_w_first else []
@@ -89,8 +89,8 @@ class PoseReading:
 
 @dataclass(frozen=True)
 class Followed:
-    """Motion that the recording shows: stamps_ns (F,), frame_from_body (F, 4, 4), and the number of the piece (F,) in which a frame is
-    tied to others, -1 for none.
+    """Motion of the recording: stamps_ns (F,), frame_from_body (F, 4, 4), and the number of the connected piece (F,) of each frame,
+    -1 if lost.
     """
 
     stamps_ns: Stamps
@@ -100,7 +100,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class Shown:
-    """What readings are compared with: the motion, its stretches (P, 2), and where the camera is mounted."""
+    """Reference for readings: the motion, its stretches (P, 2), and the mount of the camera."""
 
     followed: Followed
     pairs: NDArray[np.int64]
@@ -113,8 +113,8 @@ class Shown:
 
 @dataclass(frozen=True)
 class Judged:
-    """A reading against the recording: metres in the file's unit of length and how far their logarithm may be off, errors (P,) of stretches
-    as shares of the motion, medians of those of rotations and ways (None where fewer than LEAST_STRETCHES tell).
+    """A reading against the recording: metres in the file's unit of length and sigma of their logarithm, relative errors (P,) of
+    stretches, medians of those of rotations and translations (None with fewer than LEAST_STRETCHES informative ones).
     """
 
     reading: PoseReading
@@ -126,33 +126,33 @@ class Judged:
 
     @property
     def fits(self) -> bool:
-        """Whether the recording shows nothing else."""
+        """True if the recording does not contradict it."""
         return all(error is None or error <= FITS_WITHIN for error in (self.turn_error, self.way_error))
 
     @property
     def figures(self) -> str:
-        """The errors in words."""
+        """The errors as text."""
         told = ((self.turn_error, "the turn"), (self.way_error, "the way"))
         return " and ".join(f"{100 * error:.0f} % of {what}" for error, what in told if error is not None) or "nothing"
 
     @property
     def in_metres(self) -> float:
-        """The scale, 1 where it cannot be told from that: the file is then in metres, which are better than what the comparison gives."""
+        """The scale, 1 if indistinguishable from it: then the file is in metres, which are more accurate than the fit."""
         return 1.0 if abs(np.log(self.scale)) <= self.scale_within else self.scale
 
     @property
     def is_told(self) -> bool:
-        """Whether the recording moves enough to tell."""
+        """True if the recording has enough motion to judge."""
         return self.turn_error is not None or self.way_error is not None
 
 
 def readings(is_camera_body: bool) -> list[PoseReading]:
-    """All conventions; a camera that is the body has one frame."""
+    """Return all conventions; a camera that is the body has one frame."""
     return [PoseReading(*each) for each in product(FRAMES[is_camera_body:], (False, True), (False, True))]
 
 
 def covered(stamps: Stamps, at_ns: Stamps) -> NDArray[np.bool_]:
-    """Which of the moments (F,) have a pose there, or one on either side that is not far: those at which `pose_at` finds one."""
+    """Return which stamps (F,) have a pose, or near ones on either side: those at which `pose_at` finds one."""
     ordered = np.sort(stamps)
     after = np.searchsorted(ordered, at_ns)
     before_ns, after_ns = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
@@ -161,7 +161,7 @@ def covered(stamps: Stamps, at_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def pose_at(as_read: Trajectory, stamp_ns: int) -> Array:
-    """(4, 4) interpolated, or that of the nearest stamp: stamps may be rounded."""
+    """Return (4, 4) interpolated, or that of the nearest stamp: stamps may be rounded."""
     found = as_read.at(stamp_ns, GAP_NS)
     return np.asarray(
         as_read.frame_from_body[np.argmin(np.abs(as_read.stamps_ns - stamp_ns))] if found is None else found
@@ -169,7 +169,7 @@ def pose_at(as_read: Trajectory, stamp_ns: int) -> Array:
 
 
 def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
-    """Poses that were read as map_from_pose with quaternions x y z w, by another convention."""
+    """Convert poses read as map_from_pose with quaternions x y z w to another convention."""
     matrices = trajectory.frame_from_body
     if reading.is_w_first:
         xyzw = [quat_wxyz_from_rotation(each[:3, :3])[[1, 2, 3, 0]] for each in matrices]
@@ -180,7 +180,7 @@ def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
 
 
 def stretches(followed: Followed, known: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(P, 2) numbers of frames with poses, one after the other: each pair turned, moved or waited long enough to tell something."""
+    """Return (P, 2) consecutive numbers of frames with poses: between each pair there was enough rotation, translation or time."""
     found: list[tuple[int, int]] = []
     for piece in np.unique(followed.piece[followed.piece >= 0]):
         numbers = np.flatnonzero(known & (followed.piece == piece))
@@ -197,7 +197,7 @@ def stretches(followed: Followed, known: NDArray[np.bool_]) -> NDArray[np.int64]
 
 
 def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float | None) -> Judged:
-    """The reading, by which the file says `as_read`, over stretches; scale: metres in the unit of length where they are known."""
+    """Judge the reading with poses `as_read`, over stretches; scale: metres in the unit of length if known."""
     followed, pairs = shown.followed, shown.pairs
     ends = np.array([pose_at(as_read, int(followed.stamps_ns[k])) for k in pairs.ravel()]).reshape(-1, 2, 4, 4)
     moved = se3_inverse(ends[:, 0]) @ ends[:, 1]
@@ -219,7 +219,7 @@ def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float 
 
 
 def undecided(best: Judged, others: list[Judged]) -> list[Judged]:
-    """Those that the stretches do not tell from the best one: their errors are larger by less than the noise of that difference."""
+    """Return those indistinguishable from the best one: their errors exceed its errors by less than the noise of the difference."""
     found = []
     for other in others:
         worse = other.errors - best.errors
@@ -230,11 +230,11 @@ def undecided(best: Judged, others: list[Judged]) -> list[Judged]:
 
 
 def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
-    """Metres in the unit of translations moved (P, 3), given those in metres, seen (P, 3), and how far its logarithm may be off.
+    """Return metres in the unit of translations moved (P, 3), given those in metres, seen (P, 3), and sigma of its logarithm.
 
-    Both are noisy. A regression of either on the other is low by the share of noise in what it divides by, so that the truth lies between
-    the two; taken is their geometric mean, the ratio of root mean squares. It may be off by half of what the regressions differ by, four
-    standard errors and what our own metres may be; infinite where too few stretches move. Those that slipped on either side are left out.
+    Both are noisy. A regression of either on the other is biased low by the share of noise in its divisor, so the truth lies between;
+    the result is their geometric mean, the ratio of root mean squares. Its sigma is half of their difference, four standard
+    errors and the error of the reference scale; infinite with too few moving stretches. Outliers on either side are left out.
     Source: Horn 1987, section 2.E (symmetric scale).
     """
     moving = (np.linalg.norm(seen, axis=1) >= _LEAST_M) & (np.linalg.norm(moved, axis=1) > 0)
@@ -253,25 +253,25 @@ def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
 
 
 def _angles(rotations: Array) -> Array:
-    """Angles of rotations (..., 3, 3)."""
+    """Return angles of rotations (..., 3, 3)."""
     chord = np.linalg.norm(rotations - np.eye(3), axis=(-2, -1)) / np.sqrt(8.0)
     return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 @dataclass(frozen=True, slots=True)
 class GivenPoses:
-    """frame_from_body of every selected frame, in metres, and what was found out about the file, in words."""
+    """frame_from_body of every selected frame, in metres, and text on the findings about the file."""
 
     trajectory: Trajectory
     words: str
 
 
 def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> GivenPoses:
-    """The poses of the selected frames (F,).
+    """Return the poses of the selected frames (F,).
 
-    Frames without poses get them from our own odometry between those that have. UsageError for a single camera, where the scale stays
-    open, and where too few frames have poses; RecordingError for a file that cannot be read, is of another convention (with the one that
-    fits) or of another recording.
+    Frames without poses get them from fleetmap's odometry between those with poses. UsageError for a single camera with unknown
+    scale, and if too few frames have poses; RecordingError for a file that cannot be read, is of another convention (naming the one
+    that fits) or of another recording.
     """
     if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
         raise UsageError(
@@ -304,12 +304,12 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
 def stamps_on_clock(
     rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
 ) -> Stamps:
-    """(N,) nanoseconds on the recording's clock, of stamps in seconds of that clock or since the first frame, or numbers of frames.
+    """Return (N,) nanoseconds on the recording's clock, of stamps in seconds of that clock or since the first frame, or frame numbers.
 
-    Rows without stamps belong to all frames, or to the selected ones: UsageError where they are as many as neither. RecordingError for
+    Rows without stamps belong to all frames, or to the selected ones: UsageError if their number matches neither. RecordingError for
     stamps of another clock.
     """
-    # The other system has read, and counted, the frames too that are damaged: of the selected ones those between them, and perhaps
+    # The other system has also read and counted damaged frames: among the selected ones those between them, and perhaps
     # those next to them
     frames, damaged = recording.frame_stamps_ns, recording.damaged_ns
     clock, chosen = np.union1d(frames, damaged), frames[indices]
@@ -326,7 +326,7 @@ def stamps_on_clock(
                 return counted
         raise UsageError(
             f"{other.file} has {count} poses without stamps, {recording.name} has {len(clock)} frames, of which {len(chosen)} are "
-            "selected; select those that the poses belong to with --frames, or pass a file with stamps"
+            "selected; select the frames of the poses with --frames, or pass a file with stamps"
         )
     first, last, middle = int(clock[0]), int(clock[-1]), int(np.median(rows.stamps_ns))
     if first - _MARGIN_NS <= middle <= last + _MARGIN_NS:
@@ -346,13 +346,13 @@ def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: OtherTrajec
         for some in (stamps_ns, clock)
     )
     return RecordingError(
-        f"{other.file} belongs to another recording: of its {len(rows.map_from_it)} poses, at {written}, hardly any is at frames, "
+        f"{other.file} belongs to another recording: of its {len(rows.map_from_it)} poses, at {written}, almost none match frames, "
         f"{frames} s; pass the recording's own, with stamps in seconds on the cameras' clock or since the first frame, or numbers of frames"
     )
 
 
 def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> Followed:
-    """Our own odometry over all frames, or over some windows of them."""
+    """Return fleetmap's odometry over all frames, or over some windows of them."""
     count = len(indices)
     spans = [(0, count)]
     if not whole:
@@ -370,7 +370,7 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
             frame = rectifier.rectify(recording.read_frame(int(indices[number])))
             estimate = run.handle(frame, *feed.until(frame.stamp_ns)).estimate
             is_lost = estimate.status is OdometryStatus.DEGRADED and not estimate.inertial
-            pieces += is_lost or number == first  # without an IMU nothing ties what comes to what was
+            pieces += is_lost or number == first  # without an IMU the next frames are not connected to the earlier ones
             piece[number] = pieces
         frame_from_body[first:end] = run.chain.odom_from_body()
     return Followed(recording.frame_stamps_ns[indices], frame_from_body, piece)
@@ -379,9 +379,9 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
 def _judged(
     trajectory: Trajectory, name: str, shown: Shown, recording: Recording, other: OtherTrajectory
 ) -> tuple[Judged, str]:
-    """The poses as they are named, and how well they fit in words.
+    """Return the poses in the named convention, and text on how well they fit.
 
-    RecordingError where another convention fits better, with what to do, or none fits; UsageError where the scale stays open.
+    RecordingError if another convention fits better, with what to do, or none fits; UsageError if the scale is unknown.
     """
     is_camera_body = bool(np.abs(shown.body_from_cam - np.eye(4)).max() < 1e-3)
     every = [judge(read_as(trajectory, each), each, shown, other.scale) for each in readings(is_camera_body)]
@@ -401,16 +401,16 @@ def _judged(
         )
     if found.scale_within > SCALE_WITHIN:
         raise UsageError(
-            f"{recording.name} does not show the unit of {other.file}; say its metres with --trajectory-scale METRES"
+            f"{recording.name} does not show the unit of {other.file}; set its metres with --trajectory-scale METRES"
         )
     words = f"trajectory {name}: {said}, scale {found.in_metres:.4g}"
     if not found.is_told:
-        return found, f"{words}, as said; the recording moves too little to judge it"
+        return found, f"{words}, as stated; the recording moves too little to judge it"
     return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
 
 
 def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:
-    """UsageError where the frames (F,) that have poses span less than half of the time of all."""
+    """Raise UsageError if the frames (F,) with poses span less than half of the time of all."""
     times = stamps_ns[is_placed]
     if len(times) < 2 or np.ptp(times) < _LEAST_SPAN * np.ptp(stamps_ns):
         missing = [format_stamp(int(stamp)) for stamp in stamps_ns[~is_placed]]
@@ -421,7 +421,7 @@ def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recor
 
 
 def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: Followed, other: OtherTrajectory) -> Array:
-    """The poses (F, 4, 4) with the missing ones carried on by our odometry from the last one, so that they arrive at the next one."""
+    """Return the poses (F, 4, 4); missing ones follow odometry from the previous pose, adjusted to arrive at the next one."""
     out, own, seconds = at_frames.copy(), followed.frame_from_body, followed.stamps_ns * 1e-9
     numbers = np.flatnonzero(is_placed)
     for number in np.flatnonzero(~is_placed):

@@ -1,1 +1,1 @@
-"""Who may do what, as rows, and the chain that makes changes to the log visible."""
+"""Rights as rows, and the hash chain that reveals changes to the log."""

@@ -10,7 +10,7 @@ COLUMNS = "id, stamp_ns, site, kind, detail, version, actor, reason, operator, a
 
 @dataclass(frozen=True, slots=True)
 class AuditLine:
-    """One line of the log. operator: the name that was proved, empty where nothing was; address: where a request came from."""
+    """One line of the log. operator: the authenticated name, empty if none; address: of the request."""
 
     id: int
     stamp_ns: int
@@ -26,12 +26,12 @@ class AuditLine:
 
 
 def line_sha256(before: str, values: Sequence[object]) -> str:
-    """The hash of a line with these columns, all but the hash, behind one of hash `before` (empty for the first)."""
+    """Return the hash of a line with these columns, all but the hash, after a line of hash `before` (empty for the first)."""
     return hashlib.sha256(json.dumps([before, *values], separators=(",", ":")).encode()).hexdigest()
 
 
 def chain_head(lines: Iterable[AuditLine]) -> str:
-    """What the line behind these, oldest first, is chained to."""
+    """Return the hash to which the line after these, oldest first, is chained."""
     before = ""
     for line in lines:
         before = line.sha256 or line_sha256(before, astuple(line)[:-1])
@@ -39,7 +39,7 @@ def chain_head(lines: Iterable[AuditLine]) -> str:
 
 
 def chain_faults(lines: Iterable[AuditLine]) -> list[str]:
-    """Lines that were changed or are missing, oldest first. A log that was written anew from some line on has no fault."""
+    """Return changed or missing lines, oldest first. A log rewritten completely from some line on shows no fault."""
     faults: list[str] = []
     before, number, is_chained = "", 0, False
     for line in lines:
@@ -47,11 +47,11 @@ def chain_faults(lines: Iterable[AuditLine]) -> list[str]:
             faults.append(f"lines {number + 1} to {line.id - 1} are missing")
         values = astuple(line)[:-1]
         expected = line_sha256(before, values)
-        # The first lines of a store from before the chain have no hash. The first chained line covers them all; for a while it was
-        # written as if it were the first of all, and covers none of them.
+        # The first lines of a store from before the chain have no hash. The first chained line covers them all; in some stores it was
+        # written as if it were the very first, and covers none of them.
         right = {expected} if is_chained else {expected, line_sha256("", values), ""}
         if line.sha256 not in right:
-            faults.append(f"line {line.id} was changed, or stands behind one that was removed")
+            faults.append(f"line {line.id} was changed, or follows a removed one")
         is_chained |= bool(line.sha256)
         before, number = line.sha256 or expected, line.id
     return faults

@@ -1,4 +1,4 @@
-"""Operators, their sessions and tokens. Of secrets only hashes are kept; every change stands in the log."""
+"""Operators, their sessions and tokens. Secrets are stored as hashes only; every change is logged."""
 
 import sqlite3
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _TOKENS_KEPT_NS = 400 * 86_400_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class OperatorRow:
-    """One operator. role: viewer, operator, admin, or program for a name that has tokens alone; password: its argon2 hash."""
+    """One operator. role: viewer, operator, admin, or program for a name that has only tokens; password: its argon2 hash."""
 
     name: str
     role: str
@@ -24,7 +24,7 @@ class OperatorRow:
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """A session, with the role that its operator has now."""
+    """A session, with the present role of its operator."""
 
     name: str
     role: str
@@ -34,7 +34,7 @@ class SessionRow:
 
 @dataclass(frozen=True, slots=True)
 class TokenRow:
-    """A token: whose it is, what it may (words of scopes) and when it ends."""
+    """A token: its owner, its scopes (separated by spaces) and its end."""
 
     name: str
     role: str
@@ -43,13 +43,13 @@ class TokenRow:
 
 
 class OperatorQueries:
-    """The part of a store that knows operators. Raises StoreError where the disk refuses."""
+    """Operator accounts of a store. Raises StoreError on a disk error."""
 
     def __init__(self, transactions: Transactions) -> None:
         self._transactions = transactions
 
     def are_there(self) -> bool:
-        """Whether anybody was ever named; operators are disabled, never removed."""
+        """True once an operator was added; operators are disabled, never removed."""
         return bool(self._transactions.query("SELECT 1 FROM operators LIMIT 1"))
 
     def may_sign_in(self) -> bool:
@@ -72,7 +72,7 @@ class OperatorQueries:
         )
 
     def add(self, name: str, role: str, password: str | None, actor: Actor) -> None:
-        """A new operator; UsageError where the name is taken."""
+        """Add an operator; UsageError if the name is taken."""
         with self._transactions.write() as connection:
             values = (name, role, password)
             done = connection.execute(
@@ -80,26 +80,26 @@ class OperatorQueries:
             )
             if not done.rowcount:
                 raise UsageError(
-                    f"there is an operator {name} already; `mapserver operators role {name} ROLE` or "
+                    f"operator {name} exists; `mapserver operators role {name} ROLE` or "
                     f"`mapserver operators password {name}` changes it"
                 )
             self._transactions.log(connection, "", LogEntry("operator added", f"{name}, {role}", None, actor))
 
     def set_role(self, name: str, role: str, actor: Actor) -> None:
-        """Another role, from the next request on. UsageError for an unknown name."""
+        """Set a role, from the next request on. UsageError for an unknown name."""
         with self._transactions.write() as connection:
             _change(connection, "UPDATE operators SET role = ? WHERE name = ?", role, name)
             self._transactions.log(connection, "", LogEntry("operator's role", f"{name}, {role}", None, actor))
 
     def set_password(self, name: str, password: str, actor: Actor) -> None:
-        """Another password, also for a disabled operator, who may sign in again; sessions end. UsageError for an unknown name."""
+        """Set a password; a disabled operator is enabled again, and sessions end. UsageError for an unknown name."""
         with self._transactions.write() as connection:
             _change(connection, "UPDATE operators SET password = ?, is_disabled = 0 WHERE name = ?", password, name)
             connection.execute("DELETE FROM sessions WHERE name = ?", (name,))
             self._transactions.log(connection, "", LogEntry("operator's password", name, None, actor))
 
     def disable(self, name: str, actor: Actor) -> None:
-        """Ends sessions and tokens of a name at once, and lets nobody sign in by it. UsageError for an unknown name."""
+        """End sessions and tokens of a name at once, and refuse its sign-in. UsageError for an unknown name."""
         with self._transactions.write() as connection:
             _change(connection, "UPDATE operators SET is_disabled = 1 WHERE name = ?", name)
             for table in ("sessions", "tokens"):
@@ -114,7 +114,7 @@ class OperatorQueries:
             self._transactions.log(connection, "", LogEntry("signed in", name, None, actor))
 
     def session(self, sha256: str) -> SessionRow | None:
-        """The session of this hash, unless its operator is disabled; its age is judged elsewhere."""
+        """Return the session of this hash, unless its operator is disabled; the caller checks its age."""
         return self._transactions.first(
             SessionRow,
             """SELECT name, role, begun_ns, used_ns FROM sessions JOIN operators USING (name)
@@ -132,7 +132,7 @@ class OperatorQueries:
             self._transactions.log(connection, "", LogEntry("signed out", actor.name, None, actor))
 
     def remove_ended(self, *, begun_before_ns: int, used_before_ns: int) -> None:
-        """Removes sessions that are too old, and tokens that ended long ago: not those that only a clock far ahead has ended."""
+        """Remove sessions that are too old, and tokens that ended long ago, but not those ended only by a clock far ahead."""
         with self._transactions.write(durable=False) as connection:
             connection.execute(
                 "DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", (begun_before_ns, used_before_ns)
@@ -141,7 +141,7 @@ class OperatorQueries:
             connection.execute("DELETE FROM tokens WHERE ends_ns < ?", (long_ago_ns,))
 
     def add_token(self, sha256: str, token: TokenRow, actor: Actor) -> None:
-        """A new token; a name that is not known yet becomes that of a program."""
+        """Add a token; an unknown name becomes that of a program."""
         with self._transactions.write() as connection:
             connection.execute(
                 "INSERT OR IGNORE INTO operators (name, role, is_disabled) VALUES (?, 'program', 0)", (token.name,)
@@ -151,7 +151,7 @@ class OperatorQueries:
             self._transactions.log(connection, "", LogEntry("token made", f"{token.name}: {token.scopes}", None, actor))
 
     def token(self, sha256: str) -> TokenRow | None:
-        """The token of this hash, unless its operator is disabled; its end is judged elsewhere."""
+        """Return the token of this hash, unless its operator is disabled; the caller checks its end."""
         return self._transactions.first(
             TokenRow,
             """SELECT name, role, scopes, ends_ns FROM tokens JOIN operators USING (name)
@@ -162,4 +162,4 @@ class OperatorQueries:
 
 def _change(connection: sqlite3.Connection, sql: str, *values: str) -> None:
     if not connection.execute(sql, values).rowcount:
-        raise UsageError(f"there is no operator {values[-1]}; `mapserver operators list` names those there are")
+        raise UsageError(f"unknown operator {values[-1]}; `mapserver operators list` names all operators")

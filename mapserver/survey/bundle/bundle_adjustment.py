@@ -1,6 +1,6 @@
-"""Bundle adjustment: keyframes, landmarks, motion and biases that explain all observations best.
+"""Bundle adjustment: keyframes, landmarks, motion and biases with the best fit to all observations.
 
-The core solves (shared/core/bundle.h); here a problem is checked, and handed over as arrays. Source: Triggs et al. 2000, Bundle
+The core solves (shared/core/bundle.h); this module checks a problem and passes it as arrays. Source: Triggs et al. 2000, Bundle
 adjustment, a modern synthesis; inertial terms after Forster et al. 2017.
 """
 
@@ -18,10 +18,10 @@ from mapserver.survey.settings import BundleSettings
 
 
 def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
-    """The optimum near the problem's values, which stay untouched.
+    """Return the optimum near the problem's values; `problem` is unchanged.
 
-    Raises SurveyError where no keyframe, prior or gauge holds the map in place, and for values that are not finite. Inertial edges follow
-    bias changes to first order; where those are large, preintegrate again at the result's biases and optimise once more.
+    Raises SurveyError if no keyframe, prior or gauge fixes the map, and for values that are not finite. Inertial edges follow
+    bias changes to first order; if those are large, preintegrate again at the result's biases and optimise once more.
     """
     solver = solver_of(problem, settings)
     cost = solver.cost()
@@ -45,7 +45,7 @@ def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
 
 
 def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSolver:
-    """The core's solver at the values of `problem`; SurveyError where nothing holds the map in place."""
+    """Return the core's solver at the values of `problem`; SurveyError if nothing fixes the map."""
     _check(problem)
     solver = core.BundleSolver(
         problem.camera.lens,
@@ -72,7 +72,7 @@ def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSo
 
 
 def _motions(problem: BundleProblem) -> Array:
-    """(K, 9) velocity, gyro bias, accelerometer bias; (K, 0) without inertial terms."""
+    """Return (K, 9) velocity, gyro bias, accelerometer bias; (K, 0) without inertial terms."""
     inertial = problem.inertial
     if inertial is None:
         return np.zeros((len(problem.map_from_body), 0))
@@ -81,10 +81,10 @@ def _motions(problem: BundleProblem) -> Array:
 
 
 def _first_bad(problem: BundleProblem, squared: Array) -> str:
-    """Which observation is not finite, in words."""
+    """Return the observation that is not finite, as text."""
     bad = np.nonzero(~np.isfinite(squared))[0]
     if len(bad) == 0:
-        return "a prior, relative or inertial term is not finite, look at its values and covariance"
+        return "a prior, relative or inertial term is not finite, check its values and covariance"
     n = int(bad[0])
     landmark = problem.obs_landmark[n]
     return (
@@ -112,7 +112,7 @@ def _check(problem: BundleProblem) -> None:
 
 
 def _free_unknowns(problem: BundleProblem) -> NDArray[np.bool_]:
-    """(K, 6 or 15): rotation, translation, velocity, gyro bias, accelerometer bias."""
+    """Return (K, 6 or 15): rotation, translation, velocity, gyro bias, accelerometer bias."""
     count, inertial = len(problem.map_from_body), problem.inertial
     moves = np.zeros((count, 6 if inertial is None else 15), np.bool_)
     if problem.gauge == "pose":

@@ -1,4 +1,4 @@
-"""Bundle adjustment of a survey: assembling the problem, rounds with outliers removed in between, local windows."""
+"""Bundle adjustment of a survey: assembly of the problem, rounds with removal of outliers, local windows."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -24,11 +24,11 @@ def bundle_rounds(
     *,
     final: bool = False,
 ) -> SurveyState:
-    """The adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
+    """Return the adjusted state; outlying observations are dropped between rounds. `free` (K,) limits it to a window.
 
-    final: near the optimum; the last round takes the redescending cost of `final_bundle` with the noise that the others left
-    over. Inertial factors: Forster et al. 2017. A site's observations are as large as all else: who wants none twice in memory holds no
-    `state` of its own meanwhile.
+    final: near the optimum; the last round uses the redescending cost of `final_bundle` with noise measured from residuals.
+    Inertial factors: Forster et al. 2017. Observations dominate the memory: a caller that holds no `state` of its own
+    during the call saves half of it.
     """
     for round_number in range(rounds):
         last = round_number + 1 == rounds
@@ -43,12 +43,12 @@ def bundle_rounds(
             if free is not None:
                 keep |= ~np.isin(state.landmarks.obs_keyframe, np.flatnonzero(free))
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
-        del problem, result  # and with them the observations that were dropped
+        del problem, result  # frees the dropped observations
     return state
 
 
 def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
-    """Local bundle adjustment: overlapping windows in order, all else held; drift of the whole is left to the loops."""
+    """Run local bundle adjustment: overlapping windows in order, all else fixed; global drift is left to the loops."""
     count, window = len(state.stamps_ns), settings.local_window
     if count <= window:
         return state
@@ -60,7 +60,7 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
         ObservationIndex.of(marks.obs_landmark, len(marks.points_map)),
         relative,
     )
-    # Windows write into these arrays: a copy for each would cost the whole survey.
+    # Windows write into these arrays: copying them for each window would be too slow.
     state = replace(
         state,
         map_from_body=state.map_from_body.copy(),
@@ -81,19 +81,19 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
 
 @dataclass(frozen=True, slots=True)
 class ObservationIndex:
-    """Observations by what they belong to: rows (M,), those of number n from starts[n] to starts[n + 1]."""
+    """Observations by owner: rows (M,); those of number n from starts[n] to starts[n + 1]."""
 
     rows: NDArray[np.int64]
     starts: NDArray[np.int64]
 
     @classmethod
     def of(cls, owners: NDArray[np.int32], count: int) -> "ObservationIndex":
-        """The index of owners (M,), which are numbers below `count`."""
+        """Return the index of owners (M,), which are numbers below `count`."""
         rows = np.argsort(owners, kind="stable")
         return cls(rows, np.searchsorted(owners[rows], np.arange(count + 1)))
 
     def of_all(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The rows of some owners, rising."""
+        """Return the rows of some owners, ascending."""
         counts = self.starts[numbers + 1] - self.starts[numbers]
         first = np.repeat(self.starts[numbers] - np.cumsum(counts) + counts, counts)
         return np.sort(self.rows[np.arange(len(first)) + first])
@@ -101,7 +101,7 @@ class ObservationIndex:
 
 @dataclass(frozen=True, slots=True)
 class _WindowIndex:
-    """Observations by keyframe and by landmark, relative terms by their first keyframe: a window costs what it holds."""
+    """Observations by keyframe and by landmark, relative terms by their first keyframe: the cost of a window depends on its size only."""
 
     by_keyframe: ObservationIndex
     by_landmark: ObservationIndex
@@ -109,16 +109,16 @@ class _WindowIndex:
 
 
 def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_], index: _WindowIndex) -> None:
-    """One window with the earlier keyframes that see the same landmarks held; landmarks seen from elsewhere alone stay.
+    """Adjust one window with fixed earlier keyframes that see the same landmarks; landmarks seen only from elsewhere are unchanged.
 
-    The arrays of `state` are written to.
+    Writes to the arrays of `state`.
     """
     marks, motion = state.landmarks, state.motion
     inside = np.flatnonzero(free)
     first, last = inside[[0, -1]]
     touched = np.unique(marks.obs_landmark[index.by_keyframe.of_all(inside)]).astype(np.int64)
     rows = index.by_landmark.of_all(touched)
-    # Later keyframes are where odometry left them: held, they would pull the window back to the drift.
+    # Later keyframes are still at their odometry poses: fixed, they would pull the window back to the drift.
     rows = rows[marks.obs_keyframe[rows] <= last]
     used = np.zeros(len(free), bool)
     used[marks.obs_keyframe[rows]] = True
@@ -141,7 +141,7 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
 
 
 def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
-    """The bundle problem of a state; `free` (K,) are the keyframes that may move, all for None."""
+    """Return the bundle problem of a state; `free` (K,) are the keyframes that may move, all for None."""
     marks, motion = state.landmarks, state.motion
     fixed = np.zeros(len(state.stamps_ns), bool) if free is None else ~free
     if not fixed.any():
@@ -171,7 +171,7 @@ def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.boo
 def inertial_edges(
     state: SurveyState, settings: SurveySettings, held: NDArray[np.bool_] | None = None, first: int = 0
 ) -> list[tuple[int, int, Preintegrated]]:
-    """The IMU between neighbouring keyframes, which are numbered from `first` on; not between two that are held, nor over pauses."""
+    """Return IMU edges between neighbouring keyframes, numbered from `first`; not between two fixed ones, nor over pauses."""
     motion, edges = state.motion, []
     assert motion.noise is not None
     noise = scaled_noise(motion.noise, settings)
@@ -187,7 +187,7 @@ def inertial_edges(
 
 
 def scaled_noise(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:
-    """The data sheet's densities times the survey's scales: an IMU on a robot is noisier than on a desk."""
+    """Return the data sheet's densities times the survey's scales: an IMU on a robot is noisier than on a desk."""
     s = settings.noise
     return ImuNoise(
         noise.gyro_noise_radps_rthz * s.gyro_noise_scale,
@@ -198,7 +198,7 @@ def scaled_noise(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:
 
 
 def apply_result(state: SurveyState, result: BundleResult) -> SurveyState:
-    """The state with its variables at the values of `result`."""
+    """Return the state with its variables at the values of `result`."""
     motion, velocities = state.motion, result.velocities_map_mps
     gyro, accel = result.gyro_bias_radps, result.accel_bias_mps2
     if velocities is not None and gyro is not None and accel is not None:

@@ -1,4 +1,4 @@
-"""In which order blocks of unknowns are eliminated, so that little fills in."""
+"""Elimination order of blocks of unknowns, for little fill-in."""
 
 import numpy as np
 import scipy.sparse
@@ -8,13 +8,13 @@ from fleetmap.geometry import AnyArray
 
 
 def minimum_degree(count: int, pairs: AnyArray) -> AnyArray:
-    """(N,) nodes by minimum degree, of which `pairs` (B, 2) are coupled.
+    """Return (N,) nodes in minimum degree order; `pairs` (B, 2) are coupled nodes.
 
-    SuperLU finds the order: that of a matrix with one unknown for each node costs next to nothing.
+    SuperLU computes the order from a matrix with one unknown per node, at negligible cost.
     """
     nodes, pairs = np.arange(count), pairs[pairs[:, 0] != pairs[:, 1]]
     ends = np.concatenate([pairs, pairs[:, ::-1]])
-    # Laplacian and unit: positive definite, whatever pairs there are.
+    # Laplacian plus identity: positive definite for any pairs.
     rows, cols = np.concatenate([nodes, ends[:, 0], ends[:, 0]]), np.concatenate([nodes, ends[:, 0], ends[:, 1]])
     values = np.concatenate([np.ones(count + len(ends)), np.full(len(ends), -1.0)])
     graph = scipy.sparse.csc_array((values, (rows, cols)), shape=(count, count))

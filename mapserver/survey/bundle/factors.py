@@ -1,4 +1,4 @@
-"""The terms of a bundle problem besides its images, as arrays for the core."""
+"""The terms of a bundle problem except its images, as arrays for the core."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,10 +9,10 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import Preintegrated
 from mapserver.survey.bundle.problem import BundleProblem
 
-# Below this an increment's covariance means nothing: rounding of the sums, and it keeps empty intervals invertible.
+# Lower bound of an increment's covariance: below is rounding error, and the bound keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
 
-# Parts of an increment as the core takes it, and how many numbers each has.
+# Parts of an increment in the core's order, and their sizes.
 _INCREMENTS = {
     "dt_s": 1,
     "delta_rotation": 9,
@@ -29,7 +29,7 @@ _INCREMENTS = {
 
 
 class Terms(NamedTuple):
-    """Of R relative poses, Q pose priors, E inertial edges, and what is known of the motion of K keyframes, as the core names them."""
+    """Arrays of R relative poses, Q pose priors, E inertial edges, and motion priors of K keyframes, with the core's names."""
 
     relative_ends: AnyArray
     i_from_j: Array
@@ -45,7 +45,7 @@ class Terms(NamedTuple):
 
 
 def pack_terms(problem: BundleProblem) -> Terms:
-    """The terms of `problem` in arrays."""
+    """Pack the terms of `problem` into arrays."""
     relative, priors, inertial = problem.relative, problem.priors, problem.inertial
     edges = [] if inertial is None else inertial.edges
     width = 0 if inertial is None else 9
@@ -69,13 +69,13 @@ def pack_terms(problem: BundleProblem) -> Terms:
 
 
 def packed_increments(summed: Sequence[Preintegrated]) -> Array:
-    """(E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases that they were taken at."""
+    """Return (E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases of linearisation."""
     parts = [np.array([getattr(each, name) for each in summed]).reshape(-1, size) for name, size in _INCREMENTS.items()]
     return np.concatenate(parts, axis=1)
 
 
 def _informations(covariances: Array) -> Array:
-    """Inverse covariances (E, 15, 15), scaled first: rotation and velocity differ by many orders of magnitude."""
+    """Return inverse covariances (E, 15, 15), scaled first: rotation and velocity differ by many orders of magnitude."""
     sigma = np.sqrt(np.einsum("eaa->ea", covariances) + FLOOR_SIGMA**2)
     outer = sigma[:, :, None] * sigma[:, None, :]
     inverse = np.linalg.inv((covariances + np.diag(FLOOR_SIGMA**2)) / outer)

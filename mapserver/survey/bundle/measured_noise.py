@@ -1,8 +1,8 @@
-"""Measurement of the observations' noise from what an adjustment leaves over.
+"""Measurement of the observations' noise from the residuals of an adjustment.
 
-A sigma that is claimed too large makes robust costs blunt: at depth edges disparities are too large, never too small (foreground
-fattening), and as long as those errors count as one sigma they pull the scale. How large the noise is differs from camera to
-camera, so that the survey measures it, class by class of the claimed sigma.
+Too large stated sigmas make robust costs ineffective: at depth edges disparities are too large, never too small (foreground
+fattening), and errors within one stated sigma bias the scale. The noise differs between cameras,
+so the survey measures it, for each class of the stated sigma.
 """
 
 import numpy as np
@@ -11,19 +11,19 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.problem import BundleProblem
 
 _CLASSES = 8
-_CHUNK = 50_000  # observations, whose poses and points take a third of a kilobyte each
-_LEAST_OBSERVATIONS = 100  # of a class: its median is then good to 15 %
+_CHUNK = 50_000  # observations; poses and points take 0.3 kB each
+_LEAST_OBSERVATIONS = 100  # of a class: its median is then accurate to 15 %
 # Medians of |x| and of the length of a pair for normal noise of sigma 1
 _MEDIAN_OF_ONE, _MEDIAN_OF_TWO = 0.6745, 1.1774
 _EFFICIENT_HUBER = 1.345  # noise sigmas from which the cost is linear: 95 % efficient on normal noise (Huber 1964)
 
 
 def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
-    """(M, 2) sigmas of pixels and disparities for a robust cost that is linear from huber_sigmas.
+    """Return (M, 2) sigmas of pixels and disparities for a robust cost that is linear from huber_sigmas.
 
-    The observations are sorted into classes by the sigma that they claim. Each class keeps its claims up to one factor: the median
-    residual at the problem's values says by how much its noise differs from the claim. The factor also makes up for a cost
-    that is linear from elsewhere than 1.345 noise sigmas. Classes of less than 100 observations stay as they are.
+    Observations are grouped into classes by their stated sigma. Each class is scaled by one factor: the ratio of the median
+    residual at the problem's values to the stated sigma. The factor also corrects for a cost that
+    is linear from elsewhere than 1.345 noise sigmas. Classes of less than 100 observations are unchanged.
     """
     pixel, disparity = _residuals(problem)
     widened = _EFFICIENT_HUBER / huber_sigmas
@@ -33,7 +33,7 @@ def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
 
 
 def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
-    """Lengths (M,) of the residuals of pixel and disparity, NaN where there is none."""
+    """Return lengths (M,) of the residuals of pixel and disparity, NaN if absent."""
     cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)
     pixel, disparity = np.empty((2, len(problem.obs_keyframe)))
     for first in range(0, len(pixel), _CHUNK):
@@ -46,7 +46,7 @@ def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
 
 
 def _by_class(noise: Array, claimed: Array) -> Array:
-    """(M,) the claimed sigmas times the median ratio of noise to claim in each class."""
+    """Return (M,) the stated sigmas times the median ratio of noise to stated sigma in each class."""
     known = np.isfinite(noise)
     count = min(_CLASSES, int(known.sum()) // _LEAST_OBSERVATIONS)
     if count == 0:

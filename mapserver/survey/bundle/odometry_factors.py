@@ -15,7 +15,7 @@ from mapserver.survey.survey_inputs import SurveyInputs
 
 
 class Floor(NamedTuple):
-    """Least sigma of a step: of its rotation, by itself and for each radian of it, of its translation, by itself and for each metre."""
+    """Smallest sigma of a step: of its rotation, constant and per radian, of its translation, constant and per metre."""
 
     rotation_rad: float
     rotation_share: float
@@ -23,25 +23,25 @@ class Floor(NamedTuple):
     translation_share: float
 
     def covariance(self, first_from_last: Array) -> Array:
-        """(6, 6) of a step (4, 4)."""
+        """Return (6, 6) of a step (4, 4)."""
         turn_rad, way_m = rotation_angle_rad(first_from_last[:3, :3]), float(np.linalg.norm(first_from_last[:3, 3]))
         sigmas = self.rotation_rad + self.rotation_share * turn_rad, self.translation_m + self.translation_share * way_m
         return np.diag(np.repeat(np.square(sigmas), 3))
 
 
 FLOOR = Floor(0.004, 0.0, 0.01, 0.02)
-# With an IMU, of keyframes that are adjusted with their neighbours. What is wrong with a calibration is in no odometry's covariance: data
+# With an IMU, of keyframes adjusted with their neighbours. Odometry covariances do not include calibration errors: data
 # sheets of IMUs give the scale and the axes of their gyros to about 1 %, and a warm mount bends a stereo pair by as much.
 _INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
 
 
 def floor_of(*, inertial: bool) -> Floor:
-    """That of the steps of a chain of keyframes, which are adjusted with their neighbours."""
+    """Return the floor for steps of a chain of keyframes that are adjusted with their neighbours."""
     return _INERTIAL_FLOOR if inertial else FLOOR
 
 
 def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
-    """Keyframes where odometry put them, no landmarks yet."""
+    """Return keyframes at their odometry poses, without landmarks."""
     rectifier, numbers = inputs.rectifier, odometry.keyframe_frames
     estimates = [odometry.estimates[n] for n in numbers]
     map_from_body = odometry.odom_from_body[numbers]
@@ -68,9 +68,9 @@ def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
 
 
 def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
-    """Without an IMU, neighbours are held by odometry: weakly, so that it decides only where landmarks do not.
+    """Return weak odometry factors between neighbours, without an IMU: they matter only without landmarks.
 
-    For one camera this also holds the scale, which its landmarks leave open.
+    For one camera they also fix the scale, which its landmarks leave free.
     """
     return [
         _factor(k, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], 25.0 * edge_covariance(odometry, a, b))
@@ -79,9 +79,9 @@ def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[Relat
 
 
 def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[RelativeTerm]:
-    """Odometry across pauses, which no inertial factor spans, and from and to keyframes that see next to nothing.
+    """Return odometry factors across pauses, which no inertial factor spans, and from and to keyframes with few observations.
 
-    There it adds to the inertial factors with wheels; without wheels it adds nothing, and where there are landmarks it is not needed.
+    There wheel odometry adds to the inertial factors; without wheels it adds nothing, and with landmarks it is not needed.
     """
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
     stamps_ns = (state.stamps_ns + int(state.motion.imu_minus_cam_s * 1e9)).tolist()
@@ -95,7 +95,7 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
-    """Edges between neighbours with their adjusted motion and the covariance of the odometry."""
+    """Return edges between neighbours with their adjusted motion and the covariance of the odometry."""
     floor = floor_of(inertial=odometry.inertial)
     edges = []
     for k, a, b in _neighbours(odometry):
@@ -105,7 +105,7 @@ def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
 
 
 def _neighbours(odometry: OdometryPass) -> Iterator[tuple[int, int, int]]:
-    """Number of each keyframe but the last, its frame and that of the next one."""
+    """Yield number of each keyframe but the last, its frame and that of the next one."""
     for k, (a, b) in enumerate(pairwise(keyframe.frame_index for keyframe in odometry.keyframes)):
         yield k, a, b
 
@@ -115,27 +115,27 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
 
 
 def carried(covariance: Array, lever_m: Array) -> Array:
-    """(6, 6) of a body that lies lever_m (3,) beside one of which this is known: what is not known of its direction moves it, too."""
+    """Return (6, 6) of a body at lever_m (3,) from one with this covariance: uncertainty of rotation also moves it."""
     about = np.eye(6)
     about[3:, :3] = -skew(lever_m)
     return np.asarray(about @ covariance @ about.T)
 
 
 def edge_covariance(odometry: OdometryPass, a: int, b: int, floor: Floor = FLOOR) -> Array:
-    """(6, 6) of i_from_j between frames a and b, axes of a: what the odometry's uncertainty gained, with a floor."""
+    """Return (6, 6) of i_from_j between frames a and b, axes of a: the growth of the odometry's uncertainty, with a floor."""
     first, last = odometry.odom_from_body[[a, b]]
     known = odometry.covariances[a], odometry.covariances[b]
     return step_covariance(known, first[:3, :3], se3_inverse(first) @ last, floor)
 
 
 def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_from_last: Array, floor: Floor) -> Array:
-    """(6, 6) of a step in the axes of its first body, from the covariances (6, 6) of both places in odom axes; first's rotation (3, 3).
+    """Return (6, 6) of a step in axes of its first body, from covariances (6, 6) of both poses in odom axes; first's rotation (3, 3).
 
-    What odometry does not know of its direction at first moves the last one too, and its covariance has that with every step anew. About
-    the place of the first, where it moves nothing, the last one's is greater by what the step adds: such steps are independent.
+    An initial error of direction also moves the last pose, and is contained in its covariance at every step. About the position of
+    the first pose, where it has no effect, the last covariance is larger by the step's own part: such steps are independent.
     """
     gained = carried(known[1], -odom_from_first @ first_from_last[:3, 3]) - known[0]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
-    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames have moved since
+    gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames may have moved since
     carry = np.kron(np.eye(2), odom_from_first.T)
     return np.asarray(carry @ gained @ carry.T + floor.covariance(first_from_last))

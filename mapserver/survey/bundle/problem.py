@@ -19,7 +19,7 @@ from mapserver.survey.state import RelativeTerm
 
 @dataclass(frozen=True)
 class PriorTerm:
-    """Where keyframe k is known to be: map_from_body (4, 4); information (6, 6) of a perturbation in map axes."""
+    """Prior of keyframe k's pose: map_from_body (4, 4); information (6, 6) of a perturbation in map axes."""
 
     k: int
     map_from_body: Array
@@ -28,7 +28,7 @@ class PriorTerm:
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """What is known of keyframe k's motion and biases; a sigma of inf says nothing.
+    """Prior of keyframe k's motion and biases; a sigma of inf means no prior.
 
     mean (9,): velocity in map m/s, gyro bias rad/s, accelerometer bias m/s^2; sigma (9,).
     """
@@ -40,10 +40,10 @@ class MotionPrior:
 
 @dataclass
 class InertialTerms:
-    """Motion between keyframes as the IMU felt it.
+    """Motion between keyframes by the IMU.
 
     velocities_map_mps, gyro_bias_radps, accel_bias_mps2 (K, 3). edges: (i, j, Preintegrated), j after i.
-    fixed (K,): motion and biases that are held, none without it.
+    fixed (K,): keyframes with fixed motion and biases, none if absent.
     """
 
     velocities_map_mps: Array
@@ -57,7 +57,7 @@ class InertialTerms:
 class ImageRows(NamedTuple):
     """Whitened rows of M observations: residuals (M, 4), derivatives by point (M, 4, 3) and calibration (M, 4, C).
 
-    positions_map (K, 3): of the keyframes' bodies when the images were taken.
+    positions_map (K, 3): of the keyframes' bodies at exposure.
     """
 
     residuals: Array
@@ -67,10 +67,10 @@ class ImageRows(NamedTuple):
 
 
 class SelfCalibration(NamedTuple):
-    """A calibration that moves too: theta (C,), with weight (C,) 1 / sigma^2 about zero.
+    """A calibration that is estimated too: theta (C,), with weight (C,) 1 / sigma^2 about zero.
 
-    ways_m (R, 3): what theta[scale] adds to the translation of each relative pose. rows: the images at map_from_body, motions, points and
-    theta, with derivatives where the last argument says so; they replace the camera and its pixels.
+    ways_m (R, 3): derivative of the translation of each relative pose by theta[scale]. rows: the images at map_from_body, motions,
+    points and theta, with derivatives if the last argument is True; they replace the camera and its pixels.
     """
 
     theta: Array
@@ -84,10 +84,10 @@ class SelfCalibration(NamedTuple):
 class BundleProblem:
     """K keyframes, N landmarks, M observations.
 
-    map_from_body (K, 4, 4); fixed (K,): held keyframes. With gauge "yaw_position" a held keyframe (the first one, where
-    none is named) keeps its yaw and position and gravity decides its roll and pitch. points_map (N, 3). obs_pixels (M,
+    map_from_body (K, 4, 4); fixed (K,): fixed keyframes. With gauge "yaw_position" a fixed keyframe (by default the first one)
+    keeps its yaw and position, and gravity determines its roll and pitch. points_map (N, 3). obs_pixels (M,
     3): u_left, v, u_right, NaN without a right image. obs_sigma_px (M, 2): of u_left and v, and of the disparity u_left
-    - u_right; the three are taken as independent. points_held: keyframes alone move.
+    - u_right; the three are taken as independent. points_held: only keyframes move.
     """
 
     camera: StereoCamera
@@ -128,7 +128,7 @@ class BundleResult:
 
 
 def continued(problem: BundleProblem, result: BundleResult) -> BundleProblem:
-    """`problem` at the values of `result`."""
+    """Return `problem` at the values of `result`."""
     moved = replace(problem, map_from_body=result.map_from_body, points_map=result.points_map)
     inertial, gyro, accel = problem.inertial, result.gyro_bias_radps, result.accel_bias_mps2
     if inertial is not None and result.velocities_map_mps is not None and gyro is not None and accel is not None:

@@ -1,9 +1,9 @@
-"""Check of the extrinsic yaw between the cameras of a pair, by the survey itself.
+"""Check of the extrinsic yaw between the cameras of a pair, from survey data.
 
-A right camera that is turned about its vertical axis by a small angle shifts all disparities by nearly the same amount, which
-bends depth and so sets the scale of the map. Motion tells: only with the true shift do the points that the pair measures lie
-where several views put them. The shift is the minimum of the adjusted cost over it; the cost's slope needs no derivative of
-the adjustment, because at its optimum everything else is flat.
+A small rotation of the right camera about its vertical axis shifts all disparities by nearly the same amount, which
+bends depth and so changes the scale of the map. Motion reveals it: only with the true shift do the points triangulated by the pair
+agree with those from several views. The estimated shift minimises the adjusted cost; the cost's slope needs no derivative of
+the adjustment, because all other derivatives vanish at its optimum.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ _MIN_DISPARITIES = 200
 
 @dataclass(frozen=True, slots=True)
 class StereoYaw:
-    """What disparities are too large by in the middle of the picture, how surely, and whether the survey corrects it."""
+    """Excess of disparities in the middle of the picture, its sigma, and whether the survey corrects it."""
 
     shift_px: float
     sigma_px: float
@@ -34,7 +34,7 @@ class StereoYaw:
 
     @property
     def correction_px(self) -> float:
-        """What the survey subtracts."""
+        """Correction that the survey subtracts."""
         return self.shift_px if self.corrected else 0.0
 
 
@@ -42,12 +42,12 @@ NO_YAW = StereoYaw(0.0, float("inf"), corrected=False)
 
 
 def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
-    """(M,) how much the disparity at left pixels (M, >= 2) changes for one pixel of shift in the middle of the picture."""
+    """Return (M,) derivative of the disparity at left pixels (M, >= 2) by the shift in the middle of the picture."""
     return np.asarray(1.0 + ((pixels[:, 0] - camera.cx_px) / camera.focal_px) ** 2)
 
 
 def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px: float) -> Landmarks:
-    """The landmarks with all observed disparities made smaller by the shift."""
+    """Return the landmarks with all observed disparities reduced by the shift."""
     if correction_px == 0.0:
         return landmarks
     pixels = landmarks.obs_pixels.copy()
@@ -56,10 +56,10 @@ def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px
 
 
 def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoYaw:
-    """The yaw error that fits the adjusted survey best; corrected where it is far from zero, in sigmas.
+    """Return the yaw error with the best fit to the adjusted survey; corrected if significantly different from zero.
 
-    sigma_px is the adjustment's own, and with it `noise.turn_floor_px`: what matching alone pretends. NO_YAW where too few
-    disparities are known or where the cost has no minimum nearby.
+    sigma_px combines the adjustment's own with `noise.turn_floor_px`, since matching alone is overconfident. NO_YAW if too few
+    disparities are known or if the cost has no minimum nearby.
     """
     measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
     if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
@@ -84,14 +84,14 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
 
 
 def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings) -> float:
-    """Derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
+    """Return the derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
     camera, marks = problem.camera, without_stereo_yaw(marks, problem.camera, shift_px)
     result = optimize(replace(problem, obs_pixels=marks.obs_pixels), settings.final_bundle)
     ahead = se3_inverse(result.map_from_body @ problem.body_from_cam)[marks.obs_keyframe, 2]
     points = result.points_map[marks.obs_landmark]
     depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
-    # what the robust cost leaves of each observation's weight
+    # weight of each observation under the robust cost
     norm, robust = np.sqrt(result.squared_sigmas), settings.final_bundle
     weights = np.minimum(1.0, robust.huber_sigmas / np.maximum(norm, 1e-9))
     weights[norm > robust.cutoff_sigmas] = 0.0

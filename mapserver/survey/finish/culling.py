@@ -1,4 +1,4 @@
-"""Culling of a finished survey: duplicate landmarks, badly known ones, redundant keyframes."""
+"""Culling of a finished survey: duplicate or inaccurate landmarks, redundant keyframes."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ from mapserver.survey.state import Keyframe, Landmarks, SurveyState
 
 @dataclass(frozen=True, slots=True)
 class Culled:
-    """How many were taken out: landmarks_merged into another, landmarks_weak, keyframes that others repeat."""
+    """Numbers of removed items: landmarks_merged into another, landmarks_weak, redundant keyframes."""
 
     landmarks_merged: int = 0
     landmarks_weak: int = 0
@@ -25,7 +25,7 @@ class Culled:
 def cull(
     state: SurveyState, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Culled]:
-    """Which observations (M,) and keyframes (K,) are handed on, and what was left out; `state` stays as it is.
+    """Return the kept observations (M,) and keyframes (K,), and the removed ones; `state` is unchanged.
 
     sigmas_m (N,) of the landmarks.
     """
@@ -40,7 +40,7 @@ def cull(
 
 
 def parallax_rad(state: SurveyState) -> Array:
-    """(N,) the angle under which each landmark's observations see it: largest between any and the first, or across the baseline."""
+    """Return (N,) the parallax angle of each landmark's observations: largest between any and the first, or across the baseline."""
     marks = state.landmarks
     centres = (state.map_from_body @ state.body_from_cam)[marks.obs_keyframe, :3, 3]
     rays = centres - marks.points_map[marks.obs_landmark]
@@ -58,7 +58,7 @@ def parallax_rad(state: SurveyState) -> Array:
 def _duplicates(
     marks: Landmarks, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
 ) -> NDArray[np.bool_]:
-    """(N,) landmarks that stand where a better observed one stands, look like it and were never seen beside it."""
+    """Return (N,) landmarks at the position of a better observed similar one, never seen beside it."""
     near = cKDTree(marks.points_map).query_pairs(settings.duplicate_m, output_type="ndarray")
     if not len(near):
         return np.zeros(len(marks.points_map), bool)
@@ -73,9 +73,9 @@ def _duplicates(
 def redundant(
     marks: Landmarks, octaves: NDArray[np.int64], lasting: NDArray[np.bool_], count: int, settings: CullSettings
 ) -> NDArray[np.bool_]:
-    """(count,) keyframes of whose landmarks `redundant_share` are seen by three others at the same or a finer scale.
+    """Return (count,) keyframes whose landmarks are to a `redundant_share` seen by three others at the same or a finer scale.
 
-    Taken out one by one, those with the fewest landmarks first, so that the ones that repeat each other do not all go.
+    Removed one by one, those with the fewest landmarks first, so that mutually redundant ones are not all removed.
     Source: Mur-Artal and Tardos 2015 (ORB-SLAM).
     """
     usable = np.flatnonzero(lasting[marks.obs_landmark])

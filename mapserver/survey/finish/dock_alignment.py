@@ -1,4 +1,4 @@
-"""Alignment of a site's first survey to `map` by the docks and tags that it passed."""
+"""Alignment of a site's first survey to `map` by the docks and tags along its path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, skew,
 from fleetmap.sensors.samples import PositionPrior
 from mapserver.survey.survey_map import SurveyMap
 
-_MAX_SCALE_SIGMA_SHARE = 0.01  # of metres that priors give: beyond it the scale stays unknown
+_MAX_SCALE_SIGMA_SHARE = 0.01  # limit for the scale by priors: beyond it the scale stays unknown
 _MAX_GAP_NS = 2_000_000_000
 _YAW_KNOWN_RAD = 0.2
 
@@ -17,9 +17,9 @@ _YAW_KNOWN_RAD = 0.2
 def map_from_survey_by_priors(
     survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array
 ) -> Array | None:
-    """The turn about z and the shift (4, 4) that bring a survey nearest to its position priors, weighted by their covariances.
+    """Return the rotation about z and the translation (4, 4) with the best fit of a survey to its position priors, by covariance.
 
-    None without usable priors. One prior suffices where it knows its heading. Gauss-Newton on yaw and position.
+    None without usable priors. One prior with a heading suffices. Gauss-Newton on yaw and position.
     """
     usable = []
     for prior in priors:
@@ -49,7 +49,7 @@ def map_from_survey_by_priors(
 
 
 def _row(turn: Array, shift: Array, survey_from_base: Array, prior: PositionPrior) -> tuple[Array, Array]:
-    """Jacobian (4, 4) and residual (4,) of position and heading with respect to yaw and shift."""
+    """Return Jacobian (4, 4) and residual (4,) of position and heading with respect to yaw and shift."""
     place = turn @ survey_from_base[:3, 3]
     off_turn = prior.map_from_base[:3, :3] @ (turn @ survey_from_base[:3, :3]).T
     heading = np.sign(off_turn[1, 0]) * rotation_angle_rad(off_turn)
@@ -62,7 +62,7 @@ def _row(turn: Array, shift: Array, survey_from_base: Array, prior: PositionPrio
 
 @dataclass(frozen=True, slots=True)
 class DockAlignment:
-    """map_from_survey (4, 4) without the scale, metres per unit of the survey, and the standard deviation of that as a share of it."""
+    """map_from_survey (4, 4) without the scale, metres per unit of the survey, and its relative standard deviation."""
 
     map_from_survey: Array
     scale: float
@@ -72,9 +72,9 @@ class DockAlignment:
 def aligned_by_priors(
     survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array
 ) -> DockAlignment | None:
-    """Where a survey of unknown scale lies and how large it is, by priors that know their place and their directions.
+    """Return pose and scale of a survey of unknown scale, by priors with position and direction.
 
-    None with fewer than two such priors, or where they leave the scale less sure than 1 %. Gauss-Newton on seven unknowns.
+    None with fewer than two such priors, or with a scale less accurate than 1 %. Gauss-Newton on seven unknowns.
     """
     usable = []
     for prior in priors:

@@ -1,7 +1,7 @@
-"""Adjustment of the frames between keyframes: each is placed by the points that it shares with the adjusted keyframes.
+"""Adjustment of the frames between keyframes: each is located by points shared with the adjusted keyframes.
 
-Keyframes stay where they are. Between two of them the frames, and the points that odometry followed through them, are adjusted
-together. The IMU holds frames to each other; odometry does where there is no IMU, and where pictures show too little.
+Keyframes are fixed. Between two of them the frames, and their points tracked by odometry, are adjusted
+together. The IMU constrains neighbouring frames; odometry does without an IMU, or if pictures show too little.
 """
 
 from dataclasses import dataclass, replace
@@ -28,20 +28,20 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _BATCH = 8  # intervals
-_BESIDE = 1  # keyframes beyond those at the ends that place points too; tracks slip, so that distant ones would bend the result
-_MIN_SPREAD = np.radians(1.0) ** 2 / 4  # of a point's rays: what two have that are 1 degree apart
-_BIAS_SIGMAS = np.repeat([np.inf, 1e-4, 1e-3], 3)  # m/s, rad/s, m/s^2, around what the keyframes were adjusted to
-# Frames begin near their optimum, and what is left to gain after these steps is hundredths of a millimetre.
+_BESIDE = 1  # keyframes beyond the ends used for points; tracks slip, so distant ones would bend the result
+_MIN_SPREAD = np.radians(1.0) ** 2 / 4  # of a point's rays: that of two rays 1 degree apart
+_BIAS_SIGMAS = np.repeat([np.inf, 1e-4, 1e-3], 3)  # m/s, rad/s, m/s^2, around the adjusted values of the keyframes
+# Frames begin near their optimum; further steps would gain hundredths of a millimetre.
 _ROUGH = BundleSettings(max_iterations=10, relative_cost_tolerance=1e-2, lambda_start=1e-6)
 _FINAL = BundleSettings(
     max_iterations=10, relative_cost_tolerance=1e-3, lambda_start=1e-6, huber_sigmas=0.7, cutoff_sigmas=2.5
 )
-_WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
+_WIDE = 25.0  # factor on odometry's covariance where it only determines what pictures cannot
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedFrames:
-    """map_from_body (F, 4, 4); seen (F,): whether points that keyframes see too place the frame, else odometry or the IMU alone."""
+    """map_from_body (F, 4, 4); seen (F,): True for frames located by points of keyframes, else by odometry or the IMU alone."""
 
     map_from_body: Array
     seen: Mask
@@ -49,8 +49,8 @@ class PlacedFrames:
 
 @dataclass(frozen=True, slots=True)
 class _Interval:
-    """Frames (n,) from one keyframe to the next, their slots (n,) in the problem, and which observations (M,) are of points that
-    keyframes see."""
+    """Frames (n,) from one keyframe to the next, their slots (n,) in the problem, and a mask of observations (M,) of points seen
+    by keyframes."""
 
     frames: Indices
     slots: Indices
@@ -65,9 +65,9 @@ def place_frames(
     correction_px: float = 0.0,
     executor: Executor = SERIAL,
 ) -> PlacedFrames:
-    """All F frames of a survey with adjusted keyframes; as odometry carries them where no points of the map are seen.
+    """Return all F frames of a survey with adjusted keyframes; carried by odometry if no points of the map are seen.
 
-    correction_px: what the survey subtracts from disparities.
+    correction_px: subtracted from disparities by the survey.
     """
     chain = _Chain(odometry, state, settings, correction_px)
     placed, seen = chain.map_from_body.copy(), np.zeros(len(chain.map_from_body), bool)
@@ -84,7 +84,7 @@ def place_frames(
 
 
 def _adjust(cut_sigmas: float, intervals: list[_Interval]) -> list[tuple[Indices, Array, Mask]]:
-    """The frames, map_from_body and whether they are seen, of each interval; outliers are dropped on the way."""
+    """Return the frames, map_from_body and whether they are seen, of each interval; outliers are dropped."""
     out = []
     for interval in intervals:
         problem = interval.problem
@@ -105,7 +105,7 @@ def _adjust(cut_sigmas: float, intervals: list[_Interval]) -> list[tuple[Indices
 
 
 class _Chain:
-    """All frames where odometry carries them, and what they and the keyframes saw of the points that odometry followed."""
+    """All frames at their odometry poses, and the observations of tracked points by them and by keyframes."""
 
     def __init__(
         self, odometry: OdometryPass, state: SurveyState, settings: SurveySettings, correction_px: float
@@ -122,7 +122,7 @@ class _Chain:
         self._correction_px = correction_px
 
     def interval(self, a: int, b: int) -> _Interval | None:
-        """The frames between keyframes a and b, of which one may lie beyond the ends; None where they see nothing of the map."""
+        """Return the frames between keyframes a and b, of which one may lie beyond the ends; None if they see no points of the map."""
         first, last = np.searchsorted(self.numbers, [a, b])
         beside = self.numbers[max(first - _BESIDE, 0) : last + _BESIDE + 1]
         frames = self._frames_between(a, b)
@@ -157,21 +157,21 @@ class _Chain:
         return _Interval(frames, np.searchsorted(nodes, frames), problem, tied)
 
     def _frames_between(self, a: int, b: int) -> Indices:
-        """Those between; before the first keyframe and after the last one only what follows on without a break."""
+        """Return the frames in between; before the first keyframe and after the last one only those connected without a break."""
         frames, lost = np.arange(a + 1, b), np.flatnonzero(~self._odometry.tracked[a + 1 : b].astype(bool))
         if a < 0 and len(lost):
             return frames[lost[-1] + 1 :]
         return frames[: lost[0]] if b == len(self.is_keyframe) and len(lost) else frames
 
     def _seen_by(self, nodes: Indices) -> tuple[Indices, Indices, Array]:
-        """Of all that the nodes saw: the track (M,), which node (M,), pixels (M, 3)."""
+        """Return all observations of the nodes: track (M,), node (M,), pixels (M, 3)."""
         assert self._odometry.tracks is not None
         ids, which, pixels = self._odometry.tracks.of(nodes)
         pixels[:, 2] += self._correction_px * disparity_shift(self._state.camera, pixels)
         return ids, which, pixels
 
     def _points(self, nodes: Indices, which: Indices, marks: Indices, pixels: Array) -> tuple[Array, Mask]:
-        """points_map (N, 3) to start from, and which are known: by a disparity, of a keyframe's at best the nearest, else by rays."""
+        """Return initial points_map (N, 3) and which are known: by a disparity, preferably of the nearest keyframe, else by rays."""
         camera, count = self._state.camera, int(marks.max(initial=-1)) + 1
         map_from_cam = self.map_from_body[nodes] @ self._state.body_from_cam
         at_keyframe, disparities = self.is_keyframe[nodes][which], pixels[:, 0] - pixels[:, 2]
@@ -191,7 +191,7 @@ class _Chain:
         return points, known
 
     def _crossings(self, map_from_cam: Array, pixels: Array, marks: Indices, count: int) -> tuple[Array, Mask]:
-        """(count, 3) nearest to all rays of each point, and where they differ enough in direction to say so."""
+        """Return (count, 3) the nearest point to all rays of each point, and whether their directions differ enough."""
         camera = self._state.camera
         rays = np.column_stack([(pixels[:, :2] - camera.lens[1:3]) / camera.focal_px, np.ones(len(pixels))])
         rays = np.einsum("mij,mj->mi", map_from_cam[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
@@ -206,7 +206,7 @@ class _Chain:
         return points, sure
 
     def _inertial(self, nodes: Indices, joined: Indices) -> InertialTerms:
-        """The IMU between the nodes that are joined, which are neighbours in time."""
+        """Return IMU terms between the joined nodes, which are neighbours in time."""
         motion, offset_ns = self._state.motion, int(self._state.motion.imu_minus_cam_s * 1e9)
         assert self._imu_noise is not None
         nearest = np.clip(np.searchsorted(self.numbers, nodes), 0, len(self.numbers) - 1)
@@ -227,7 +227,7 @@ class _Chain:
         return InertialTerms(velocities, gyro, accel, edges, priors)
 
     def _relative(self, nodes: Indices, joined: Indices, sees: Mask) -> list[RelativeTerm]:
-        """Odometry between neighbours: weakly without an IMU, and as it is where either sees too little."""
+        """Return odometry between neighbours: weakly without an IMU, and at full weight if either sees too little."""
         odometry, terms = self._odometry, []
         for i, j in pairwise(joined.tolist()):
             if (sees[i] and sees[j]) and self._state.motion.inertial:
@@ -243,9 +243,9 @@ class _Chain:
 def frame_trajectory(
     frame_stamps_ns: Stamps, odom_from_body: Array, keyframe_frames: list[int], map_from_body: Array
 ) -> Array:
-    """map_from_body (F, 4, 4) of all frames: carried from the keyframe before and from the one after, blended by time.
+    """Return map_from_body (F, 4, 4) of all frames: carried from the previous and the next keyframe, blended by time.
 
-    odom_from_body (F, 4, 4): the motion; keyframe_frames (K,) frame numbers, rising; map_from_body (K, 4, 4).
+    odom_from_body (F, 4, 4): the motion; keyframe_frames (K,) frame numbers, ascending; map_from_body (K, 4, 4).
     """
     out = np.empty((len(frame_stamps_ns), 4, 4))
     afters = np.searchsorted(keyframe_frames, np.arange(len(out))).tolist()

@@ -10,10 +10,10 @@ from mapserver.survey.survey_map import SurveyMap
 
 
 def viewing_cones(survey: SurveyMap, map_from_cam: Array) -> ViewingCones:
-    """The cones of a survey's landmarks (N), whose keyframes' cameras are at map_from_cam (K, 4, 4).
+    """Return the viewing cones of a survey's landmarks (N), with its keyframes' cameras at map_from_cam (K, 4, 4).
 
-    Directions are the mean of those to the cameras, half angles the largest angle to it, distances the median over observations of
-    distance * scale ** octave. Half angle and distance are 0 where nothing observes a landmark.
+    Directions: mean of those to the cameras; half angles: largest angle to it; distances: median over observations of
+    distance * scale ** octave. Half angle and distance are 0 for a landmark without observations.
     Source: Mur-Artal et al. 2015 (ORB-SLAM), section III.C.
     """
     landmark, count = survey.obs_landmark, len(survey.landmark_ids)
@@ -32,7 +32,7 @@ def viewing_cones(survey: SurveyMap, map_from_cam: Array) -> ViewingCones:
 
 def _mean_directions(landmark: NDArray[np.int32], rays_map: Array, counts: NDArray[np.intp]) -> Array:
     sums = np.stack([np.bincount(landmark, rays_map[:, axis], len(counts)) for axis in range(3)], axis=1)
-    # Seen from opposite sides the mean has no direction; any will do, the half angle then includes all others.
+    # Seen from opposite sides the mean is zero; any direction will do, the half angle then includes all others.
     vague = np.linalg.norm(sums, axis=1) < 1e-6 * np.maximum(counts, 1)
     first_seen = np.unique(landmark, return_index=True)
     fallback = np.tile([0.0, 0.0, 1.0], (len(counts), 1))
@@ -42,7 +42,7 @@ def _mean_directions(landmark: NDArray[np.int32], rays_map: Array, counts: NDArr
 
 
 def _medians(groups: NDArray[np.int32], values: Array, counts: NDArray[np.intp]) -> Array:
-    """(N,) median (the upper of two middle ones) of the values of each group, 0 for empty ones."""
+    """Return (N,) median (the upper of two middle ones) of the values of each group, 0 for empty ones."""
     ordered = values[np.lexsort((values, groups))]
     starts = np.cumsum(counts) - counts
     medians = np.zeros(len(counts))

@@ -17,14 +17,14 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_map import SurveyMap
 
-_PATCH_HALF_PX = 10  # a 9 px window seen from nearer or turned still finds all of itself
+_PATCH_HALF_PX = 10  # margin so that a scaled or rotated 9 px window still fits
 _CHUNK = 5000  # landmarks
 
 
 def assemble(
     state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
 ) -> tuple[SurveyMap, NDArray[np.int64], Culled]:
-    """The SurveyMap of an adjusted survey, in the survey's own frame, which landmarks of the state it has, and what was left out."""
+    """Return the SurveyMap of an adjusted survey, in the survey's own frame, its landmarks as rows of the state, and the removed ones."""
     every_sigma = point_sigmas_m(state)
     seen, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
     marks, rows = state.landmarks.keep_observations(seen, 1), np.unique(state.landmarks.obs_landmark[seen])
@@ -57,17 +57,17 @@ def assemble(
 
 
 def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
-    """(N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
+    """Return (N, 32): of each landmark's descriptors the one nearest to all others (their medoid)."""
     rows = marks.of_features([k.features.descriptors for k in keyframes])
     starts = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map) + 1))
     return rows[core.medoids(packed(rows), starts)]
 
 
 def point_sigmas_m(state: SurveyState) -> Array:
-    """(N,) largest standard deviation of each landmark, keyframes taken as known."""
+    """Return (N,) largest standard deviation of each landmark, for fixed keyframes."""
     marks, map_from_cam = state.landmarks, state.map_from_body @ state.body_from_cam
     weakest = np.empty(len(marks.points_map))
-    for start in range(0, len(weakest), _CHUNK):  # an observation's share of the work is half a kilobyte
+    for start in range(0, len(weakest), _CHUNK):  # working memory is 0.5 kB per observation
         some = slice(start, min(start + _CHUNK, len(weakest)))
         rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
         has_right, sigmas = np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows]
@@ -85,7 +85,7 @@ def point_information(
     has_right: NDArray[np.bool_],
     obs_sigma_px: Array,
 ) -> Array:
-    """(N, 3, 3) information of M observations by known cameras map_from_cam (M, 4, 4) on N points, in map axes: sum of J^T J."""
+    """Return (N, 3, 3) information of M observations by known cameras map_from_cam (M, 4, 4) on N points, in map axes: sum of J^T J."""
     cam_from_map = se3_inverse(map_from_cam)
     rotations = cam_from_map[:, :3, :3]
     seen = np.einsum("mij,mj->mi", rotations, points_map[obs_landmark]) + cam_from_map[:, :3, 3]
@@ -103,7 +103,7 @@ def point_information(
 
 
 def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:
-    """(N, 21, 21) windows around each landmark's first observation, at the halving nearest to its octave."""
+    """Return (N, 21, 21) windows around each landmark's first observation, at the halving nearest to its octave."""
     size = 2 * _PATCH_HALF_PX + 1
     out = np.zeros((len(marks.points_map), size, size), np.uint8)
     first = np.searchsorted(marks.obs_landmark, np.arange(len(marks.points_map)))
@@ -122,7 +122,7 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
 
 
 def _estimated(state: SurveyState, odometry: OdometryPass, placed: PlacedFrames) -> NDArray[np.bool_]:
-    """(F,) frames that something measured ties to the map: landmarks, unbroken odometry, or the IMU through a gap."""
+    """Return (F,) frames connected to the map by measurements: landmarks, unbroken odometry, or the IMU through a gap."""
     tied = odometry.tracked.astype(bool) | placed.seen
     if state.motion.inertial:
         tied[[k.frame_index for k in odometry.keyframes]] = True

@@ -1,4 +1,4 @@
-"""A finished survey in another frame."""
+"""Transformation of a finished survey to another frame."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from mapserver.survey.survey_map import SurveyMap
 
 
 def transform_map(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
-    """The same survey in the frame `new`; new_from_map (4, 4) is rigid, so nothing measured changes."""
+    """Return the same survey in the frame `new`; new_from_map (4, 4) is rigid, so measurements are unchanged."""
     return replace(
         survey_map,
         map_from_body=new_from_map @ survey_map.map_from_body,
@@ -21,13 +21,13 @@ def transform_map(survey_map: SurveyMap, new_from_map: Array) -> SurveyMap:
 
 
 def transform_state(state: SurveyState, new_from_map: Array) -> SurveyState:
-    """The adjusted state as `transform_map` changes its map."""
+    """Transform the adjusted state as `transform_map` does its map."""
     landmarks = replace(state.landmarks, points_map=transform_points(new_from_map, state.landmarks.points_map))
     return replace(state.moved(new_from_map @ state.map_from_body), landmarks=landmarks)
 
 
 def scaled(survey_map: SurveyMap, scale: float) -> SurveyMap:
-    """The same survey `scale` times as large, in metres from now on; cameras keep their mounting, which was in metres before."""
+    """Return the same survey `scale` times as large, then in metres; the cameras' mount, already in metres, is unchanged."""
     frames = _grown(survey_map.trajectory.frame_from_body, survey_map.body_from_cam, scale)
     return replace(
         survey_map,
@@ -40,7 +40,7 @@ def scaled(survey_map: SurveyMap, scale: float) -> SurveyMap:
 
 
 def scaled_state(state: SurveyState, scale: float) -> SurveyState:
-    """The adjusted state as `scaled` changes its map."""
+    """Scale the adjusted state as `scaled` does its map."""
     return replace(
         state,
         map_from_body=_grown(state.map_from_body, state.body_from_cam, scale),

@@ -1,4 +1,4 @@
-"""Connected components of a survey: keyframes joined by shared landmarks or by short bridges of odometry.
+"""Connected components of a survey: keyframes connected by shared landmarks or by short bridges of odometry.
 
 Only one component can be in a map: the pose of any other relative to it is unknown.
 """
@@ -16,18 +16,18 @@ from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.state import OdometryPass, SurveyState
 
-MIN_SHARED = 15  # landmarks, as many as a loop needs matches
-MIN_SEEN = 8  # landmarks without which a keyframe counts as blind
+MIN_SHARED = 15  # landmarks; a loop needs as many matches
+MIN_SEEN = 8  # least landmarks of a keyframe that is not blind
 _MIN_KEYFRAMES = 2
 _SURE_SIGMAS = 3.0
 _LARGEST = "the largest part"
-_APART = "nothing says for sure where it lies to the largest part; drive it again"
-_BLIND = "too little was seen to tie it to anything; drive it again, with light"
+_APART = "its position relative to the largest part is uncertain; drive it again"
+_BLIND = "too little was seen to connect it; drive it again, with light"
 
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """Connected keyframes: seconds of the first and last after the survey's first keyframe, and whether they are kept, and why."""
+    """Connected keyframes: seconds of the first and last after the survey's first keyframe, whether they are kept, and the reason."""
 
     start_s: float
     end_s: float
@@ -36,13 +36,13 @@ class Component:
     reason: str
 
     def remark(self) -> str:
-        """It in words."""
+        """The component as text."""
         return f"left out: {self.keyframes} keyframes from {self.start_s:.1f} to {self.end_s:.1f} s: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """labels (K,): the component of each keyframe, -1 for stray ones, which are in none and listed run by run."""
+    """labels (K,): the component of each keyframe, -1 for stray ones, which belong to no component and are listed per run."""
 
     labels: NDArray[np.int64]
     components: list[Component]
@@ -50,16 +50,16 @@ class Components:
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """(K,) keyframes that stay in the map: those of the component with most that see something."""
+        """(K,) keyframes that stay in the map: those of the component with the most keyframes that are not blind."""
         return np.asarray(self.labels == next(n for n, component in enumerate(self.components) if component.kept))
 
 
 def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Components:
-    """The components of an adjusted survey, in the order of time; SurveyError where no keyframes are connected.
+    """Return the components of an adjusted survey, ordered by time; SurveyError if no keyframes are connected.
 
-    Keyframes are connected where they share landmarks, and where the last one that saw something and the next one that does
-    are known to `join_sigma_m` of each other by odometry. Blind ones in between are then connected too; other blind ones
-    are with the component before or after as long as three sigmas of the odometry are within that limit.
+    Keyframes are connected if they share landmarks, or if odometry between two consecutive ones that are not blind is accurate
+    to `join_sigma_m`. Blind ones in between are then connected too; other blind ones belong to the previous or
+    next component while three sigmas of the odometry are within that limit.
     """
     groups = np.unique(find_groups(state, odometry_sigmas_m, join_sigma_m).labels(), return_inverse=True)[1]
     seeing = np.flatnonzero(_seeing(state))
@@ -67,7 +67,7 @@ def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_
     real = [g for g in dict.fromkeys(groups[seeing].tolist()) if sizes[g] >= _MIN_KEYFRAMES]
     if not real:
         raise SurveyError(
-            f"none of {len(groups)} keyframes shares {MIN_SHARED} landmarks with another; look at the recording with "
+            f"none of {len(groups)} keyframes shares {MIN_SHARED} landmarks with another; check the recording with "
             "`mapserver doctor`: dark, blurred, or too few frames?"
         )
     largest = max(real, key=lambda g: int(seeing_sizes[g]))
@@ -89,7 +89,7 @@ def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_
 
 
 def find_groups(state: SurveyState, sigmas_m: "SigmaBetween", join_sigma_m: float) -> KeyframeGroups:
-    """The same before loops are closed, where groups may be many and none is chosen."""
+    """Return the same before loops are closed: there may be many groups, and none is chosen."""
     rows, columns = _shared_landmarks(state, MIN_SHARED)
     seeing = _seeing(state)
     joins = [*zip(rows.tolist(), columns.tolist(), strict=True), *bridges(seeing, sigmas_m, join_sigma_m)]
@@ -103,7 +103,7 @@ def _seeing(state: SurveyState) -> NDArray[np.bool_]:
 def bridges(
     seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float, first: int = 0
 ) -> list[tuple[int, int]]:
-    """Keyframes that odometry connects, of those from `first` on; seeing (K,): whether each sees something. See find_components."""
+    """Yield keyframes connected by odometry, from `first` on; seeing (K,): False for blind ones. See find_components."""
     seen = first + np.flatnonzero(seeing[first:])
     joins = [(int(a), int(b)) for a, b in pairwise(seen) if sigmas_m(int(a), int(b)) <= join_sigma_m]
     bridged = {a for a, _ in joins}
@@ -125,14 +125,14 @@ class SigmaBetween:
         self._variances = variances_m2
 
     def __call__(self, a: int, b: int) -> float:
-        """The growth of the variance between them, as a standard deviation."""
+        """Return the growth of the variance between them, as a standard deviation."""
         return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
 
 
 def only_kept(
     state: SurveyState, odometry: OdometryPass, loops: Loops, kept: NDArray[np.bool_]
 ) -> tuple[SurveyState, OdometryPass, Loops]:
-    """The survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
+    """Return the survey of the kept keyframes (K,) alone; the records of loops keep the old numbers."""
     if kept.all():
         return state, odometry, loops
     number = np.cumsum(kept) - 1
@@ -142,7 +142,7 @@ def only_kept(
 
 
 def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of keyframes, the older one first, that share so many landmarks."""
+    """Return pairs of keyframes, the older one first, that share at least `at_least` landmarks."""
     marks = state.landmarks
     ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(state.stamps_ns), len(marks.points_map))
     seen = csr_matrix((ones, (marks.obs_keyframe, marks.obs_landmark)), shape)
@@ -152,7 +152,7 @@ def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int
 
 
 def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(F,) frames whose neighbouring keyframes, the one before and the one after, are all kept."""
+    """Return (F,) frames whose neighbouring keyframes, previous and next, are both kept."""
     after = np.searchsorted(keyframe_frames, np.arange(frames))
     exact = keyframe_frames[np.minimum(after, len(kept) - 1)] == np.arange(frames)
     before = np.where(exact, after, np.maximum(after - 1, 0))

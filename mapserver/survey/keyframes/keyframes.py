@@ -1,4 +1,4 @@
-"""Keyframe selection, and the data that is kept of each keyframe."""
+"""Keyframe selection, and the data of each keyframe."""
 
 from collections import deque
 from collections.abc import Container, Iterable, Iterator
@@ -17,11 +17,11 @@ from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
 from mapserver.survey.state import ImageStore, Keyframe, MemoryImageStore, Pictures
 
-_BATCH = 2  # frames for one call: a twentieth of a second each
+_BATCH = 2  # frames for one call: 0.05 s each
 
 
 def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
-    """Detects, describes and stereo-matches one frame; its pictures stay in memory."""
+    """Detect, describe and stereo-match one frame; its pictures stay in memory."""
     return next(make_keyframes([(frame_index, frame)], camera, settings))
 
 
@@ -32,9 +32,9 @@ def make_keyframes(
     images: ImageStore | None = None,
     executor: Executor = SERIAL,
 ) -> Iterator[Keyframe]:
-    """Keyframes of numbered frames; the executor extracts features while the next frames are awaited.
+    """Return keyframes of numbered frames; the executor extracts features while the next frames are awaited.
 
-    images: takes the pictures, memory without one.
+    images: store for the pictures; by default memory.
     """
     kept = MemoryImageStore() if images is None else images
     waiting: deque[tuple[int, RectifiedFrame]] = deque()
@@ -56,7 +56,7 @@ def make_keyframes(
 def _extract(
     shared: tuple[StereoCamera, SurveySettings], frames: list[RectifiedFrame]
 ) -> list[tuple[orb.Features, Array]]:
-    """What is found in some frames: features and disparities."""
+    """Return features and disparities of some frames."""
     camera, settings = shared
     found = []
     for frame in frames:
@@ -66,7 +66,7 @@ def _extract(
 
 
 def set_aside(keyframe: Keyframe, store: ImageStore) -> Keyframe:
-    """The same keyframe with its features where `store` keeps them."""
+    """Return the same keyframe with its features in `store`."""
     own = keyframe.features
     found = own.pixels, own.octaves, own.angles_deg, own.descriptors, keyframe.disparities, keyframe.points_cam
     *features, disparities, points_cam = store.keep(found)
@@ -89,14 +89,14 @@ class KeyframePolicy:
     """Chooses by overlap with the last keyframe, by motion, or by count; never a blurred frame unless tracking would break."""
 
     def __init__(self, settings: KeyframeSettings, required: Container[int] = ()) -> None:
-        """required: numbers of frames, counted from 0, that are chosen whatever they show."""
+        """required: numbers of frames, counted from 0, that are always chosen."""
         self._settings, self._required = settings, required
         self._last: FrameSummary | None = None
         self._sharpness: deque[float] = deque(maxlen=31)
         self._count = -1
 
     def wants(self, frame: FrameSummary) -> bool:
-        """Whether this frame becomes a keyframe; frames must come in order."""
+        """True if this frame becomes a keyframe; frames must come in order."""
         self._count += 1
         self._sharpness.append(frame.sharpness)
         chosen = self._chooses(frame)
@@ -125,5 +125,5 @@ class KeyframePolicy:
 
 
 def sharpness(frame: RectifiedFrame) -> float:
-    """Variance of the Laplacian at half size: falls with motion blur. Source: Pech-Pacheco et al. 2000."""
+    """Return the variance of the Laplacian at half size: it falls with motion blur. Source: Pech-Pacheco et al. 2000."""
     return float(cv2.Laplacian(frame.half_left, cv2.CV_32F).var())

@@ -1,7 +1,7 @@
 """Thinning of revisits: some visits to each place are adjusted, the others are localized in the result.
 
-A global adjustment takes memory and time with the square of the visits to a place. After some visits one more gains nothing:
-places are then known better than the calibration is.
+A global adjustment takes memory and time with the square of the visits to a place. Beyond some visits another one gains nothing:
+places are then known more accurately than the calibration.
 """
 
 from dataclasses import replace
@@ -20,15 +20,15 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, SurveyState
 from mapserver.survey.tracks.tracks import Tracks
 
-_LONGEST_GAP_S = 3.0  # over which the IMU carries from one keyframe to the next where those between take no part
+_LONGEST_GAP_S = 3.0  # longest IMU bridge across left-out keyframes
 
 
 def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings) -> NDArray[np.bool_]:
-    """(K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
+    """Return (K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
-    A visit ends where no keyframe has seen a track for longer than a loop takes at least. The last keyframes go first, so that
-    whole drives are left. None are redundant where no place is seen on more visits than those. Keyframes that then share too
-    few tracks with the others, such as blind ones, are redundant too: their neighbours are known better.
+    A visit ends when no keyframe has seen a track for longer than the shortest loop. The last keyframes are removed first, so that
+    whole drives remain. None are redundant if no place has more visits than those. Keyframes that then share too
+    few tracks with the others, such as blind ones, are redundant too: their neighbours are more accurate.
     """
     cull = settings.cull
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
@@ -50,7 +50,7 @@ def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: Sur
 def _left_alone(
     keyframes: NDArray[np.int64], track: NDArray[np.int64], redundant: NDArray[np.bool_], least: int
 ) -> NDArray[np.bool_]:
-    """(K,) keyframes next to redundant ones that share fewer tracks than `least` with those that are not."""
+    """Return (K,) keyframes next to redundant ones that share fewer tracks than `least` with the others."""
     used = ~redundant[keyframes]
     shared = used & (np.bincount(track[used], minlength=len(track))[track] > 1)
     beside = np.zeros(len(redundant), bool)
@@ -60,7 +60,7 @@ def _left_alone(
 
 
 def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> SurveyState:
-    """The state of all other keyframes; no inertial factor joins those between which redundant ones leave a long gap."""
+    """Return the state of all other keyframes; inertial factors do not span long gaps left by redundant ones."""
     if not redundant.any():
         return state
     part, chosen = state.of(~redundant), np.flatnonzero(~redundant)
@@ -71,10 +71,10 @@ def without_redundant(state: SurveyState, redundant: NDArray[np.bool_]) -> Surve
 def adjust_visits(
     state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_], rounds: int
 ) -> SurveyState:
-    """Final adjustment of all keyframes but redundant ones (K,), which are then localized among its landmarks."""
+    """Run the final adjustment without redundant keyframes (K,), and then localize those among its landmarks."""
     if not redundant.any():
         held = [state]
-        del state  # or its observations would be in memory twice
+        del state  # otherwise its observations would be in memory twice
         return bundle_rounds(held.pop(), settings, rounds=rounds, final=True)
     part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
     numbers = np.flatnonzero(~redundant)
@@ -84,7 +84,7 @@ def adjust_visits(
 
 
 def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
-    """`state` with the used keyframes (K,) as they are in `part`."""
+    """Return `state` with the used keyframes (K,) from `part`."""
     motion = state.motion
     map_from_body, velocities = state.map_from_body.copy(), motion.velocities_mps.copy()
     gyro_bias, accel_bias = motion.gyro_bias_radps.copy(), motion.accel_bias_mps2.copy()
@@ -97,7 +97,7 @@ def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: Survey
 def _seen_by(
     redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: NDArray[np.int64]
 ) -> Landmarks:
-    """What redundant keyframes observe of `adjusted`, which is left of `marks`; numbers: those of the adjusted keyframes in `marks`."""
+    """Return redundant keyframes' observations of `adjusted`, the rest of `marks`; numbers: of the adjusted keyframes in `marks`."""
     stride = int(marks.obs_feature.max(initial=0)) + 1
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
     first = adjusted.firsts
@@ -111,7 +111,7 @@ def _seen_by(
 
 
 def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[np.bool_]) -> SurveyState:
-    """The redundant keyframes by their observations of landmarks that are held, and by the IMU; outliers are dropped."""
+    """Locate the redundant keyframes by their observations of fixed landmarks, and by the IMU; outliers are dropped."""
     for how in (settings.rough_bundle, settings.final_bundle):
         result = optimize(replace(bundle_problem(state, settings, redundant), points_held=True), how)
         keep = result.squared_sigmas < settings.noise.cut_sigmas**2
@@ -121,7 +121,7 @@ def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[n
 
 
 def _together(adjusted: Landmarks, numbers: NDArray[np.int64], placed: Landmarks) -> Landmarks:
-    """The same landmarks with the observations of both; those that were adjusted first."""
+    """Return the same landmarks with the observations of both, the adjusted ones first."""
     adjusted = replace(adjusted, obs_keyframe=numbers[adjusted.obs_keyframe].astype(np.int32))
     both = Landmarks.concatenated(adjusted.points_map, [adjusted, placed])
     order = np.argsort(both.obs_landmark, kind="stable")

@@ -1,1 +1,1 @@
-"""Mapping while the survey drives: a local map at the newest keyframes, loops, and a pose graph."""
+"""Mapping during the drive: a local map at the newest keyframes, loops, and a pose graph."""

@@ -1,7 +1,7 @@
-"""Map that grows keyframe by keyframe: local adjustment of the newest ones, loops behind the same gate as a build, pose graph.
+"""Map that grows keyframe by keyframe: local adjustment of the newest ones, loops with the same gate as in a build, pose graph.
 
-It is what operators see while a survey drives. The finished map is made by a build of the whole recording, which matches again where
-the loops put keyframes, and adjusts everything together.
+Operators see it during a survey. The finished map is made by a build of the whole recording, which matches again at the
+poses after loop closure, and adjusts everything together.
 """
 
 from collections.abc import Sequence
@@ -32,59 +32,59 @@ from mapserver.survey.tracks.mono_depths import MonoDepths
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks import build_landmarks, tracks_of
 
-_WINDOW = 10  # keyframes that move while the chain grows: what the newest one shares points with
-_HELD = 2  # of the window's oldest, to which the others are tied
-_MIN_OBSERVATIONS = 30  # below which odometry alone places a keyframe
+_WINDOW = 10  # keyframes adjusted with the newest one, with which it shares points
+_HELD = 2  # the window's oldest, which are fixed
+_MIN_OBSERVATIONS = 30  # below, a keyframe is located by odometry alone
 _ROTATION_SIGMA_RAD = 0.02
-_LOST = 100.0  # times the variance of what pictures say, from which on odometry has lost a frame that they have not
+_LOST = 100.0  # ratio to the images' variance, above which odometry counts as lost
 _NEWEST = 12
-_BELONGING = 2  # keyframes of which a map can be made
-_ADJUST_EVERY_S = 0.4  # keyframes that follow more quickly are adjusted with the next one
-_WIDE = 25.0  # factor on odometry's covariance where it only decides what pictures leave open
+_BELONGING = 2  # least keyframes of a map
+_ADJUST_EVERY_S = 0.4  # keyframes at shorter intervals are adjusted with the next one
+_WIDE = 25.0  # factor on odometry's covariance where it only determines what pictures cannot
 
 
 class LiveMap:
-    """Takes every keyframe in turn; what it makes of them depends on nothing else."""
+    """Processes every keyframe in order; the result depends on nothing else."""
 
     def __init__(self, options: SurveyConfig, rig: LiveRig) -> None:
-        """rig: of one camera, features get their depths from the keyframes of the window."""
+        """rig: with one camera, features get their depths from the keyframes of the window."""
         self._options, self._settings, self._rig = options, options.settings, rig
         self._camera = survey_camera(rig.camera)
         self._depths = MonoDepths([], self._camera, options.settings) if rig.camera.baseline_m == 0 else None
         self._keyframes: list[Keyframe] = []
         self._news: list[NewKeyframe] = []
-        self._chain_from_body: list[Array] = []  # adjusted in windows, moved by no loop
+        self._chain_from_body: list[Array] = []  # adjusted in windows, not moved by loops
         self._walked_m2: list[float] = [0.0]
         self._pairs: list[PairMatch] = []
-        self._points_body: list[Array] = []  # of the landmarks whose reference each keyframe is
+        self._points_body: list[Array] = []  # landmarks by their reference keyframe
         self._step_covs: list[Array] = []
         self._chain: list[PoseEdge] = []
-        self._loop_weights = np.zeros(0)  # 1 believed, 0 not
+        self._loop_weights = np.zeros(0)  # 1 accepted, 0 not
         self._map_from_body = np.zeros((0, 4, 4))
         self._closer: LoopCloser | None = None
         self._marginals: GraphMarginals | None = None
         self._level = np.eye(3)
         self._adjusted_ns = 0
         self._seeing = np.zeros(0, bool)
-        self._parts = KeyframeGroups()  # by what keyframes share with their neighbours, and by odometry
-        self._joined = KeyframeGroups()  # by loops as well, as the loop closer has it
+        self._parts = KeyframeGroups()  # by points shared with neighbours, and by odometry
+        self._joined = KeyframeGroups()  # also by loops, as in the loop closer
 
     def __len__(self) -> int:
         return len(self._keyframes)
 
     @property
     def map_from_body(self) -> Array:
-        """(K, 4, 4) of the keyframes as loops place them, upright."""
+        """(K, 4, 4) of the keyframes after loop closure, upright."""
         return np.asarray(se3(self._level, np.zeros(3)) @ self._map_from_body)
 
     def points_map(self) -> Array:
-        """(N, 3) landmarks, each carried by the keyframe from which it was seen first."""
+        """(N, 3) landmarks, each moved with the keyframe that saw it first."""
         placed = self.map_from_body
         parts = [p @ t[:3, :3].T + t[:3, 3] for p, t in zip(self._points_body, placed, strict=True)]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
     def loops(self) -> LiveLoops:
-        """What became of revisits."""
+        """Outcome of revisits."""
         found, refused, best = self._loops(), dict[str, int](), dict[int, LoopRecord]()
         for record in found.records:
             if record.verdict is not LoopVerdict.ACCEPTED:
@@ -105,11 +105,11 @@ class LiveMap:
         return LiveLoops(ends, refused, newest)
 
     def _loops(self) -> Loops:
-        """All candidates so far, and the loops that the pose graph believes."""
+        """All candidates so far, and the loops accepted by the pose graph."""
         return Loops() if self._closer is None else self._closer.loops.without_outliers(self._loop_weights)
 
     def parts(self) -> LiveParts:
-        """What belongs together: by neighbours, by odometry, and by the loops that are believed."""
+        """Connected parts: by neighbours, by odometry, and by accepted loops."""
         whole = KeyframeGroups(enumerate(self._parts.labels().tolist()), len(self))
         for edge in self._loops().edges:
             whole.join(edge.i, edge.j)
@@ -129,7 +129,7 @@ class LiveMap:
         return LiveParts(labels, spans)
 
     def estimate(self) -> LiveEstimate | None:
-        """Where the newest keyframe is in the map that grows, relative to its first one; LOST while its part is not that map."""
+        """Return the pose of the newest keyframe in the growing map, relative to its first one; LOST while in another part."""
         if len(self) < _BELONGING:
             return None
         parts, newest = self.parts(), len(self) - 1
@@ -153,7 +153,7 @@ class LiveMap:
         return round((self._keyframes[k].stamp_ns - self._keyframes[0].stamp_ns) * 1e-9, 3)
 
     def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
-        """One more keyframe: matched with its neighbours, adjusted with them, and compared with all that came before."""
+        """Add one more keyframe: match and adjust it with its neighbours, and compare it with all earlier ones."""
         keyframe = make_keyframe(frame, new.number, self._rig.camera, self._settings)
         self._keyframes.append(keyframe)
         if len(self._keyframes) > _WINDOW:
@@ -190,13 +190,13 @@ class LiveMap:
         self._close()
 
     def _upright(self) -> Array:
-        """(3, 3) turn of the chain that makes the newest keyframe as upright as odometry knows it: windows have turned the chain."""
+        """Return (3, 3) rotation of the chain that makes the newest keyframe upright by odometry: windows have rotated the chain."""
         new, up = self._news[-1], np.array([0.0, 0.0, 1.0])
         up_body = (new.level_from_frame @ new.frame_from_body[:3, :3]).T @ up
         return rotation_between_vectors(self._chain_from_body[-1][:3, :3] @ up_body, up)
 
     def _matched(self, first: int) -> list[PairMatch]:
-        """The newest keyframe with those of the window that see the same."""
+        """Match the newest keyframe with those of the window that see the same."""
         window, newest = self._keyframes[first:], len(self._keyframes) - 1
         settings, rig = self._settings.pairs, self._rig
         finder = PairFinder(window, self._camera, rig.body_from_cam, settings)
@@ -215,36 +215,36 @@ class LiveMap:
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]
 
     def _place_features(self, first: int) -> None:
-        """Depths of one camera's features, from where the window's keyframes are now."""
+        """Compute depths of one camera's features, from the present poses of the window's keyframes."""
         if self._depths is not None:
             self._depths.grow(self._keyframes)
             placed = np.array(self._chain_from_body)
             self._keyframes[first:] = self._depths.keyframes_at(placed, self._rig.body_from_cam, first)
 
     def _step_cov(self, by_odometry: Array, found: Sequence[PairMatch]) -> Array:
-        """(6, 6) of the step to the newest keyframe: a frame that odometry lost may be tied to the one before by what both see."""
+        """Return (6, 6) of the step to the newest keyframe: common images may connect a frame lost by odometry to the previous one."""
         for pair in found:
             if pair.i == pair.j - 1:
                 edge = body_edge(pair, self._rig.body_from_cam)
-                carry = adjoint(se3_inverse(edge.i_from_j))  # from the axes of the newest to those of the one before
+                carry = adjoint(se3_inverse(edge.i_from_j))  # from the axes of the newest to those of the previous one
                 tied = carry @ edge.cov_rot_trans @ carry.T
                 if np.trace(by_odometry[:3, :3]) > _LOST * np.trace(tied[:3, :3]):
                     return np.asarray(tied)
         return by_odometry
 
     def _adjust(self, first: int) -> None:
-        """The window's keyframes by their common points and the motion between them; its oldest ones stay."""
+        """Adjust the window's keyframes by their common points and the motion between them; its oldest ones are fixed."""
         state = self._state(first)
         if len(state.landmarks.obs_keyframe) < _MIN_OBSERVATIONS:
             return
         held = min(_HELD, len(state.stamps_ns) - 1) if first else 1
         free = np.arange(len(state.stamps_ns)) >= held
-        # With an IMU nothing of the chain's beginning is sure but where it is: with the tilt, the speed and the accelerometer bias that
-        # odometry began with, held, the scale of one camera would take up their errors.
+        # With an IMU only the position of the chain's start is fixed: with the initial tilt, speed and accelerometer bias of
+        # odometry fixed too, the scale of one camera would absorb their errors.
         is_open = first == 0 and state.motion.inertial
         free |= is_open
         problem = bundle_problem(state, self._settings, None if is_open else free)
-        if is_open and problem.inertial is not None:  # a second of it does not show the bias
+        if is_open and problem.inertial is not None:  # one second cannot show the bias
             sigma = np.full(9, np.inf)
             sigma[6:] = self._settings.odometry.filter.initial_accel_bias_sigma_mps2
             problem.inertial.priors.append(MotionPrior(0, np.zeros(9), sigma))
@@ -265,7 +265,7 @@ class LiveMap:
         self._keep_points(first, state, keep)
 
     def _keep_points(self, first: int, state: SurveyState, keep: NDArray[np.bool_]) -> None:
-        """Landmarks that enough keyframes of the window agree on, in the axes of the keyframe that saw each first."""
+        """Keep landmarks on which enough keyframes of the window agree, in the axes of the keyframe that saw each first."""
         marks = state.landmarks
         reference = marks.obs_keyframe[np.unique(marks.obs_landmark, return_index=True)[1]]
         seen = np.bincount(marks.obs_landmark[keep], minlength=len(marks.points_map))
@@ -276,7 +276,7 @@ class LiveMap:
             self._points_body[first + n] = (own - map_from_body[:3, 3]) @ map_from_body[:3, :3]
 
     def _state(self, first: int) -> SurveyState:
-        """The window as an adjustment takes it, upright."""
+        """Return the window as the state of an adjustment, upright."""
         rig, news = self._rig, self._news[first:]
         level_from_body = se3(self._level, np.zeros(3)) @ np.array(self._chain_from_body[first:])
         inertial = rig.imu_noise is not None and all(new.inertial for new in news)
@@ -304,7 +304,7 @@ class LiveMap:
         )
 
     def _relative(self, first: int) -> list[RelativeTerm]:
-        """Odometry between the window's neighbours, weakly."""
+        """Return weak odometry between the window's neighbours."""
         terms = []
         for n, (a, b) in enumerate(zip(self._news[first:-1], self._news[first + 1 :], strict=True)):
             assert b.step_cov is not None
@@ -313,7 +313,7 @@ class LiveMap:
         return terms
 
     def _follow(self, first: int) -> None:
-        """The chain's edges and the map's poses of the window as they are adjusted now."""
+        """Update the chain's edges and the map's poses of the window after adjustment."""
         start = max(first - 1, 0)
         del self._chain[start:]
         for k in range(start, len(self._keyframes) - 1):
@@ -325,7 +325,7 @@ class LiveMap:
         self._map_from_body = np.array(placed)
 
     def _connect(self, first: int) -> None:
-        """Which part the newest keyframes belong to, by the same rule as a build's."""
+        """Assign the newest keyframes to parts, by the same rule as a build."""
         joins: list[tuple[int, int]] = []
         for pair in self._pairs:
             self._seeing[[pair.i, pair.j]] = True
@@ -340,7 +340,7 @@ class LiveMap:
             self._joined.join(a, b)
 
     def _close(self) -> None:
-        """Looks for revisits of the newest keyframe; with one more loop the pose graph places all keyframes anew."""
+        """Search revisits of the newest keyframe; with a new loop the pose graph updates all keyframes."""
         newest, rig = len(self._keyframes) - 1, self._rig
         posed = PosedKeyframes(self._keyframes, self._map_from_body, rig.body_from_cam, self._camera)
         matched = [(pair.i, pair.j) for pair in self._pairs if pair.j == newest]

@@ -1,4 +1,4 @@
-"""Values that tracking, the growing map and those who watch it pass to each other."""
+"""Values exchanged between tracking, the growing map and its viewers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import ImuSamples
 
 @dataclass(frozen=True, slots=True)
 class LiveRig:
-    """What saw the survey: the rectified camera, its place on the body, the IMU's noise (None without one) and its clock."""
+    """Sensors of the survey: the rectified camera, its mount on the body, the IMU's noise (None if absent) and its clock."""
 
     camera: StereoCamera
     body_from_cam: Array
@@ -29,11 +29,11 @@ class LiveRig:
 
 @dataclass(frozen=True, slots=True)
 class NewKeyframe:
-    """A frame that the odometry chose.
+    """A frame chosen by the odometry.
 
-    frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) turns that upright as gravity is known now.
-    step_cov (6, 6): of the motion since the keyframe before, axes of that one, rotation first; None for the first. velocity_body_mps
-    and biases (3,); imu: samples since the keyframe before. variance_m2: of the odometry's position, summed over the axes.
+    frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) makes that upright by the present gravity estimate.
+    step_cov (6, 6): of the motion since the previous keyframe, axes of that one, rotation first; None for the first. velocity_body_mps
+    and biases (3,); imu: samples since the previous keyframe. variance_m2: of the odometry's position, summed over the axes.
     """
 
     number: int
@@ -50,9 +50,9 @@ class NewKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class LiveLoops:
-    """Loops so far: ends (L, 2) of those that are believed, keyframe numbers; how many candidates were refused and for which reason.
+    """Loops so far: ends (L, 2) of accepted ones, keyframe numbers; numbers of refused candidates by reason.
 
-    newest: of the last keyframes that matched an old one, the match with most in common, believed or not.
+    newest: for each of the latest keyframes that matched an old one, its best match, accepted or not.
     """
 
     believed: NDArray[np.int64]
@@ -61,7 +61,7 @@ class LiveLoops:
 
 
 class LiveEstimate(NamedTuple):
-    """Where the newest keyframe is: map_from_body (4, 4) and its covariance (6, 6), map axes, rotation first; None while not known."""
+    """Pose of the newest keyframe: map_from_body (4, 4) and its covariance (6, 6), map axes, rotation first; None while unknown."""
 
     keyframe: NewKeyframe
     status: Status
@@ -71,9 +71,9 @@ class LiveEstimate(NamedTuple):
 
 
 class LiveParts(NamedTuple):
-    """Parts of a survey that lost itself: labels (K,) number them in the order of time, -1 for keyframes that saw too little.
+    """Parts of a survey that lost tracking: labels (K,) number them by time, -1 for keyframes that saw too little.
 
-    Only one can be the map, that with most keyframes: those that stay apart when the survey is over are left out.
+    Only one can be the map, the one with the most keyframes: parts still separate at the end are left out.
     """
 
     labels: NDArray[np.int64]
@@ -81,7 +81,7 @@ class LiveParts(NamedTuple):
 
 
 def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples of parts that follow each other."""
+    """Concatenate samples of consecutive parts."""
     return ImuSamples(
         np.concatenate([part.stamps_ns for part in parts]),
         np.concatenate([part.gyro_radps for part in parts]),

@@ -1,4 +1,4 @@
-"""Tracking of a survey under way: the survey's own odometry, frame by frame, and what the growing map needs of its keyframes."""
+"""Tracking of a live survey: the survey's own odometry, frame by frame, and the data of its keyframes for the growing map."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,10 +19,10 @@ _TORN_M2 = 100.0
 
 
 class Tracked(NamedTuple):
-    """One frame as tracking leaves it.
+    """Tracking result of one frame.
 
-    frame_from_body (4, 4); quality: share of its points that agree, 0 while the odometry is lost; keyframe: what the map takes of it,
-    None where it is none; pixels (N, 3), u_left v u_right, of the points that the odometry follows, None where it follows none.
+    frame_from_body (4, 4); quality: share of its consistent points, 0 while the odometry is lost; keyframe: its data for the map,
+    None if it is not one; pixels (N, 3), u_left v u_right, of the tracked points, None without any.
     """
 
     frame: RectifiedFrame
@@ -33,7 +33,7 @@ class Tracked(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """The last keyframe: its place with the covariance, and what was torn until then."""
+    """The last keyframe: its pose with the covariance, and the variance of breaks until then."""
 
     covariance: Array
     frame_from_body: Array
@@ -41,17 +41,17 @@ class _Before(NamedTuple):
 
 
 class LiveTracking:
-    """Takes every frame in turn."""
+    """Processes every frame in order."""
 
     def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
         self._run = OdometryRun(calibration, rectifier, settings)
         self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
-        self._torn_m2 = 0.0  # variance of what lies between runs of one camera
+        self._torn_m2 = 0.0  # variance of the gaps between runs of one camera
         self._before: _Before | None = None
         self._imu: list[ImuSamples] = []
 
     def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> Tracked:
-        """The next frame, with the samples of the IMU and the wheels up to it that were not given before."""
+        """Track the next frame, with the new samples of the IMU and the wheels up to it."""
         tracked = self._run.handle(frame, imu, wheel)
         self._imu.append(imu)
         estimate = tracked.estimate
@@ -62,13 +62,13 @@ class LiveTracking:
         return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe, estimate.track_pixels)
 
     def _has_place(self, estimate: OdometryEstimate) -> bool:
-        """Whether a frame lies to those before: of one camera not until it has started, with an IMU not until the scale is known."""
+        """True if the frame's pose relative to earlier ones is known: with one camera only after its start, with an IMU after scale."""
         if not self._is_single or (
             estimate.status is not OdometryStatus.INITIALISING and estimate.scale_known == self._has_imu
         ):
             return True
         if self._before is not None and not self._has_imu:
-            self._torn_m2 += _TORN_M2  # a new start has a scale of its own
+            self._torn_m2 += _TORN_M2  # a new start has its own scale
         return False
 
     def _keyframe(self, tracked: TrackedFrame) -> NewKeyframe:

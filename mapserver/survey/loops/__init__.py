@@ -1,1 +1,1 @@
-"""Loop closure: candidates by words, gated by position, verified by geometry."""
+"""Loop closure: candidates by bag of words, gated by position, verified by geometry."""

@@ -1,7 +1,7 @@
-"""Groups of keyframes in a survey that loses itself, and when a revisit is sure enough to join two of them.
+"""Groups of keyframes in a survey that lost tracking, and the evidence needed to join two of them by revisits.
 
-Within a group odometry says where keyframes lie to each other, and the gate of `LoopCloser` rests on it. Between groups it says next to
-nothing: one place that looks alike would join them wrongly. So several revisits must agree, over some way.
+Within a group odometry gives the relative poses, and the gate of `LoopCloser` uses them. Between groups they are unknown:
+one similar place would join them wrongly. So several revisits must agree, over some distance.
 """
 
 from collections.abc import Iterable
@@ -14,14 +14,14 @@ from fleetmap.geometry import se3_inverse, so3_log
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
-_MIN_KEYFRAMES = 3  # that agree on where their group lies
-_MIN_WAY_M = 1.0  # between the outermost of them: TRACKING is announced after as much
-_MOST_COMPETITORS = 1 / 3  # keyframes that say otherwise, for each of those that agree
+_MIN_KEYFRAMES = 3  # that agree on the pose of their group
+_MIN_WAY_M = 1.0  # between the outermost of them: TRACKING is reported after the same distance
+_MOST_COMPETITORS = 1 / 3  # contradicting keyframes per agreeing one
 _FLOOR_M, _FLOOR_RAD, _SIGMAS = 0.3, 0.15, 3.0
 
 
 class KeyframeGroups:
-    """Keyframes that belong together, as far as is known (disjoint sets)."""
+    """Groups of connected keyframes (disjoint sets)."""
 
     def __init__(self, joins: Iterable[tuple[int, int]] = (), count: int = 0) -> None:
         self._parents = list(range(count))
@@ -32,23 +32,23 @@ class KeyframeGroups:
         return len(self._parents)
 
     def grow(self, count: int) -> None:
-        """Takes more keyframes, each a group of its own."""
+        """Add keyframes, each as its own group."""
         self._parents += range(len(self._parents), count)
 
     def join(self, a: int, b: int) -> None:
-        """Keyframes a and b belong together; the group is known by its first keyframe."""
+        """Join the groups of keyframes a and b; a group is named by its first keyframe."""
         first, second = sorted((self.of(a), self.of(b)))
         self._parents[second] = first
 
     def of(self, k: int) -> int:
-        """The first keyframe of the group that k is in."""
+        """Return the first keyframe of k's group."""
         while self._parents[k] != k:
             self._parents[k] = self._parents[self._parents[k]]
             k = self._parents[k]
         return k
 
     def labels(self) -> NDArray[np.int64]:
-        """(K,) the group of each keyframe, by its first keyframe."""
+        """Return (K,) the group of each keyframe, by its first keyframe."""
         return np.array([self.of(k) for k in range(len(self._parents))], np.int64)
 
 
@@ -62,12 +62,12 @@ class Revisit:
 
 @dataclass
 class WaitingRevisits:
-    """Revisits between groups, each of which waits for others that agree with it."""
+    """Revisits between groups that wait for others that agree with them."""
 
     _waiting: list[Revisit] = field(default_factory=list)
 
     def add(self, revisit: Revisit, groups: KeyframeGroups, marginals: GraphMarginals) -> list[Revisit]:
-        """One more; all that join its two groups if it makes them sure, an empty list while they are not."""
+        """Add one; return all that join its two groups if it completes the evidence, else an empty list."""
         pair = _pair(revisit, groups)
         beside = [other for other in self._waiting if _pair(other, groups) == pair]
         self._waiting.append(revisit)
@@ -91,7 +91,7 @@ def _pair(revisit: Revisit, groups: KeyframeGroups) -> tuple[int, int]:
 
 
 def _agree(one: Revisit, other: Revisit, marginals: GraphMarginals) -> bool:
-    """Whether two revisits put the new group at the same place, as far as odometry within the groups can say."""
+    """True if two revisits put the new group at the same pose, within the accuracy of odometry within the groups."""
     a, b, placed = one.edge, other.edge, marginals.map_from_body
     new_from_new, old_from_old = (se3_inverse(placed[q]) @ placed[p] for p, q in ((a.i, b.i), (b.j, a.j)))
     off = se3_inverse(b.i_from_j) @ new_from_new @ a.i_from_j @ old_from_old

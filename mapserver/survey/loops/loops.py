@@ -21,25 +21,25 @@ from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, Pred
 
 # Matched points share calibration and depth errors: a pair's own covariance is too narrow by about this factor.
 _CORRELATION = 3.0
-_CHUNK = 64  # candidates that are gated at once
-_SIDES = 16  # to which the site may repeat
-_ALIAS_SCORE = 0.7  # of a candidate's score, from which on another place looks the same
-# Of the view's reach, and of the gate, beyond which a match is of another place for certain
+_CHUNK = 64  # candidates per gating step
+_SIDES = 16  # directions of a possible repetition of the site
+_ALIAS_SCORE = 0.7  # of a candidate's score, above which another place looks the same
+# Of the view's reach, and of the gate, beyond which a match is certainly of another place
 _ALIAS_REACH, _ALIAS_GATE = 0.5, 4.0
-_WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop changes what the gate knows by less than half
-# Known so well, no place can be taken for another: the gate need not learn more. Doubled with every so many loops that it has
-# learned, as they cost memory with their square; what it does not learn leaves it wider, and the next loop can still be learned.
+_WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop improves the gate by less than half
+# At this accuracy no place can be mistaken for another: the gate need not improve further. Doubled with every so many learned
+# loops, as their memory grows with the square; skipped loops leave the gate wider, and the next loop can still be learned.
 _WELL_KNOWN = np.repeat([0.005, 0.05], 3)  # rad, m
 _LEARNED_PER_DOUBLING = 64
-_SAME_SHARE = 0.25  # of its length by which a step may differ from another one to be the same
-_ENOUGH = 3  # keyframes that saw a step before it is believed: one match may be wrong
+_SAME_SHARE = 0.25  # of its length by which two equal steps may differ
+_ENOUGH = 3  # keyframes that must see a step: one match may be wrong
 CONTRADICTED = "contradicts the other loops in the pose graph"
 _WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
-_FAR = "too far apart to see the same, given how well the way between is known"
+_FAR = "too far apart to see the same, given the accuracy of the relative pose"
 
 
 class LoopVerdict(StrEnum):
-    """What became of a candidate."""
+    """Outcome of a candidate."""
 
     ACCEPTED = "accepted"
     GATED_OUT = "gated_out"
@@ -49,9 +49,9 @@ class LoopVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopRecord:
-    """One candidate and its fate: keyframe i (new) against j (old); inliers and the reason in words.
+    """One candidate and its outcome: keyframe i (new) against j (old); inliers and the reason as text.
 
-    also: further old keyframes, less alike than j, refused for the same reason before any was compared in detail.
+    also: further old keyframes, less similar than j, refused for the same reason before a detailed comparison.
     """
 
     i: int
@@ -71,7 +71,7 @@ class Loops:
     edges: list[PoseEdge] = field(default_factory=list)
 
     def counts(self) -> dict[str, int]:
-        """candidates, gated_out, rejected, accepted; ambiguous ones count as rejected."""
+        """Return candidates, gated_out, rejected, accepted; ambiguous ones count as rejected."""
         tally = {verdict: sum(1 + len(r.also) for r in self.records if r.verdict is verdict) for verdict in LoopVerdict}
         return {
             "candidates": sum(tally.values()),
@@ -81,7 +81,7 @@ class Loops:
         }
 
     def without_outliers(self, weights: Array) -> "Loops":
-        """The same with every loop rejected whose pose-graph weight is below one half; one weight for each edge."""
+        """Return the loops, rejecting those with a pose-graph weight below one half; one weight for each edge."""
         outliers = {(e.i, e.j) for e, weight in zip(self.edges, weights, strict=True) if weight < 0.5}
         records = list(self.records)
         for n, r in enumerate(records):
@@ -91,10 +91,10 @@ class Loops:
 
 
 class LoopCloser:
-    """Searches a chain of keyframes for revisits: candidates pass a gate, are verified one by one and decided on together.
+    """Searches a chain of keyframes for revisits: candidates pass a gate, are verified one by one and decided together.
 
-    `marginals` narrows with every loop that is accepted. loops: the outcome so far. learned: loops by which the gate has narrowed.
-    scales: where it is measured, by how much each verified loop's keyframes differ in scale: (log scale, sigma) by (new, old).
+    `marginals` narrows with every accepted loop. loops: the outcome so far. learned: loops used to narrow the gate.
+    scales: if measured, the scale difference of each verified loop's keyframes: (log scale, sigma) by (new, old).
     """
 
     def __init__(
@@ -108,8 +108,8 @@ class LoopCloser:
         *,
         measures_scale: bool = False,
     ) -> None:
-        """matched: pairs of keyframes that were matched as neighbours, and so are no loops. groups: joined here by sure revisits; None
-        where all keyframes belong together.
+        """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits; None
+        if all keyframes belong together.
         """
         self.loops, self.learned = Loops(), list[PoseEdge]()
         self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
@@ -126,7 +126,7 @@ class LoopCloser:
         self.grow(posed, marginals, matched)
 
     def grow(self, posed: PosedKeyframes, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
-        """Takes a longer chain: all keyframes where they are now, those that are known first; `matched` adds to what was given."""
+        """Extend the chain: all keyframes at their present poses, known ones first; `matched` adds to earlier pairs."""
         self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body, marginals
         vocabulary, new = self._config.vocabulary, posed.keyframes[len(self._vectors) :]
         self._vectors += [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in new]
@@ -139,17 +139,17 @@ class LoopCloser:
 
     @property
     def begin(self) -> Array:
-        """(K, 4, 4) from where a pose graph with the loops is to begin: where the keyframes were, unless a loop has turned a group."""
+        """Return (K, 4, 4) initial poses for a pose graph with the loops: unchanged, unless a loop has moved a group."""
         return self._marginals.linearised_at
 
     def close(self, i: int) -> None:
-        """Looks for revisits of keyframe i among those before it, then adds it to the index. To be called in order."""
+        """Search revisits of keyframe i among the earlier ones, then add it to the index. Call in order."""
         candidates = self._gate(i, self._alike(i))
         self._decide(self._verify(i, candidates))
         self._index.add(i, self._vectors[i])
 
     def _alike(self, i: int) -> "_Candidates":
-        """Old keyframes that share words with i and are not matched with it."""
+        """Return old keyframes that share words with i and are not matched with it."""
         ids = self._index.place_ids
         new = i - ids >= self._settings.min_gap_keyframes
         new &= ~np.isin(ids, self._neighbours.get(i, []))
@@ -159,17 +159,17 @@ class LoopCloser:
         return _Candidates(ids, scores, [])
 
     def _gate(self, i: int, found: "_Candidates") -> "_Candidates":
-        """Chooses the candidates that may be seen from where i can be, at most `top`.
+        """Choose at most `top` candidates that may be seen from possible poses of i.
 
-        Appearance alone would fill its best places with other aisles where aisles repeat, so the gate goes down the
-        list, and records what it refused on the way.
+        With repeated aisles the most similar candidates may all be in other aisles, so the gate goes down the
+        list and records the refused ones.
         """
         far, zoned = list[int](), list[int]()
         for start in range(0, len(found.ids), _CHUNK):
             js = found.ids[start : start + _CHUNK]
             reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
             reachable = self._marginals.reachable(i, js, reach_m)
-            # A loop there would tell nothing, and the global adjustment matches what is seen from both.
+            # A loop there would add no information; the global adjustment matches common views anyway.
             apart_m = np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
             known = (apart_m < _ALIAS_REACH * reach_m) & self._marginals.known(i, js, _WELL_KNOWN)
             for n, is_reachable in enumerate(reachable.tolist(), start):
@@ -191,7 +191,7 @@ class LoopCloser:
         return found
 
     def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
-        """The candidates that pass every test alone, with their edges; records the others."""
+        """Return the candidates that pass every single test, with their edges; record the others."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
@@ -200,7 +200,7 @@ class LoopCloser:
             others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
             if len(same) >= self._settings.per_place:
-                reason = f"its place is closed with keyframe {same[0]} already"
+                reason = f"its place is already closed with keyframe {same[0]}"
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
             edge = None if match is None else self._edge(match)
@@ -216,7 +216,7 @@ class LoopCloser:
     def _examined(
         self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
     ) -> tuple[LoopVerdict, str]:
-        """The verdict on one candidate alone, and its reason. aliases: old keyframes that look as much like the new one."""
+        """Return the verdict on one candidate alone, and its reason. aliases: old keyframes as similar to the new one."""
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
@@ -226,7 +226,7 @@ class LoopCloser:
         innovation = self._marginals.innovation_squared(edge)
         if innovation > settings.max_innovation:
             self._learn_repetition(edge, count, innovation)
-            reason = f"matches, but from where the robot cannot be (innovation {innovation:.0f})"
+            reason = f"matches, but from an impossible position (innovation {innovation:.0f})"
             return LoopVerdict.GATED_OUT, reason
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < settings.alone_inliers):
@@ -234,11 +234,11 @@ class LoopCloser:
         shift_m = self._unseen_alias(edge, aliases)
         if shift_m is not None:
             alike = f"places {shift_m:.2f} m apart look the same here"
-            return LoopVerdict.AMBIGUOUS, f"{alike}, and another such step is as possible as this one"
+            return LoopVerdict.AMBIGUOUS, f"{alike}, and another such step is equally possible"
         return LoopVerdict.ACCEPTED, "verified"
 
     def _decide(self, verified: list[tuple[PoseEdge, LoopRecord]]) -> None:
-        """Accepts what is left, unless the candidates exclude each other: then none is."""
+        """Accept the remaining candidates, or none if they exclude each other."""
         places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e, _ in verified]
         spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
         js = np.array([edge.j for edge, _ in verified], np.int64)
@@ -272,16 +272,16 @@ class LoopCloser:
             self._map_from_body = self._marginals.map_from_body
 
     def _are_apart(self, j: int, others: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(M,) whether old keyframes are other places than j: they cannot be seen from where it is."""
+        """Return (M,) True for old keyframes at other places than j: they cannot be seen from there."""
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
         return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
     def _unseen_alias(self, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
-        """How far off the robot could be too if the site repeats as it is seen to, or said to; None where it cannot be.
+        """Return the possible position error if the site repeats as seen or configured; None if no alias is possible.
 
-        Twins look like the old keyframe; those that lie elsewhere count. The way to each of them is a step by which the site repeats,
-        perhaps also to a place where no keyframe is yet: a first visit must not be taken for a return. So are the steps that aliases
-        anywhere in the site have shown.
+        Aliases resemble the old keyframe; those at other places count. The offset to each of them is a step of repetition of the site,
+        perhaps also to a place without keyframes so far: a first visit must not be taken for a return. So are the steps shown
+        by aliases anywhere in the site.
         """
         ways = np.zeros((0, 3))
         if len(aliases):
@@ -296,10 +296,10 @@ class LoopCloser:
         return float(lengths_m.min()) if len(lengths_m) else None
 
     def _learn_repetition(self, edge: PoseEdge, count: int, innovation: float) -> None:
-        """What matches from where the robot cannot be is an alias of its place: the way between the two is a step of the site.
+        """Learn a step of the site: a match from an impossible position is an alias, and its offset a step.
 
-        Not where the graph may misjudge a true revisit: aliases are far apart, seen by what both see, and by what the graph knows. Both
-        must be turned alike: a site repeats by steps, and not by turns.
+        Not if the graph may misjudge a true revisit: aliases are far apart by covisibility and by the graph. Both
+        must have the same orientation: a site repeats by translations, not by rotations.
         """
         here = self._map_from_body[edge.i]
         step_m = (self._map_from_body[edge.j] @ se3_inverse(edge.i_from_j))[:3, 3] - here[:3, 3]
@@ -323,7 +323,7 @@ class LoopCloser:
         return np.asarray(cam_from_map @ self._map_from_body[i] @ body_from_cam)
 
     def _predict(self, i: int, j: int) -> tuple[int, int, PredictedMotion]:
-        """The motion by which to match j (as reference) with i; the graph's rotation is used where it is known well enough."""
+        """Return the predicted motion to match j (as reference) with i; the graph's rotation is used if it is accurate enough."""
         sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
         known = max(sigma, 0.02) if sigma < self._settings.rotation_sigma_limit_rad else None
         return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
@@ -336,7 +336,7 @@ class LoopCloser:
         return body_edge(match, self._posed.body_from_cam)
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
-        """Whether a covisible neighbour of the old keyframe, placed by this match, matches too; None where none can be seen."""
+        """True if a covisible neighbour of the old keyframe, located by this match, matches too; None if none is visible."""
         i, j = match.j, match.i
         tried = 0
         for n in sorted(self._neighbours.get(j, []), key=lambda n: abs(n - j))[:4]:
@@ -354,10 +354,10 @@ class LoopCloser:
 
 
 class Repetition:
-    """What look-alikes of one place teach about all others, in map axes.
+    """Steps of repetition learned from aliases of single places, in map axes.
 
-    Aisles are built alike at one distance. Where the first two are told apart the way between them is known; where the robot later
-    knows its place to no better than that way, a view that fits an old aisle fits one beside it as well, even if that was never seen.
+    Aisles are identical at one distance. If the first two are distinguished, their offset is known; if the robot later
+    knows its position only to about that offset, a view that fits an old aisle also fits a neighbouring one, even one never seen.
     """
 
     def __init__(self) -> None:
@@ -366,9 +366,9 @@ class Repetition:
         self._seen_by: list[set[int]] = []
 
     def see(self, keyframe: int, step_m: Array, variance_m2: float) -> None:
-        """A keyframe looks like a place that is step_m (3,) from where it must be, known to variance_m2 along each axis."""
+        """Record that a keyframe resembles a place at step_m (3,) from its true one, known to variance_m2 along each axis."""
         weight = 1.0 / variance_m2
-        # Whoever repeats by a step repeats by its opposite.
+        # A repetition by a step implies one by its opposite.
         signs = np.where(self._means @ step_m < 0, -1.0, 1.0)
         away = np.linalg.norm(signs[:, None] * self._means - step_m, axis=1) if len(signs) else np.zeros(0)
         n = int(np.argmin(away)) if len(away) else 0
@@ -383,14 +383,14 @@ class Repetition:
 
     @property
     def steps_m(self) -> Array:
-        """(M, 3) the steps that enough keyframes saw, and their opposites."""
+        """Return (M, 3) the steps seen by enough keyframes, and their opposites."""
         believed = self._means[[len(seen) >= _ENOUGH for seen in self._seen_by]]
         return np.concatenate([believed, -believed])
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Old keyframes by their likeness to a new one: ids (C,), scores (C,), falling; chosen: the numbers of those that are followed."""
+    """Old keyframes by similarity to a new one: ids (C,), scores (C,), descending; chosen: numbers of those to be verified."""
 
     ids: NDArray[np.int64]
     scores: Array
@@ -398,7 +398,7 @@ class _Candidates:
 
 
 def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
-    """Body i from body j as a loop; the match has camera i (its j) from camera j (its i)."""
+    """Return body i from body j as a loop; the match has camera i (its j) from camera j (its i)."""
     body_from_body = body_from_cam @ match.j_from_i @ se3_inverse(body_from_cam)
     carry = adjoint(body_from_cam)
     covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
@@ -406,7 +406,7 @@ def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
 
 
 def _around(distance_m: float) -> Array:
-    """(16, 3) level steps of one length to all sides, none for no length."""
+    """Return (16, 3) level steps of one length in all directions, empty for length 0."""
     if distance_m <= 0:
         return np.zeros((0, 3))
     angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
@@ -414,7 +414,7 @@ def _around(distance_m: float) -> Array:
 
 
 def _cells(keyframe: Keyframe, features: NDArray[np.int32], camera: StereoCamera) -> int:
-    """How many of 8 x 6 image cells hold one of the features."""
+    """Return how many of 8 x 6 image cells contain a feature."""
     pixels = keyframe.features.pixels[features]
     column = np.clip(pixels[:, 0] / camera.width_px * 8, 0, 7).astype(int)
     row = np.clip(pixels[:, 1] / camera.height_px * 6, 0, 5).astype(int)

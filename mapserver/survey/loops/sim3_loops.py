@@ -1,4 +1,4 @@
-"""Loops of a survey whose scale nothing observes: measured with the scale that drifted, and closed over similarities."""
+"""Loops of a survey with unobservable scale: measured with the drifted scale, and closed over similarities."""
 
 import numpy as np
 
@@ -6,13 +6,13 @@ from fleetmap.geometry import Array, transform_points
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges
 from mapserver.survey.pose_graph.sim3_pose_graph import SimilarityEdge, SimilarityResult, optimize_similarities
 
-_MIN_SHARED = 8  # points with depth in both keyframes below which a loop says nothing about the scale
+_MIN_SHARED = 8  # least points with depth in both keyframes to measure the scale
 _CORRELATION = 3.0  # depths of one keyframe share the errors of its neighbours
 _UNKNOWN_SIGMA = 1.0
 
 
 def measured_log_scale(points_i: Array, points_j: Array, j_from_i: Array) -> tuple[float, float]:
-    """Logarithm of j's lengths per length of i, and its sigma, from points (N, 3) known in both cameras (NaN where not).
+    """Return the logarithm of j's lengths per length of i, and its sigma, from points (N, 3) known in both cameras (NaN if not).
 
     j_from_i was measured in lengths of i; the median over the points' distances, robust to half of them being wrong.
     """
@@ -26,10 +26,10 @@ def measured_log_scale(points_i: Array, points_j: Array, j_from_i: Array) -> tup
 
 
 def gate_covariances(chain: list[PoseEdge], scale_walk: float) -> list[PoseEdge]:
-    """The chain's edges as the position gate must see them: widened by what a wandering scale may do to the way so far.
+    """Return the chain's edges for the position gate: widened by the effect of scale drift on the path so far.
 
     A scale that walks by `scale_walk` for each keyframe shifts the end of n edges of length l by about scale_walk n^1.5 l / sqrt 3;
-    independent edges add up to as much where each has scale_walk times the way so far.
+    independent edges add up to as much if each has scale_walk times the path so far.
     """
     widened, way_m = [], 0.0
     for edge in chain:
@@ -47,9 +47,9 @@ def solve_scaled(
     scales: dict[tuple[int, int], tuple[float, float]],
     scale_walk: float,
 ) -> SimilarityResult:
-    """The bodies that agree best with chain and loops, each loop with its measured change of scale.
+    """Return the bodies with the best fit to chain and loops, each loop with its measured change of scale.
 
-    `scales` says for loop (i, j) the logarithm of i's lengths per length of j, with sigma. Scales are in the distances between places.
+    `scales`: for loop (i, j) the logarithm of i's lengths per length of j, with sigma. Scales are contained in the distances of places.
     SurveyError as `check_edges`.
     """
     check_edges(len(map_from_body), [*chain, *loops])
@@ -59,7 +59,7 @@ def solve_scaled(
 
 
 def _edge(edge: PoseEdge, log_scale: float, sigma: float) -> SimilarityEdge:
-    """The loop's i_from_j was measured in lengths of j: in lengths of i its translation is longer by the scale."""
+    """Convert the loop's i_from_j from lengths of j to lengths of i: its translation is multiplied by the scale."""
     scale = float(np.exp(log_scale))
     carry = np.diag([1.0] * 3 + [scale] * 3)
     cov = np.zeros((7, 7))

@@ -16,20 +16,20 @@ class Zones:
     polygons: dict[str, Array] = field(default_factory=dict)
 
     def at(self, position_m: Array) -> frozenset[str]:
-        """Names of the zones that hold a position (x, y, ...)."""
+        """Return the names of the zones that contain a position (x, y, ...)."""
         place = np.asarray(position_m[None, :2])
         return frozenset(name for name, polygon in self.polygons.items() if inside_rings(place, [polygon])[0])
 
     def compatible(self, a_m: Array, b_m: Array) -> bool:
-        """Whether two positions may see the same."""
+        """True if two positions may see the same."""
         zones_a, zones_b = self.at(a_m), self.at(b_m)
         return not zones_a or not zones_b or bool(zones_a & zones_b)
 
 
 def zones_of(named: dict[str, object], file: str) -> Zones:
-    """Zones from lists of corners [[x, y], ...] by name.
+    """Build zones from lists of corners [[x, y], ...] by name.
 
-    Raises UsageError, naming the file and the zone, for anything but three or more corners of two finite numbers each.
+    Raises UsageError, naming the file and the zone, unless a zone has three or more corners of two finite numbers each.
     """
     if not named:
         raise UsageError(f"{file}: the table [zones] is empty; write name = [[x, y], ...] or leave --zones out")

@@ -1,1 +1,1 @@
-"""A survey joined to a map that is there already: found in it, adjusted together with it, and only what is new is taken over."""
+"""A survey joined to an existing map: located in it, adjusted together with it; only new parts are added."""

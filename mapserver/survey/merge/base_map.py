@@ -1,4 +1,4 @@
-"""The map that a survey is joined to, ready to be looked at from anywhere."""
+"""The map to which a survey is joined, prepared for queries from any pose."""
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from mapserver.survey.survey_map import SurveyMap, history_of
 
 
 class BaseMap:
-    """A SurveyMap read as if `camera` on a rig with `body_from_cam` had made it: the same pinhole, another baseline perhaps.
+    """A SurveyMap converted to `camera` on a rig with `body_from_cam`: the same pinhole, perhaps another baseline.
 
     map_from_cam, map_from_body (K, 4, 4); points_map (N, 3), descriptors (N, 32); obs_pixels (M, 3) and obs_sigma_px (M, 2) as
-    `camera` would have them; references (N,): the first observation of each landmark, -1 without any.
+    in `camera`; references (N,): the first observation of each landmark, -1 without any.
     """
 
     def __init__(self, survey_map: SurveyMap, camera: StereoCamera, body_from_cam: Array) -> None:
@@ -36,11 +36,11 @@ class BaseMap:
         self.references[seen] = first
 
     def visible(self, map_from_cam: Array, margin_px: float, max_view_angle_rad: float) -> VisibleLandmarks:
-        """The landmarks that a camera there should see, in its image widened by margin_px."""
+        """Return the landmarks visible to a camera at this pose, in its image widened by margin_px."""
         return visible_landmarks(self.cones, map_from_cam, self.camera, margin_px, max_view_angle_rad)
 
     def view(self, vocabulary: Vocabulary) -> MapView:
-        """The whole map as robots hold one, but with all landmarks and keyframes and at the archive's precision, not cut into tiles."""
+        """Return the whole map in the robots' form, but with all landmarks and keyframes at the archive's precision, not in tiles."""
         cones, old = self.cones, self.map
         order = np.argsort(old.obs_keyframe, kind="stable")
         ends = np.cumsum(np.bincount(old.obs_keyframe, minlength=len(self.map_from_cam)))
@@ -63,21 +63,21 @@ class BaseMap:
         return MapView([whole], vocabulary, self.camera.focal_px)
 
     def reference_cameras(self, rows: Rows) -> Array:
-        """(V, 4, 4) map_from_cam of the keyframes that the patches of `rows` were cut from."""
+        """Return (V, 4, 4) map_from_cam of the source keyframes of the patches of `rows`."""
         return np.asarray(self.map_from_cam[self.map.obs_keyframe[self.references[rows]]])
 
 
 def baseline_ratio(camera: StereoCamera, other: StereoCamera) -> float:
-    """By what disparities of `camera` are larger than the other's; 1 where one of them is a single camera and has none."""
+    """Return the ratio of disparities of `camera` to the other's; 1 if one of them is a single camera without any."""
     return camera.baseline_m / other.baseline_m if camera.baseline_m and other.baseline_m else 1.0
 
 
 def with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array, Array]:
-    """Observations as a pair with another baseline would have made them, farther apart by `ratio`: disparities grow with it."""
+    """Return the observations of a pair with a baseline larger by `ratio`: disparities are scaled."""
     disparity = (pixels[:, 0] - pixels[:, 2]) * ratio
     return np.column_stack([pixels[:, :2], pixels[:, 0] - disparity]), np.asarray(sigmas_px * [1.0, abs(ratio)])
 
 
 def as_recorded(base: BaseMap, pixels: Array, sigmas_px: Array) -> tuple[Array, Array]:
-    """Observations (M, 3), (M, 2) of BaseMap's camera as the camera that made the map would have them."""
+    """Convert observations (M, 3), (M, 2) of BaseMap's camera to the camera that made the map."""
     return with_baseline(pixels, sigmas_px, 1.0 / base.baseline_ratio)

@@ -1,4 +1,4 @@
-"""Changes of a map by a survey: keyframes and landmarks that moved, landmarks that stand elsewhere or are new."""
+"""Changes of a map by a survey: moved keyframes and landmarks, and new landmarks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.state import Keyframe, Landmarks
 
 _CELLS = COLUMNS * ROWS
-_MIN_IN_CELL = 3  # fewer confirmed landmarks do not show that the map lacks something there
+_MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
 _LACKING_SHARE = 0.6
 _KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
 Mask = NDArray[np.bool_]
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 def what_changes(
     base: BaseMap, survey: Survey, joint: JointSolution, gone: Mask, settings: SurveySettings, *, anchored: bool
 ) -> tuple[Change, int, int]:
-    """The change, and how many keyframes and landmarks of the map moved. gone (N,): landmarks that have faded."""
+    """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks."""
     marks, body_from_cam = survey.state.landmarks, survey.state.body_from_cam
     map_from_cam = joint.map_from_body @ body_from_cam
     moved_keyframes = np.zeros(len(base.map_from_cam), bool)
@@ -58,7 +58,7 @@ def what_changes(
 
 
 def known_well(survey: Survey, joint: JointSolution, settings: SurveySettings) -> Mask:
-    """(N,) own landmarks of the survey that are seen under an angle that places them, as a survey demands of those it hands on."""
+    """Return (N,) own landmarks of the survey with enough parallax, as required of landmarks in a map."""
     took_part = np.isfinite(joint.own_points_map).all(axis=1)
     marks = replace(survey.state.landmarks, points_map=np.nan_to_num(joint.own_points_map))
     placed = replace(survey.state, map_from_body=joint.map_from_body, landmarks=marks)
@@ -66,7 +66,7 @@ def known_well(survey: Survey, joint: JointSolution, settings: SurveySettings) -
 
 
 def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSettings) -> Mask:
-    """(B,) keyframes of the map that the new survey moved by more than their anchors admit."""
+    """Return (B,) keyframes of the map that the new survey moved by more than their anchors allow."""
     before = base.map_from_body[joint.base_keyframes]
     shift_m = np.linalg.norm(joint.base_from_body[:, :3, 3] - before[:, :3, 3], axis=1)
     turns = joint.base_from_body[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
@@ -78,10 +78,10 @@ def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSetti
 def _moved_points(
     base: BaseMap, joint: JointSolution, judged: Shift, moved_keyframes: Mask, cameras: Array, *, anchored: bool
 ) -> tuple[Array, Mask]:
-    """Where the map's landmarks (N, 3) are, and which (N,) moved with the keyframes that saw them.
+    """Return the positions of the map's landmarks (N, 3), and which (N,) moved with their keyframes.
 
-    Seen ones go where the adjustment put them, the others with the keyframe that their patch was cut from; in a published
-    map what was seen and did not move significantly stays.
+    Seen ones are at their adjusted positions, the others move with the keyframe of their patch; in a published
+    map, seen landmarks without significant motion are unchanged.
     """
     points, references = base.points_map.copy(), base.map.obs_keyframe[base.references]
     moved = moved_keyframes[references] & (base.references >= 0)
@@ -102,10 +102,10 @@ def _new_landmarks(
     free: NDArray[np.bool_],
     settings: SessionSettings,
 ) -> NDArray[np.bool_]:
-    """(N,) of the survey's own landmarks those that the map should gain; free (M,) are observations that show none of the map's.
+    """Return (N,) own landmarks of the survey to add to the map; free (M,): observations that show none of the map's.
 
-    A part of a picture (one of 48) is covered where landmarks of the map are seen in it, at least `covered_share` as many
-    as new ones; a landmark is new where most of the parts in which it is seen are not.
+    A part of a picture (one of 48) is covered if at least `covered_share` as many landmarks of the map are seen in it
+    as new ones; a landmark is new if most of its parts are not covered.
     """
     counts = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map))
     confirmed = (counts >= settings.min_confirmations) & np.isfinite(joint.own_points_map).all(axis=1)
@@ -125,7 +125,7 @@ def _new_landmarks(
 
 
 def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence[Sighting | None]) -> Landmarks:
-    """Landmarks of the map as the new survey alone knows them: rows (R,) at points_map (R, 3) with their sightings."""
+    """Return landmarks of the map by the new survey alone: rows (R,) at points_map (R, 3) with their sightings."""
     number = np.full(len(base.points_map), -1)
     number[rows] = np.arange(len(rows))
     seen = [(k, s.only(number[s.rows] >= 0)) for k, s in enumerate(sightings) if s is not None]
@@ -141,7 +141,7 @@ def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence
 
 
 def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:
-    """The same landmarks with observations by fewer keyframes: taken in greedily until each has `enough`, or all it had."""
+    """Return the same landmarks with observations by fewer keyframes: chosen greedily until each has `enough`, or all it had."""
     needed = np.minimum(np.bincount(marks.obs_landmark, minlength=len(marks.points_map)), enough)
     taken: list[int] = []
     left = np.unique(marks.obs_keyframe).tolist()

@@ -1,7 +1,7 @@
-"""Confirmation of a map by a session: of the parts of the map that it should see, how many it sees again. Pure.
+"""Confirmation of a map by a session: the share of its expected parts that it sees again. Pure.
 
-The unit is a cell of space, not a landmark: landmarks of one thing stay or go together, and a session that is placed wrongly finds
-again what halls share (walls, columns, the ends of racks), many landmarks of few things.
+The unit is a cell of space, not a landmark: landmarks of one object stay or vanish together, and a wrongly located session also
+sees the common parts of halls (walls, columns, the ends of racks), many landmarks of few objects.
 """
 
 from collections.abc import Sequence
@@ -21,23 +21,23 @@ from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 
 EDGE_PX = 12.0
-_BESIDE_PX = 25.0  # so near a measured corner, what lies far behind it is hidden by the same thing
+_BESIDE_PX = 25.0  # distance within which a measured corner hides farther points
 WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
-_WINDOW_PX, _DISPARITY_PX = 4.0, 2.0  # around a prediction that is good to a centimetre at two metres
-_MATCHING = FixSettings(guided_distance=60)  # bits: two views of one thing differ by some 40, two things by 128
-# A thing, and things that may share their fate: goods on one pallet, pictures on one wall
+_WINDOW_PX, _DISPARITY_PX = 4.0, 2.0  # around a prediction accurate to 1 cm at 2 m
+_MATCHING = FixSettings(guided_distance=60)  # bits: two views of one object differ by about 40, two objects by 128
+# An object, and objects that may change together: goods on one pallet, pictures on one wall
 _CELL_M, _BLOCK_M = 0.75, 1.5
-_FIRM_OBSERVATIONS = 4  # keyframes of the map by which a landmark is one that is found again
-_MIN_LANDMARKS = 4  # of a cell that is judged
-_SEEN_SHARE = 1 / 3  # of a cell's landmarks; by chance one in some hundred is found, of what stands there most are
+_FIRM_OBSERVATIONS = 4  # keyframes of the map that must observe a landmark to expect it again
+_MIN_LANDMARKS = 4  # for a cell to be judged
+_SEEN_SHARE = 1 / 3  # of a cell's landmarks; by chance about 1 % match, of present objects most
 
 
 @dataclass(frozen=True, slots=True)
 class Confirmation:
-    """Cells of the map that a session should see, and those that it sees; low, high: bounds of their share at the test's error rate.
+    """Cells of the map that a session should see, and those seen; low, high: bounds of their share at the test's error rate.
 
-    blocks: in which the cells lie.
+    blocks: of the cells.
     """
 
     cells: int
@@ -48,19 +48,19 @@ class Confirmation:
 
     @property
     def share(self) -> float:
-        """Of the expected cells those that were seen; 0 without any."""
+        """Share of the expected cells that were seen; 0 without any."""
         return self.seen / max(self.cells, 1)
 
 
 def firm_landmarks(count: int, obs_landmark: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(N,) which of `count` landmarks enough keyframes of the map observe (M,) to expect that others find them too."""
+    """Return (N,) which of `count` landmarks are observed (M,) by enough keyframes of the map to be expected again."""
     return np.bincount(obs_landmark, minlength=count) >= _FIRM_OBSERVATIONS
 
 
 def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
-    """(V,) which visible landmarks a picture with features at pixels (F, 3) should show.
+    """Return (V,) which visible landmarks a picture with features at pixels (F, 3) should show.
 
-    Their octave is one that is searched, and no corner beside them is much nearer.
+    Their octave is searched, and no corner beside them is much nearer.
     """
     fits = np.asarray((expected.octaves > 0.0) & (expected.octaves < _MAX_OCTAVE))
     known = np.flatnonzero(np.isfinite(pixels[:, 2]))
@@ -76,7 +76,7 @@ def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
 def look(
     view: MapView, camera: StereoCamera, query: FrameFeatures, map_from_cam: Array
 ) -> tuple[Rows, NDArray[np.bool_]]:
-    """Rows (V,) of the landmarks that a picture from there should show, and which of them it shows: the place is not refined."""
+    """Return rows (V,) of the landmarks expected in a picture at this pose, and which of them it shows: the pose is not refined."""
     expected = view.visible(map_from_cam, camera, -EDGE_PX, WIDER_VIEW_RAD)
     shown = due(expected, query.pixels)
     expected = VisibleLandmarks(expected.rows[shown], expected.pixels[shown], expected.octaves[shown])
@@ -92,9 +92,9 @@ def look(
 def confirmation(
     points_map: Array, looks: Sequence[tuple[Rows, NDArray[np.bool_]]], firm: NDArray[np.bool_], error_rate: float
 ) -> Confirmation:
-    """Of the cells in which landmarks (N, 3) that are `firm` (N,) are expected by two looks and more, those with enough of them seen.
+    """Return the cells in which `firm` landmarks (N, 3) are expected by two or more views, and those with enough of them seen.
 
-    The bounds are those of Clopper and Pearson 1934 for as many independent cells as have the measured variance: blocks of cells
+    The bounds are those of Clopper and Pearson 1934 for the number of independent cells with the measured variance: blocks of cells
     are the clusters of the sample. Source: Cochran 1977, Sampling Techniques, section 9A.
     """
     expected, seen = np.zeros(len(points_map), np.int64), np.zeros(len(points_map), np.int64)
@@ -112,7 +112,7 @@ def confirmation(
 
 
 def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Confirmation:
-    """The share of cells (C,) in blocks (C, 3), with its bounds."""
+    """Return the share of cells (C,) in blocks (C, 3), with its bounds."""
     count = len(is_seen)
     if count == 0:
         return Confirmation(0, 0, 0, 0.0, 1.0)

@@ -17,7 +17,7 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe
 
-_CORRELATION = 3.0  # as of loops: what matched points share makes a fix worse than its own covariance says
+_CORRELATION = 3.0  # as for loops: common errors of matched points make a fix's covariance too small
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,16 +30,16 @@ class Sighting:
     sigmas_px: Array
 
     def only(self, keep: NDArray[np.bool_]) -> "Sighting":
-        """Some of it."""
+        """Return the chosen part."""
         return Sighting(self.rows[keep], self.features[keep], self.pixels[keep], self.sigmas_px[keep])
 
 
 def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveySettings) -> Relocalizer:
-    """The robots' relocalizer over the whole map at the archive's precision, with the survey's settings.
+    """Return the robots' relocalizer over the whole map at the archive's precision, with the survey's settings.
 
-    Two things differ from a robot's, for a reason. The view holds all landmarks as the archive has them, not the chosen ones rounded
-    to a tile's grid: what is matched becomes observations of the adjustment. And inliers, windows and sigmas are the survey's: a
-    wrong join spoils a map for good, whereas a robot's next fix corrects a wrong one.
+    It differs from a robot's in two ways. The view has all landmarks of the archive, not the chosen ones rounded
+    to a tile's grid: matches become observations of the adjustment. And inliers, windows and sigmas are the survey's: a
+    wrong join damages a map permanently, whereas a robot's next fix corrects a wrong one.
     """
     return Relocalizer(base.view(vocabulary), base.camera, session_relocalization(settings))
 
@@ -66,7 +66,7 @@ def session_relocalization(settings: SurveySettings) -> RelocalizerSettings:
 
 
 def keyframe_features(keyframe: Keyframe) -> FrameFeatures:
-    """A keyframe's features as the relocalizer takes them."""
+    """Return a keyframe's features for the relocalizer."""
     pixels = keyframe.features.pixels
     return FrameFeatures(keyframe.features, np.column_stack([pixels, pixels[:, 0] - keyframe.disparities[:, 0]]))
 
@@ -79,7 +79,7 @@ def match_keyframe(
     radius_px: float,
     settings: SurveySettings,
 ) -> Sighting | None:
-    """The landmarks that a keyframe near `map_from_cam` sees, to a fraction of a pixel; None where too few agree."""
+    """Return the landmarks seen by a keyframe near `map_from_cam`, at subpixel accuracy; None if too few agree."""
     fix = relocalizer.by_projection(keyframe_features(keyframe), map_from_cam, radius_px)
     if fix is None or fix.matches is None:
         return None
@@ -90,7 +90,7 @@ def match_keyframe(
 def _refined(
     base: BaseMap, keyframe: Keyframe, rows: Rows, features: Rows, cam_from_map: Array, settings: SurveySettings
 ) -> Sighting:
-    """Coordinates from the landmarks' patches where those agree, else the corner's own with a wider sigma."""
+    """Return coordinates from the landmarks' patches if those agree, else the corner's own with a wider sigma."""
     noise = settings.noise
     left = keyframe.features.pixels[features].copy()
     sigma = noise.descriptor_sigma_px * SCALE_FACTOR ** keyframe.features.octaves[features].astype(np.float64)
@@ -107,16 +107,16 @@ def _refined(
 def _aligned(
     base: BaseMap, keyframe: Keyframe, rows: Rows, features: Rows, cam_from_map: Array, settings: SurveySettings
 ) -> Array:
-    """(P, 3) as patch_align.refine_matches, against the landmarks' patches instead of whole pictures."""
+    """Return (P, 3) as patch_align.refine_matches, against the landmarks' patches instead of whole pictures."""
     octaves = base.map.obs_octave[base.references[rows]]
     sizes = 2.0 ** patch_align.halvings(octaves)[:, None]
     exact = base.map.obs_pixels[base.references[rows], :2] / sizes
     side = base.map.patches.shape[1]
     mosaic = np.ascontiguousarray(base.map.patches[rows].reshape(-1, side))
     centres = exact - np.rint(exact) + side // 2
-    # Patches lie below each other: a window that leaves its patch sideways would leave it up or down too.
+    # Patches are stacked vertically: a window that leaves its patch sideways would also leave it up or down.
     centres[:, 1] += side * np.arange(len(rows))
-    # Each patch was cut on its own level, and so the mosaic is that of all.
+    # Each patch was cut at its own level, which is the level of the mosaic.
     reference = patch_align.Patches((mosaic, mosaic, mosaic), centres * sizes, octaves)
     seen = keyframe.features.take(features)
     current = patch_align.Patches(keyframe.pyramid, seen.pixels, seen.octaves)
@@ -124,7 +124,7 @@ def _aligned(
 
 
 def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
-    """(P, 2, 2) reference_from_current for pixel offsets; NaN where degenerate."""
+    """Return (P, 2, 2) reference_from_current for pixel offsets; NaN if degenerate."""
     cameras = base.reference_cameras(rows)
     warps = np.empty((len(rows), 2, 2))
     order = base.map.obs_keyframe[base.references[rows]]

@@ -1,8 +1,8 @@
-"""One adjustment of the map's keyframes and the new survey's.
+"""Joint adjustment of the map's keyframes and the new survey's.
 
-A map that robots have is held: each keyframe stays where it was unless much speaks against it. A map that is only being made is
-held by what it knows of itself: all that its surveys have seen and felt takes part, as in the final adjustments of maplab (Schneider
-et al. 2018) and ORB-SLAM3 (Campos et al. 2021), so that it bends only where the new survey knows better.
+A published map is anchored: each keyframe stays unless the evidence against its pose is strong. A map in construction is
+constrained by its own data: all observations and inertial terms of its surveys take part, as in the final adjustments of maplab (Schneider
+et al. 2018) and ORB-SLAM3 (Campos et al. 2021), so that it changes only where the new survey is more accurate.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,9 @@ from mapserver.survey.survey_map import SurveyMap, history_of
 
 @dataclass(frozen=True)
 class Measured:
-    """What holds a map, at its optimum: the observations, motion and priors of its keyframes.
+    """Constraints of a map, at its optimum: the observations, motion and priors of its keyframes.
 
-    keyframes (K,), landmarks (N,): the numbers that those of the map have in the problem, -1 for what takes no part.
+    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, -1 if not included.
     """
 
     problem: BundleProblem
@@ -40,12 +40,12 @@ class Measured:
 
 @dataclass(frozen=True)
 class JointSolution:
-    """What the adjustment found.
+    """Result of the adjustment.
 
-    map_from_body (K, 4, 4) of the new keyframes; base_keyframes (B,) of the map that took part, base_from_body (B, 4, 4) where
-    they are now; base_rows (R,) landmarks of the map that took part, base_points_map (R, 3); own_points_map (N, 3) of the
-    survey's own landmarks, NaN where they took no part; sightings without those that did not fit. measured: the problem at its optimum,
-    the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 where they took no part.
+    map_from_body (K, 4, 4) of the new keyframes; base_keyframes (B,) of the map that took part, base_from_body (B, 4, 4) their
+    poses; base_rows (R,) landmarks of the map that took part, base_points_map (R, 3); own_points_map (N, 3) of the
+    survey's own landmarks, NaN if not included; sightings without outliers. measured: the problem at its optimum,
+    the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 if not included.
     """
 
     map_from_body: Array
@@ -69,12 +69,11 @@ def adjust_jointly(
     *,
     finely: bool,
 ) -> JointSolution:
-    """Old and new keyframes and landmarks that fit all observations best; map_from_body (K, 4, 4) is where the new ones start.
+    """Return old and new keyframes and landmarks with the best fit to all observations; map_from_body (K, 4, 4): start of the new ones.
 
-    known: what holds the map; None for a published one, whose keyframes stay within `anchor_sigma_m`. A survey that sees nothing of
-    the map keeps its shape, and its first keyframe its place. The first adjustment tells what does not fit. finely: a second one takes
-    the redescending cost with measured noise, as a survey's own last one does: at the noise that observations claim, depth edges
-    would pull the scale that the survey had found.
+    known: constraints of the map; None for a published one, whose keyframes stay within `anchor_sigma_m`. A survey without sight of the map
+    keeps its shape, and its first keyframe its pose. The first adjustment finds outliers. finely: a second one uses the redescending cost
+    with measured noise, as in a survey's own last one: with the stated noise, depth edges would bias the scale of the survey.
     """
     final = settings.final_bundle
     for how in (msgspec.structs.replace(final, cutoff_sigmas=np.inf), final)[: 1 + finely]:
@@ -92,20 +91,20 @@ def _solved(
     settings: SurveySettings,
     how: BundleSettings,
 ) -> JointSolution:
-    """One adjustment: first the map's keyframes and landmarks, then the survey's."""
+    """Solve one adjustment: first the map's keyframes and landmarks, then the survey's."""
     marks = state.landmarks
     seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
     known = known or _published(base, state, seen, settings.sessions)
     earlier, old, points = known.problem, len(known.problem.map_from_body), len(known.problem.points_map)
-    # A feature that shows a landmark of the map counts there.
+    # A feature that shows a landmark of the map is counted as its observation.
     free = free_observations(marks, sightings)
     own_used = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map)) >= 2
     own = free & own_used[marks.obs_landmark]
     own_numbers = np.where(own_used, np.cumsum(own_used) - 1 + points, -1)
     turn, carried = _carried(state, map_from_body)
-    rig_from_body = earlier.body_from_cam @ se3_inverse(state.body_from_cam)  # of the body that the problem speaks of
+    rig_from_body = earlier.body_from_cam @ se3_inverse(state.body_from_cam)  # of the body in the problem
     own_rig = bool(np.allclose(rig_from_body, np.eye(4), atol=1e-9))
-    camera = earlier.camera if earlier.camera.baseline_m else state.camera  # only a pair sees distances
+    camera = earlier.camera if earlier.camera.baseline_m else state.camera  # only a pair measures distances
     pixels, sigmas_px = with_baseline(
         np.concatenate([*(s.pixels for _, s in seen), marks.obs_pixels[own]]),
         np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own]]),
@@ -130,7 +129,7 @@ def _solved(
         obs_pixels=np.concatenate([earlier.obs_pixels, pixels]),
         obs_sigma_px=np.concatenate([earlier.obs_sigma_px, sigmas_px]),
     )
-    if own_rig:  # a survey by another mounting takes part by its pictures alone
+    if own_rig:  # a survey with another mount contributes its pictures only
         relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
         problem = replace(problem, relative=earlier.relative + relative)
     problem.inertial = _inertial(earlier, state, turn, settings, own_rig)
@@ -162,7 +161,7 @@ def _solved(
 def _published(
     base: BaseMap, state: SurveyState, seen: Sequence[tuple[int, Sighting]], settings: SessionSettings
 ) -> Measured:
-    """What holds a published map: the landmarks that the survey sees, the keyframes that see them too, and an anchor for each of these."""
+    """Return the constraints of a published map: landmarks seen by the survey, their keyframes, and an anchor for each of these."""
     rows = np.unique(np.concatenate([s.rows for _, s in seen])) if seen else np.zeros(0, np.int64)
     landmarks, keyframes = np.full(len(base.points_map), -1), np.full(len(base.map_from_body), -1)
     landmarks[rows] = np.arange(len(rows))
@@ -186,7 +185,7 @@ def _published(
 
 
 def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
-    """How the survey's keyframes turned (K, 3, 3), and its landmarks (N, 3) where those went that define them."""
+    """Return the rotations of the survey's keyframes (K, 3, 3), and its landmarks (N, 3) moved with their defining keyframes."""
     marks = state.landmarks
     turn = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
     shift = map_from_body[:, :3, 3] - np.einsum("kij,kj->ki", turn, state.map_from_body[:, :3, 3])
@@ -195,7 +194,7 @@ def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
 
 
 def free_observations(marks: Landmarks, sightings: Sequence[Sighting | None]) -> NDArray[np.bool_]:
-    """(M,) observations of the survey's own landmarks whose feature shows no landmark of the map."""
+    """Return (M,) observations of the survey's own landmarks whose feature shows no landmark of the map."""
     stride = int(marks.obs_feature.max(initial=0)) + 1
     taken = [k * stride + s.features[s.features < stride] for k, s in enumerate(sightings) if s is not None]
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
@@ -205,7 +204,7 @@ def free_observations(marks: Landmarks, sightings: Sequence[Sighting | None]) ->
 def _inertial(
     earlier: BundleProblem, state: SurveyState, turn: Array, settings: SurveySettings, own_rig: bool
 ) -> InertialTerms | None:
-    """The motion of the map's keyframes, if it is known, and the survey's behind it; turn (K, 3, 3) is that of its keyframes since."""
+    """Return the motion of the map's keyframes, if known, followed by the survey's; turn (K, 3, 3): rotation of its keyframes since."""
     motion, old, felt = state.motion, len(earlier.map_from_body), state.motion.inertial and own_rig
     if earlier.inertial is None and not felt:
         return None
@@ -222,13 +221,13 @@ def _inertial(
 
 
 def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: SurveySettings) -> Measured:
-    """What holds the map that a survey begins, whose state is in the map's frame; landmarks (N,): rows of the state that the map has."""
+    """Return the constraints of a map's first survey, its state in the map's frame; landmarks (N,): rows of the state in the map."""
     keyframes = np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
     return Measured(bundle_problem(state, settings, None), keyframes, landmarks)
 
 
 def grown(joint: JointSolution, change: Change, base: BaseMap, after: SurveyMap) -> Measured:
-    """What holds the map after a change; a landmark that stands elsewhere by now is where the new survey saw it."""
+    """Return the constraints of the map after a change; a moved landmark is at its position by the new survey."""
     before, problem, is_new = joint.measured, joint.measured.problem, change.added_rows < 0
     old = len(problem.map_from_body) - len(joint.map_from_body)
     stay = np.isin(base.history.keyframe_ids, history_of(after).keyframe_ids)

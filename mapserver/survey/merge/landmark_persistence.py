@@ -16,22 +16,22 @@ from mapserver.survey.merge.guided_matching import Sighting, keyframe_features
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe
 
-_PRIOR_COUNT = 4.0  # observations that the whole survey's rate counts for, where a landmark has no history
-_AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that speaks against a place
-_DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old place, in favour of the new one
-_MIN_SIGHTINGS = 3  # below which nothing is said about a landmark's place
+_PRIOR_COUNT = 4.0  # weight of the survey's overall rate, in observations, for a landmark without history
+_AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that contradicts a position
+_DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old position, for the new one
+_MIN_SIGHTINGS = 3  # below, a landmark's position is not judged
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkCounts:
-    """In how many keyframes of this survey each of N landmarks was expected and seen."""
+    """Numbers of keyframes of this survey in which each of N landmarks was expected and seen."""
 
     expected: NDArray[np.int64]
     seen: NDArray[np.int64]
 
     @property
     def rate(self) -> float:
-        """Share of the expected observations that were made, of landmarks that are still there."""
+        """Share of the expected observations that were made, for landmarks still present."""
         there = self.seen > 0
         return float(self.seen[there].sum() / max(self.expected[there].sum(), 1))
 
@@ -39,7 +39,7 @@ class LandmarkCounts:
 def count_landmarks(
     base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None]
 ) -> LandmarkCounts:
-    """Counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
+    """Return counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
     expected, seen = np.zeros(len(base.points_map), np.int64), np.zeros(len(base.points_map), np.int64)
     for keyframe, place, sighting in zip(keyframes, map_from_cam, sightings, strict=True):
         if sighting is None:
@@ -54,16 +54,16 @@ def count_landmarks(
 
 
 def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:
-    """(N,) how often each landmark was expected since it was seen last."""
+    """Return (N,) how often each landmark was expected since it was last seen."""
     before = base.history.landmark_missed.astype(np.int64)
     return np.where(counts.seen > 0, 0, before + counts.expected - counts.seen)
 
 
 def faded(base: BaseMap, counts: LandmarkCounts, settings: SurveySettings) -> NDArray[np.bool_]:
-    """(N,) landmarks that were missed more often than is likely, were they still there.
+    """Return (N,) landmarks that were missed more often than is likely if still present.
 
-    The chance to be seen is each landmark's own from before the misses began, drawn towards the survey's where it was rarely
-    expected. Observations within one survey are correlated, so that each counts for less than one (`look_weight`).
+    The probability of detection is each landmark's own before the misses, shrunk towards the survey's if it was rarely
+    expected. Observations within one survey are correlated, so each counts for less than one (`look_weight`).
     """
     history, missed = base.history, missed_since(base, counts)
     before = history.landmark_expected.astype(np.float64) - history.landmark_missed
@@ -83,11 +83,11 @@ class Shift:
 
 
 def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | None], settings: SurveySettings) -> Shift:
-    """Each landmark placed by its sightings alone, from cameras map_from_cam (K, 4, 4), against where the map has it.
+    """Compare each landmark, triangulated by its sightings alone from cameras map_from_cam (K, 4, 4), with its position in the map.
 
-    The difference is judged by both covariances, keyframes taken as known, and `still_m` for what those leave out; and most
-    sightings must speak against the old place each for itself (what none of them can tell apart does robots no harm) and nearly
-    all for the new one: corners where one thing hides another stand nowhere.
+    The difference is judged by both covariances, for fixed keyframes, and `still_m` for their omissions; also most
+    sightings must individually contradict the old position (smaller differences do not affect robots) and nearly
+    all must support the new one: occlusion corners have no fixed position.
     """
     seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
     landmark = np.concatenate([s.rows for _, s in seen]) if seen else np.zeros(0, np.int64)
@@ -126,7 +126,7 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | No
 def _squared(
     base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
 ) -> Array:
-    """(M,) squared residuals of observations in sigmas."""
+    """Return (M,) squared residuals of observations in sigmas."""
     cam_from_map = se3_inverse(map_from_cam)
     seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map[landmark]) + cam_from_map[:, :3, 3]
     residual = _residuals(base, seen, pixels) / sigmas_px[:, [0, 0, 1]]
@@ -134,7 +134,7 @@ def _squared(
 
 
 def _residuals(base: BaseMap, points_cam: Array, pixels: Array) -> Array:
-    """(M, 3) of u, v and disparity; NaN without a right match."""
+    """Return (M, 3) of u, v and disparity; NaN without a right match."""
     predicted = base.camera.pixel_from_point(np.column_stack([points_cam[:, :2], np.maximum(points_cam[:, 2], 0.05)]))
     return np.column_stack(
         [pixels[:, :2] - predicted[:, :2], pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]]
@@ -144,7 +144,7 @@ def _residuals(base: BaseMap, points_cam: Array, pixels: Array) -> Array:
 def _triangulated(
     base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
 ) -> Array:
-    """Points (R, 3) that fit their observations (M) from known cameras best: some steps of Gauss-Newton."""
+    """Return points (R, 3) with the best fit to their observations (M) from known cameras: some steps of Gauss-Newton."""
     camera, points = base.camera, points_map.copy()
     cam_from_map = se3_inverse(map_from_cam)
     for _ in range(4):

@@ -1,11 +1,11 @@
-"""Test whether a session belongs to a site, and where: joined, foreign, or undecided, at a stated error rate. Pure.
+"""Test whether a session belongs to a site, and its pose there: joined, foreign, or undecided, at a stated error rate. Pure.
 
-Fixes at several places whose motion from one to the next is the session's own say where it may be. Two hypotheses are tested there by
-the share that it sees of the parts of the map that it should see: that it was recorded elsewhere, where it sees at most what halls of
-one maker share, and that it belongs to the site, of which the greater part still stands. Position priors widen the search around where
-they point, choose between places of the site that look the same, and hold a session that they contradict; they are no evidence that it
-belongs to the site. Only with them is a session called foreign: without, the place may be another one of the same site, surveyed the
-other way round or not at all, as like the map's as another building's.
+Fixes at several places whose relative motion agrees with the session's own give possible poses. There two hypotheses are tested by
+the seen share of the expected parts of the map: that it was recorded elsewhere, where it sees at most what similar halls
+have in common, and that it belongs to the site, of which the greater part still exists. Position priors widen the search around their
+poses, choose between similar places of the site, and reject a session that they contradict; they are not evidence that it
+belongs to the site. Only with them is a session called foreign: without, the place may be another one of the same site, surveyed in the
+other direction or not at all, as similar to the map's as one of another building.
 """
 
 from collections.abc import Sequence
@@ -26,15 +26,15 @@ from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
 
-_REMAINING_SHARE = 0.5  # of the expected cells: a map of which the greater part stands no more is to be surveyed anew
-# What is seen of another building's map: in pictures of twelve pairs of halls of one layout, with fixes at each place, 0.25 to 0.39 of the
-# cells (floor marks, beams, columns, lamps)
+_REMAINING_SHARE = 0.5  # of the expected cells: a map of which the greater part has changed needs a new survey
+# Seen share of another building's map: in pictures of twelve pairs of halls of one layout, with fixes at each place, 0.25 to 0.39 of
+# the cells (floor marks, beams, columns, lamps)
 _SHARED_SHARE = 0.4
-_MIN_BLOCKS = 8  # of a metre and a half: two walls of three by three metres
-_MOST_PLACES, _MOST_LOOKS = 4, 240  # alignments that are compared, keyframes that look
+_MIN_BLOCKS = 8  # of 1.5 m: two walls of 3 m x 3 m
+_MOST_PLACES, _MOST_LOOKS = 4, 240  # compared alignments, keyframes used
 _SAME_PLACE_M = 1.2
-_BESIDE_M, _BESIDE_COSINE = 2.0, 0.8  # from a place of the map, and between both ways of looking, to be found there
-_PRIOR_M = 3.0  # within which an alignment is where position priors put the session
+_BESIDE_M, _BESIDE_COSINE = 2.0, 0.8  # limits of distance and heading to a place of the map, to be located there
+_PRIOR_M = 3.0  # limit between an alignment and the position priors
 
 
 class MembershipVerdict(StrEnum):
@@ -49,10 +49,9 @@ class MembershipVerdict(StrEnum):
 class MembershipEvidence:
     """Figures of the test.
 
-    fixes: keyframes whose fixes agree with the session's own motion; places: those of them that lie a metre apart. cells_expected,
-    cells_seen: parts of the map that the session should see, and sees; seen_share with its bounds share_low, share_high at error_rate.
-    competitor_share: the same share at the other place that looks most alike, None without one. priors_off_m: how far the place is from
-    where position priors put it, None without any.
+    fixes: keyframes whose fixes agree with the session's own motion; places: number of those a metre apart. cells_expected, cells_seen:
+    expected and seen parts of the map; seen_share with its bounds share_low, share_high at error_rate. competitor_share: the same share at
+    the most similar other place, None without one. priors_off_m: distance between the place and the position priors, None without any.
     """
 
     fixes: int = 0
@@ -69,7 +68,7 @@ class MembershipEvidence:
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """A session that is not joined: why, and by what evidence."""
+    """A session that is not joined: reason and evidence."""
 
     reason: str
     verdict: MembershipVerdict = MembershipVerdict.UNDECIDED
@@ -78,7 +77,7 @@ class Membership:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlace:
-    """A session's place: map_from_body (K, 4, 4) of its keyframes, the fixes that agree and how many of them were believed."""
+    """A session's pose: map_from_body (K, 4, 4) of its keyframes, the agreeing fixes and how many of them were accepted."""
 
     map_from_body: Array
     placed: Alignment
@@ -93,15 +92,15 @@ class SessionPlace:
 
     @property
     def figures(self) -> str:
-        return f"of {self.seen.cells} parts of the map that it should see there it sees {self.seen.seen}"
+        return f"of {self.seen.cells} parts of the map expected there it sees {self.seen.seen}"
 
 
 @dataclass(frozen=True)
 class SessionKeyframes:
-    """A session as the test takes it.
+    """Input of the test: a session.
 
     keyframes (K) with their features and depths; survey_from_body (K, 4, 4) and the edges of its motion; camera on a body.
-    map_from_survey: where position priors put it, None without any.
+    map_from_survey: pose by position priors, None without any.
     """
 
     keyframes: Sequence[FrameFeatures]
@@ -113,7 +112,7 @@ class SessionKeyframes:
 
     @property
     def by_priors(self) -> Array | None:
-        """(K, 4, 4) map_from_body where position priors put the keyframes."""
+        """(K, 4, 4) map_from_body of the keyframes by position priors."""
         return None if self.map_from_survey is None else self.map_from_survey @ self.survey_from_body
 
 
@@ -123,15 +122,15 @@ class MembershipTest:
     def __init__(
         self, relocalizer: Relocalizer, firm: NDArray[np.bool_], session: SessionKeyframes, settings: SessionSettings
     ) -> None:
-        """firm (N,): landmarks of the relocalizer's view that are expected to be found again."""
+        """firm (N,): landmarks of the relocalizer's view that are expected to be seen again."""
         self._relocalizer, self._firm, self._session, self._settings = relocalizer, firm, session, settings
         self.tried = 0
 
     def locate(self) -> SessionPlace | Membership:
-        """Where the session is, if fixes say so and nowhere else looks alike. The map's confirmation there is not judged yet."""
+        """Return the session's pose if fixes give one and no other is similar. The map's confirmation there is judged later."""
         session, settings, by_priors = self._session, self._settings, self._session.by_priors
         ks = _spread(range(len(session.keyframes)), settings.fix_keyframes)
-        if by_priors is not None:  # as many again of those that priors put beside a place of the map
+        if by_priors is not None:  # plus as many that priors put near a place of the map
             ks = sorted({*ks, *_spread(self._beside_the_map(by_priors), settings.fix_keyframes)})
         fixes = find_fixes(self._relocalizer, session.keyframes, ks, session.body_from_cam)
         if by_priors is not None:
@@ -144,11 +143,11 @@ class MembershipTest:
             most = found[0] if found else Alignment((), np.eye(4), 0)
             return Membership(
                 f"it was not found in the map: at most {len(most.fixes)} fixes of {len(ks)} keyframes at {most.places} places agree "
-                f"on where it lies, {settings.min_fixes} at {settings.min_places} are needed; drive a longer way through places "
+                f"on its pose, {settings.min_fixes} at {settings.min_places} are needed; drive a longer way through places "
                 "that are in the map, the same way round",
                 evidence=MembershipEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
             )
-        # Where priors put it there may be few fixes: most of it is new, and a look-alike of what the map has has more.
+        # At the priors' pose there may be few fixes: most of it is new, and a similar place in the map may have more.
         places = []
         for placed in sorted(enough, key=self._is_elsewhere_by_priors)[:_MOST_PLACES]:
             map_from_body, believed = follow_fixes(placed, session.survey_from_body, session.chain)
@@ -159,13 +158,13 @@ class MembershipTest:
         return self._chosen(places)
 
     def _beside_the_map(self, map_from_body: Array) -> list[int]:
-        """Keyframes at map_from_body (K, 4, 4) that look from beside a place of the map, its way."""
+        """Return keyframes at map_from_body (K, 4, 4) near a place of the map, with a similar heading."""
         places = self._relocalizer.view.map_from_cam
         looking = map_from_body @ self._session.body_from_cam
         return [k for k, at in enumerate(looking) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
 
     def _priors_off_m(self, placed: Alignment, map_from_body: Array) -> float | None:
-        """How far the keyframes with fixes are from where priors put them, at map_from_body (K, 4, 4); None without priors."""
+        """Return the distance of the keyframes with fixes from their priors, at map_from_body (K, 4, 4); None without priors."""
         if self._session.by_priors is None:
             return None
         ks = [fix.k for fix in placed.fixes]
@@ -176,10 +175,10 @@ class MembershipTest:
         return off_m is None or off_m >= _PRIOR_M
 
     def confirmation(self, map_from_body: Array) -> Confirmation:
-        """How much of the map the session sees with its keyframes at map_from_body (K, 4, 4).
+        """Return the share of the map seen by the session with its keyframes at map_from_body (K, 4, 4).
 
-        Keyframes beside places of the map are asked: what an aisle's survey saw of the next one, through gaps in the racks, other goods
-        hide from within that one. Without any of them all are asked, and few landmarks are expected.
+        Only keyframes near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
+        may be hidden by other goods from within that aisle. Without any near ones all are used, with few expected landmarks.
         """
         session, view = self._session, self._relocalizer.view
         ks = _spread(self._beside_the_map(map_from_body) or range(len(session.keyframes)), _MOST_LOOKS)
@@ -187,7 +186,7 @@ class MembershipTest:
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
     def evidence(self, located: SessionPlace, seen: Confirmation) -> MembershipEvidence:
-        """The figures of a place at which the session sees so much of the map."""
+        """Return the figures of a pose with this confirmation."""
         return MembershipEvidence(
             fixes=len(located.placed.fixes),
             places=located.placed.places,
@@ -202,13 +201,13 @@ class MembershipTest:
         )
 
     def judged(self, located: SessionPlace, seen: Confirmation) -> Membership | None:
-        """Why a session that sees so much of the map is not joined; None where it is."""
+        """Return why a session with this confirmation is not joined; None if it is."""
         if _speaks_for_itself(seen):
             return None
         located = replace(located, seen=seen)
         evidence = self.evidence(located, seen)
         if not contradicts(seen):
-            bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} for sure and half in all are needed"
+            bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} certainly, and half in total, are needed"
             return Membership(
                 f"it is not certain that it belongs here: {located.figures}, {bounds}; drive a longer way through places that are in the "
                 "map, the same way round",
@@ -217,7 +216,7 @@ class MembershipTest:
         figures = f"{located.figures}, at most {seen.high:.0%} where half is needed"
         if located.priors_off_m is None:
             return Membership(
-                f"the place that is most like it is not its own: {figures}; it was recorded elsewhere, or where or in a direction in which "
+                f"the most similar place is not its own: {figures}; it was recorded elsewhere, or where or in a direction in which "
                 "the map was not: drive past a dock, the same way round as the survey, or build it as another --site",
                 evidence=evidence,
             )
@@ -225,14 +224,14 @@ class MembershipTest:
         return Membership(reason, MembershipVerdict.FOREIGN, evidence)
 
     def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
-        """The place that most of the map speaks for; undecided where another is as good and no position prior tells them apart."""
+        """Return the pose with the most evidence; undecided if another is as good and no position prior distinguishes them."""
         ranked = sorted(found, key=lambda one: (one.seen.cells - 2 * one.seen.seen, -len(one.placed.fixes)))
         best, *others = [
             one for n, one in enumerate(ranked) if not any(_same_place(one, other) for other in ranked[:n])
         ]
         alike = [best, *(one for one in others if one.seen.high >= max(_SHARED_SHARE, best.seen.low))]
         near = [one for one in alike if one.is_where_priors_say]
-        if not near:  # of a drive that adds new aisles its own place shows less than a look-alike elsewhere
+        if not near:  # for a drive with new aisles its own place may show less than a similar one elsewhere
             near = [one for one in others if one.is_where_priors_say and _speaks_for_itself(one.seen)]
             alike = [best, *near] if len(near) == 1 else alike
         chosen = near[0] if len(alike) > 1 and len(near) == 1 else best
@@ -242,7 +241,7 @@ class MembershipTest:
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
             return Membership(
-                f"{len(alike)} places of the map look alike to it: it sees {seen} parts of the map there; drive on to where they "
+                f"{len(alike)} places of the map look alike: it sees {seen} parts of the map there; drive on to where they "
                 "differ, or past a dock",
                 evidence=evidence,
             )
@@ -250,30 +249,30 @@ class MembershipTest:
             return chosen
         if contradicts(chosen.seen):
             return Membership(
-                f"it was not found where its docks are, and the place that is most like it, {chosen.priors_off_m:.1f} m from there, is "
+                f"it was not found where its docks are, and the most similar place, {chosen.priors_off_m:.1f} m from there, is "
                 f"not its own: {chosen.figures}; drive a longer way through places that are in the map, the same way round, or build it "
                 "as another --site",
                 evidence=evidence,
             )
         return Membership(
-            f"its docks and what it sees name places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
+            f"its docks and its view of the map give places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
             "them out",
             evidence=evidence,
         )
 
 
 def _spread(keyframes: Sequence[int], most: int) -> list[int]:
-    """At most so many of them, evenly chosen."""
+    """Return at most `most` of them, evenly chosen."""
     return list(keyframes[:: max(1, -(-len(keyframes) // most))])
 
 
 def _speaks_for_itself(seen: Confirmation) -> bool:
-    """True if more is seen, for sure, than another building would show, and half of the map or more."""
+    """True if certainly more is seen than another building would show, and half of the map or more."""
     return seen.blocks >= _MIN_BLOCKS and seen.low > _SHARED_SHARE and seen.share >= _REMAINING_SHARE
 
 
 def contradicts(seen: Confirmation) -> bool:
-    """True if the session's view speaks, for sure, against the place."""
+    """True if the session's view certainly contradicts the place."""
     return seen.blocks >= _MIN_BLOCKS and seen.high < _REMAINING_SHARE
 
 

@@ -1,4 +1,4 @@
-"""Merging of a new survey's changes into the map, as one SurveyMap: all else stays to the bit."""
+"""Merge of a new survey's changes into the map, as one SurveyMap: all else is bit-identical."""
 
 from dataclasses import dataclass, replace
 
@@ -18,10 +18,9 @@ from mapserver.survey.survey_map import History, SurveyMap
 class Change:
     """Changes to a map of N landmarks and K keyframes.
 
-    keep (N,): landmarks that stay; points_map (N, 3) and map_from_body (K, 4, 4): where they are from now on. added: landmarks
-    that come, their observations by keyframes of the new survey (sorted by landmark); added_rows: which landmark of the map each
-    takes the place of, with its id and descriptor, -1 for a new one, which is added_own of the new survey's.
-    map_from_cam: of the new survey's keyframes.
+    keep (N,): landmarks that stay; points_map (N, 3) and map_from_body (K, 4, 4): their new positions and poses. added: new landmarks,
+    their observations by keyframes of the new survey (sorted by landmark); added_rows: the landmark of the map replaced by each, whose id
+    and descriptor it takes, -1 for a new one, which is added_own of the new survey's. map_from_cam: of the new survey's keyframes.
     """
 
     keep: NDArray[np.bool_]
@@ -36,8 +35,8 @@ class Change:
 def merged(
     base: BaseMap, change: Change, counts: LandmarkCounts, keyframes: list[Keyframe], min_place_landmarks: int
 ) -> SurveyMap:
-    """The next version's map, with the old trajectory. Keyframes that nothing is seen from any more go; new ones come where they see added
-    landmarks.
+    """Return the next version's map, with the old trajectory. Keyframes without landmarks are removed; new ones are added if they see
+    added landmarks.
     """
     old, added, before, keep = base.map, change.added, base.history, change.keep
     keep_obs = keep[old.obs_landmark]
@@ -52,7 +51,7 @@ def merged(
     rows, is_new = change.added_rows, change.added_rows < 0
     ids = np.where(is_new, before.next_landmark_id + np.cumsum(is_new) - 1, old.landmark_ids[rows])
     descriptors = medoid_descriptors(added, keyframes)
-    descriptors[~is_new] = old.descriptors[rows[~is_new]]  # it is found by the old one, and robots have that
+    descriptors[~is_new] = old.descriptors[rows[~is_new]]  # robots match and already have the old one
     cameras, has_depth = change.map_from_cam[added.obs_keyframe], np.isfinite(added.obs_pixels[:, 2])
     observations = (added.obs_landmark, has_depth, added.obs_sigma_px)
     information = point_information(base.camera, cameras, added.points_map, *observations)

@@ -1,4 +1,4 @@
-"""Several surveys, and the map of a site that has one, become one map. Surveys that cannot be joined are left out."""
+"""Merge of several surveys, and of a site's existing map, into one map. Surveys that cannot be joined are left out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One recording's survey. map_from_survey: where position priors put it, None without any."""
+    """One recording's survey. map_from_survey: pose by position priors, None without any."""
 
     survey: Survey
     map_from_survey: Array | None
@@ -30,7 +30,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of session `number`: in the map or left out, why, by what evidence; counts where it was joined to something."""
+    """Result of session `number`: in the map or left out, reason, evidence; counts if it was joined to something."""
 
     number: int
     verdict: MembershipVerdict
@@ -40,15 +40,15 @@ class Outcome:
 
     @property
     def joined(self) -> bool:
-        """Whether it is in the map."""
+        """True if it is in the map."""
         return self.verdict is MembershipVerdict.JOINED
 
 
 @dataclass(frozen=True, slots=True)
 class MergedMap:
-    """The map of all sessions that could be joined, what became of each in their order, and the trajectories of the joined ones.
+    """The map of all joined sessions, the result of each in order, and the trajectories of the joined ones.
 
-    estimated: for each trajectory, which of its frames were measured.
+    estimated: for each trajectory, a mask of its measured frames.
     """
 
     map: SurveyMap
@@ -58,16 +58,16 @@ class MergedMap:
 
 
 class MapMerger:
-    """One map of `base` (the published one, None on a new site) and all sessions that find their place in it.
+    """Builds one map of `base` (the published one, None on a new site) and all sessions that can be located in it.
 
-    On a new site the first session with position priors begins, the first of all where none has any. Sessions with priors are joined
-    in their order as soon as they are added, which needs none that come later; those without, and what could not be joined at
-    once, are tried when all others are there. The map depends on the order of the sessions, not on when each is added.
+    On a new site the first session with position priors starts the map, or the very first if none has any. Sessions with priors are
+    joined in order as soon as they are added, independent of later ones; those without, and those not joined at
+    once, are tried after all others. The map depends on the order of the sessions, not on the time of adding them.
     """
 
     def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
         self._settings, self._current = settings, base
-        self._measured: Measured | None = None  # what holds a map that is not published
+        self._measured: Measured | None = None  # constraints of an unpublished map
         self._sessions: list[Session] = []
         self._waiting: list[int] = []
         self._outcomes: dict[int, Outcome] = {}
@@ -76,14 +76,14 @@ class MapMerger:
         self._has_grown = False
 
     def add(self, session: Session) -> None:
-        """The next session."""
+        """Add the next session."""
         self._sessions.append(session)
         self._waiting.append(len(self._sessions) - 1)
         if session.map_from_survey is not None:
             self._try(self._waiting[-1])
 
     def finish(self) -> MergedMap:
-        """The map, and what became of every session."""
+        """Return the map, and the result of every session."""
         self._waiting.sort(key=lambda n: self._sessions[n].map_from_survey is None)
         for number in [n for n in self._waiting if self._sessions[n].map_from_survey is None]:
             self._try(number)
@@ -119,7 +119,7 @@ class MapMerger:
         self._waiting.remove(number)
 
     def _trajectory(self, number: int) -> Trajectory:
-        """That of a joined session: its frames follow its keyframes, which later sessions may have moved in a map that is being made."""
+        """Return that of a joined session: its frames follow its keyframes, which later sessions may have moved in an unpublished map."""
         found, survey = self._found[number][0], self._sessions[number].survey
         if self._measured is None or number == next(reversed(self._found)):
             return found
@@ -148,16 +148,16 @@ def _begun(session: Session, settings: SurveySettings) -> tuple[SurveyMap, Measu
 def with_trajectories(
     survey_map: SurveyMap, trajectories: Sequence[Trajectory], estimated: Sequence[Mask]
 ) -> SurveyMap:
-    """The map with the frames of all sessions, one after the other."""
+    """Return the map with the frames of all sessions, concatenated."""
     return replace(
         survey_map, trajectory=chained(trajectories, trajectories), trajectory_estimated=np.concatenate(estimated)
     )
 
 
 def chained(trajectories: Sequence[Trajectory], clocks: Sequence[Trajectory]) -> Trajectory:
-    """One trajectory of several: stamps stay where they follow each other, else a later one's are moved behind those before.
+    """Concatenate trajectories: stamps in order are kept, else later ones are shifted behind the earlier ones.
 
-    clocks: by how much is decided on these, so that an estimate and its truth are moved alike.
+    clocks: define the shifts, so that an estimate and its truth are shifted alike.
     """
     stamps, places, end_ns = [], [], -(2**62)
     for trajectory, clock in zip(trajectories, clocks, strict=True):

@@ -1,4 +1,4 @@
-"""Stages that make the next map of a survey and a map: found, adjusted together, compared, merged."""
+"""Stages that merge a survey into a map: localization, joint adjustment, comparison, merge."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ from mapserver.survey.survey_map import SurveyMap
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Figures of a join: fixes tried and believed, keyframes found in the map, and the map's landmarks."""
+    """Figures of a join: fixes tried and accepted, keyframes located in the map, and the map's landmarks."""
 
     fixes: int
     believed_fixes: int
@@ -47,7 +47,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Extension:
-    """The next map (its trajectory is the new survey's), what holds it, what changed, and the evidence for joining it."""
+    """The next map (its trajectory is the new survey's), its constraints, its changes, and the evidence for the join."""
 
     map: SurveyMap
     measured: Measured | None
@@ -63,22 +63,22 @@ def extend(
     known: Measured | None = None,
     map_from_survey: Array | None = None,
 ) -> Extension | Membership:
-    """The map with a survey joined to it, if it passes the test of `membership`: at the place that fixes say, and once more adjusted.
+    """Return the map joined with a survey that passes the test of `membership`: at the pose by fixes, and after joint adjustment.
 
-    known: what holds base_map, all of which takes its best place; None for a published one: what did not move significantly stays to the
-    bit.
-    map_from_survey: where position priors put the survey, if they do.
+    known: constraints of base_map, which is adjusted as a whole; None for a published one, whose landmarks without
+    significant motion are bit-identical.
+    map_from_survey: pose by position priors, if any.
     """
     state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
         return Membership(
-            "a survey by one camera without IMU has no metres of its own: it can begin a map, not join one"
+            "a survey by one camera without IMU has an unknown scale: it can begin a map, not join one; add an IMU or a camera"
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
     session = SessionKeyframes(
         keyframes=[keyframe_features(keyframe) for keyframe in guess.keyframes],
-        survey_from_body=state.map_from_body,  # the survey's own frame, named `map` before there was another
+        survey_from_body=state.map_from_body,  # the survey's own frame, called `map` in a single survey
         chain=[*chain_edges(guess, state), *survey.loops.edges],
         camera=state.camera,
         body_from_cam=state.body_from_cam,
@@ -109,7 +109,7 @@ def extend(
     anchored = known is None
     gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
-    # Between keyframes the survey's own frames were placed by what they saw; they follow the keyframes that moved.
+    # Frames between keyframes were located within the survey; they follow their moved keyframes.
     stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
     placed = frame_trajectory(stamps_ns, survey_from_body, guess.keyframe_frames, map_from_body)
     result = replace(

@@ -1,4 +1,4 @@
-"""Alignments of a survey to the map: sets of fixes whose motion from one to the next is the survey's own."""
+"""Alignments of a survey to the map: sets of fixes whose relative motion agrees with the survey's own."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from fleetmap.time_sliced import finished
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
 
-_WIDEST_PX = 60.0  # a window in which a descriptor still finds its feature more often than another one
-_ANY_TURN_RAD = 0.5  # beyond which two fixes disagree whatever the covariances say
-_PLACE_M = 1.0  # between fixes that count as independent: nearer ones show the same things
-_MAP_SHAPE = np.diag([0.003**2] * 3 + [0.02**2] * 3)  # of the map between two places: twice what surveys are off by
+_WIDEST_PX = 60.0  # window size at which a descriptor still finds its feature more often than another one
+_ANY_TURN_RAD = 0.5  # beyond which two fixes always disagree
+_PLACE_M = 1.0  # between independent fixes: nearer ones see the same objects
+_MAP_SHAPE = np.diag([0.003**2] * 3 + [0.02**2] * 3)  # of the map between two places: twice the error of surveys
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFix:
-    """Keyframe k of the new survey found in the map: map_from_body (4, 4), the covariance of its inverse in body axes, inliers."""
+    """Keyframe k of the new survey located in the map: map_from_body (4, 4), the covariance of its inverse in body axes, inliers."""
 
     k: int
     map_from_body: Array
@@ -31,8 +31,8 @@ class SessionFix:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The fixes that agree (one for each keyframe), map_from_survey (4, 4) of the one that most agree with, and at how many places
-    they stand.
+    """The agreeing fixes (one for each keyframe), map_from_survey (4, 4) of the one that agrees with the most, and the number of
+    their places.
     """
 
     fixes: tuple[SessionFix, ...]
@@ -43,12 +43,12 @@ class Alignment:
 def find_fixes(
     relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], ks: Sequence[int], body_from_cam: Array
 ) -> list[SessionFix]:
-    """All fixes of keyframes ks, several for one keyframe where the map looks alike in several places."""
+    """Return all fixes of keyframes ks, several for one keyframe if places of the map look alike."""
     return [_at_body(k, fix, body_from_cam) for k in ks for fix in finished(relocalizer.anywhere(keyframes[k]))]
 
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
-    """The fix of keyframe k, its covariance turned from map axes to the camera's and carried to the body."""
+    """Return the fix of keyframe k, its covariance converted from map axes to the camera's and then to the body."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = fix.map_from_cam[:3, :3].T
     carry = adjoint(body_from_cam) @ turn
@@ -60,7 +60,7 @@ def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
 def fixes_around(
     relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], places: dict[int, Array], body_from_cam: Array
 ) -> list[SessionFix]:
-    """Fixes of keyframes near where their bodies are expected, map_from_body (4, 4) by keyframe."""
+    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe."""
     found = (
         (k, relocalizer.by_projection(keyframes[k], place @ body_from_cam, _WIDEST_PX)) for k, place in places.items()
     )
@@ -68,10 +68,10 @@ def fixes_around(
 
 
 def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Alignment]:
-    """Sets of fixes that agree with the survey's own motion, the largest first; no fix is in two of them.
+    """Return sets of fixes that agree with the survey's own motion, the largest first; the sets are disjoint.
 
-    survey_from_body (K, 4, 4). Two fixes agree where the motion between them is that of the survey within 0.999 of chi-square of
-    the covariances of its chain, of both fixes and of the map's own shape.
+    survey_from_body (K, 4, 4). Two fixes agree if the motion between them is that of the survey within 0.999 of chi-square of
+    the covariances of its chain, of both fixes and of the map's shape.
     """
     agreeing = [_agreeing(n, fixes, survey_from_body, chain) for n in range(len(fixes))]
     found: list[Alignment] = []
@@ -88,7 +88,7 @@ def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: Grap
 
 
 def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[int]:
-    """Of every keyframe the fix that agrees best with the seed's, if one does; the seed itself first."""
+    """Return for every keyframe the fix that agrees best with the seed's, if any; the seed itself first."""
     own = fixes[seed]
     measured = se3_inverse(own.map_from_body) @ np.stack([fix.map_from_body for fix in fixes])
     numbers = np.array([fix.k for fix in fixes])
@@ -108,7 +108,7 @@ def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, c
 
 
 def _places(positions_m: Array) -> int:
-    """How many of positions (F, 3) lie a metre and more from each other, chosen in their order."""
+    """Return how many of positions (F, 3), chosen in order, are at least a metre from each other."""
     chosen: list[Array] = []
     for position in positions_m:
         if all(np.linalg.norm(position - other) >= _PLACE_M for other in chosen):
@@ -117,7 +117,7 @@ def _places(positions_m: Array) -> int:
 
 
 def follow_fixes(placed: Alignment, survey_from_body: Array, chain: Sequence[PoseEdge]) -> tuple[Array, int]:
-    """map_from_body (K, 4, 4) by the pose graph of the survey's own edges and the fixes, and how many fixes were believed."""
+    """Return map_from_body (K, 4, 4) by the pose graph of the survey's own edges and the fixes, and the number of accepted fixes."""
     start = np.concatenate([np.eye(4)[None], placed.map_from_survey @ survey_from_body])
     edges = [PoseEdge(e.i + 1, e.j + 1, e.i_from_j, e.cov_rot_trans, is_loop=False) for e in chain]
     edges += [

@@ -1,4 +1,4 @@
-"""Covariances along a chain of independent steps with measured differences between far links: little memory, quick answers."""
+"""Covariances along a chain of independent steps with measured differences between distant links: low memory, fast queries."""
 
 import numpy as np
 
@@ -6,31 +6,31 @@ from fleetmap.features.matching import Indices
 from fleetmap.geometry import Array
 
 _FIRST_CAPACITY = 16
-_ROWS = 256  # that a measurement narrows at once
+_ROWS = 256  # updated at once by a measurement
 
 
 class ChainCovariance:
-    """Joint covariance of x_0 = 0, x_1, ..., each a step on from the one before, after measurements of x_j - x_i.
+    """Joint covariance of x_0 = 0, x_1, ..., each one step from the previous one, after measurements of x_j - x_i.
 
-    Only the ends of measurements are kept in full, as anchors. Between two of them a place is interpolated by the share of
-    its steps' covariance in that of the whole way, plus a bridge that no measurement has touched: the chain is
-    Gauss-Markov, so nothing is approximated. Memory and a measurement cost go with the square of the anchors, an answer with the places
-    that it is about; how long the chain is does not matter.
+    Only the ends of measurements are stored in full, as anchors. Between two of them a place is interpolated by the share of
+    its steps' covariance in that of the whole interval, plus a bridge unaffected by measurements: the chain is
+    Gauss-Markov, so nothing is approximated. Memory and the cost of a measurement grow with the square of the anchors, a query with its
+    number of places; the length of the chain does not matter.
     """
 
     def __init__(self, sums: Array) -> None:
         """sums (K, 6, 6): covariance of each x_k before any measurement, sums[0] = 0."""
         self._sums = np.ascontiguousarray(sums)
         count = len(sums)
-        self._anchors = [0]  # keyframes, in the order in which they became anchors: their slots in the joint covariance
+        self._anchors = [0]  # keyframes in order of becoming anchors; the index is the slot in the joint covariance
         self._joint = np.zeros((6 * _FIRST_CAPACITY, 6 * _FIRST_CAPACITY))
         self._starts = np.zeros(count, np.int64)  # the last anchor at or before each place
         self._before = np.zeros(count, np.int64)  # its slot
-        self._after = np.zeros(count, np.int64)  # the next one's slot; behind the last anchor the same with no share
+        self._after = np.zeros(count, np.int64)  # the next one's slot; after the last anchor the same with share 0
         self._shares = np.zeros((count, 6, 6))
 
     def of_differences(self, i: int, js: Indices) -> Array:
-        """(M, 6, 6) covariances of x_j - x_i for each j of js (M,)."""
+        """Return (M, 6, 6) covariances of x_j - x_i for each j of js (M,)."""
         before, after = self._crossing(i, self._before[js]), self._crossing(i, self._after[js])
         cross = before + (after - before) @ self._shares[js].transpose(0, 2, 1)
         near = np.flatnonzero(self._starts[js] == self._starts[i])
@@ -39,9 +39,9 @@ class ChainCovariance:
         return np.asarray(own[:-1] + own[-1] - cross - cross.transpose(0, 2, 1))
 
     def measure(self, i: int, j: int, cov: Array) -> Array:
-        """Takes a measurement of x_j - x_i with cov (6, 6) into account.
+        """Update by a measurement of x_j - x_i with cov (6, 6).
 
-        Returns the gain (K, 6, 6): how far each place moves by what the measurement says against the prediction.
+        Returns the gain (K, 6, 6): displacement of each place per innovation of the measurement.
         """
         a, b = (6 * self._anchor(k) for k in (i, j))
         size = 6 * len(self._anchors)
@@ -49,20 +49,20 @@ class ChainCovariance:
         innovation = row[:, b : b + 6] - row[:, a : a + 6] + cov
         root = np.linalg.cholesky(0.5 * (innovation + innovation.T))
         half = np.linalg.solve(root, row)
-        for start in range(0, size, _ROWS):  # the whole product would take as much memory as the matrix
+        for start in range(0, size, _ROWS):  # the whole product would need as much memory as the matrix
             self._joint[start : min(start + _ROWS, size), :size] -= half[:, start : start + _ROWS].T @ half
         gains = np.linalg.solve(root.T, half).T.reshape(-1, 6, 6)
         before, after = gains[self._before], gains[self._after]
         return np.asarray(before + self._shares @ (after - before))
 
     def _crossing(self, k: int, slots: Indices) -> Array:
-        """(M, 6, 6) covariance of place k with the anchors in some slots (M,)."""
+        """Return (M, 6, 6) covariance of place k with the anchors in some slots (M,)."""
         blocks = self._joint.reshape(len(self._joint) // 6, 6, -1, 6)
         before, after = blocks[self._before[k], :, slots], blocks[self._after[k], :, slots]
         return np.asarray(before + self._shares[k] @ (after - before))
 
     def _covariances(self, ks: Indices) -> Array:
-        """(M, 6, 6) of each place on its own."""
+        """Return (M, 6, 6) covariance of each single place."""
         blocks = self._joint.reshape(len(self._joint) // 6, 6, -1, 6)
         a, b, shares = self._before[ks], self._after[ks], self._shares[ks]
         first, last, both = blocks[a, :, a], blocks[b, :, b], blocks[b, :, a]
@@ -72,7 +72,7 @@ class ChainCovariance:
         return np.asarray(first + shift + shift.transpose(0, 2, 1) + spread + walked - shares @ walked)
 
     def _bridges(self, i: int, js: Indices) -> Array:
-        """(M, 6, 6) covariances of place i with places between the same anchors, beyond what the anchors say."""
+        """Return (M, 6, 6) covariances of place i with places between the same anchors, beyond those by the anchors."""
         start = self._sums[self._starts[i]]
         walked_i, walked_j = self._sums[i] - start, self._sums[js] - start
         ahead = (js >= i)[:, None, None]
@@ -80,7 +80,7 @@ class ChainCovariance:
         return np.asarray(np.where(ahead, onward, back))
 
     def _anchor(self, k: int) -> int:
-        """The slot of place k, made an anchor if it is none yet."""
+        """Return the slot of place k, made an anchor if needed."""
         if self._starts[k] == k:
             return int(self._before[k])
         slot = len(self._anchors)
@@ -98,7 +98,7 @@ class ChainCovariance:
         return slot
 
     def _split(self, k: int, slot: int) -> None:
-        """Place k becomes the end of the stretch before it and the start of the one behind it."""
+        """Make place k the end of the interval before it and the start of the one after it."""
         start, had_end = int(self._starts[k]), self._after[k] != self._before[k]
         end = self._anchors[self._after[k]] if had_end else len(self._sums)
         self._anchors.append(k)
@@ -111,7 +111,7 @@ class ChainCovariance:
             self._after[k:end] = slot
 
     def _share(self, start: int, end: int, slot: int) -> None:
-        """The places from start until before end lie between these two anchors; slot is that of the end."""
+        """Assign the places from start until before end to these two anchors; slot is that of the end."""
         way = self._sums[start:end] - self._sums[start]
         whole = self._sums[end] - self._sums[start]
         self._shares[start:end] = np.linalg.solve(whole, way).transpose(0, 2, 1)

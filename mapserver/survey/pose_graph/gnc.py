@@ -1,6 +1,6 @@
-"""Graduated non-convexity (GNC): outlying loops of a pose graph whose other edges are true. Source: Yang et al. 2020.
+"""Graduated non-convexity (GNC): finds outlier loops of a pose graph whose other edges are true. Source: Yang et al. 2020.
 
-Own code, because `gtsam.GncLMOptimizer`, known inliers and bound the same, solves to the end at each of its steps: of parking-garage
+Own code, because `gtsam.GncLMOptimizer`, with the same known inliers and bound, solves to convergence at each step: of parking-garage
 (1,661 poses, one wrong loop more for 20) it had no result in 57 CPU s, where `loop_weights` ends after 13.4. Drives of 80 poses
 (tests/mapserver/survey/pose_graph/test_pose_graph.py) take both of them 0.14 s and end at the same cost.
 """
@@ -13,7 +13,7 @@ from fleetmap.geometry import Array
 _GROWTH = 1.6  # of the control parameter, from almost convex to truncated
 _STEPS = 2  # Levenberg-Marquardt iterations between two updates of the weights
 _MAX_UPDATES = 150
-_UNSURE = 1e-3  # a weight so near to 0 or 1 counts as decided
+_UNSURE = 1e-3  # a weight this near to 0 or 1 counts as decided
 
 
 def loop_weights(
@@ -22,12 +22,12 @@ def loop_weights(
     start: gtsam.Values,
     bound: float,
 ) -> tuple[Array, gtsam.Values]:
-    """Weight (len(loops),) of each loop, 1 believed and 0 not, and where the keyframes are then.
+    """Return the weight (len(loops),) of each loop, 1 accepted and 0 not, and the resulting poses of the keyframes.
 
-    `certain`: all that is taken for true. A loop is consistent while its squared residual stays within `bound`. Each step makes the cost a
-    little less convex and takes up where the last one ended, so that the whole costs little more than one solve. It begins once near
-    `start`, where at least the better half of the loops pulls, and, should that end in disbelief, once more with every loop pulling; the
-    lower truncated cost wins. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
+    `certain`: all edges assumed true. A loop is consistent while its squared residual stays within `bound`. Each step makes the cost a
+    little less convex and continues from the last result, so the whole costs little more than one solve. It starts near
+    `start`, with weights that keep the better half of the loops active, and, if loops are rejected, again with all loops active; the
+    lower truncated cost is returned. Source: Yang et al. 2020, Graduated non-convexity for robust spatial perception.
     """
     squared = squared_residuals(loops, start)
     if (squared <= bound).all():
@@ -49,7 +49,7 @@ def _anneal(
     bound: float,
     control: float,
 ) -> tuple[float, Array, gtsam.Values]:
-    """Truncated cost, weights and places, annealed from a control parameter."""
+    """Return truncated cost, weights and poses, annealed from a control parameter."""
     values = start
     for _ in range(_MAX_UPDATES):
         weights = truncated_weights(squared_residuals(loops, values), bound, control)
@@ -62,14 +62,14 @@ def _anneal(
 
 
 def truncated_weights(squared: Array, bound: float, control: float) -> Array:
-    """Weights of squared residuals under the surrogate of truncated least squares. Source: Yang et al. 2020, eq. 14."""
+    """Return weights of squared residuals under the surrogate of truncated least squares. Source: Yang et al. 2020, eq. 14."""
     between = np.sqrt(bound * control * (control + 1.0) / np.maximum(squared, 1e-12)) - control
     weights = np.where(squared >= bound * (control + 1.0) / control, 0.0, between)
     return np.asarray(np.where(squared <= bound * control / (control + 1.0), 1.0, np.clip(weights, 0.0, 1.0)))
 
 
 def squared_residuals(loops: list[gtsam.NoiseModelFactor], values: gtsam.Values) -> Array:
-    """(len(loops),) squared residuals in sigmas."""
+    """Return (len(loops),) squared residuals in sigmas."""
     return 2.0 * np.array([loop.error(values) for loop in loops])
 
 
@@ -80,12 +80,12 @@ def improved(
     values: gtsam.Values,
     steps: int,
 ) -> gtsam.Values:
-    """The values after so many steps of Levenberg-Marquardt in which each loop has its weight."""
+    """Return the values after some steps of Levenberg-Marquardt with weighted loops."""
     graph = gtsam.NonlinearFactorGraph(certain)
     for loop, weight in zip(loops, weights, strict=True):
         if weight >= 1.0 - _UNSURE:
             graph.push_back(loop)
-        elif weight > 0.0:  # however little: a sure loop far off begins with the bound's share of its square
+        elif weight > 0.0:  # however small: a distant true loop starts with the bound's share of its square
             noise = loop.noiseModel()
             assert isinstance(noise, gtsam.noiseModel.Gaussian)
             weaker = gtsam.noiseModel.Gaussian.SqrtInformation(noise.R() * np.sqrt(weight))

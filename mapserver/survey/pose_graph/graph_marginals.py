@@ -1,8 +1,8 @@
-"""Marginal covariances of relative transforms in a pose graph, as the loop gate needs them very often.
+"""Marginal covariances of relative transforms in a pose graph, for frequent queries by the loop gate.
 
-Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the plain difference x_j
+Perturbing every keyframe in map axes (map_from_body -> Exp(x_k) @ map_from_body) makes each edge a measurement of the difference x_j
 - x_i: odometry a chain of independent steps, every other edge a rank-6 update of it (recursive least squares). So a query costs a few small
-matrix products, with no factorisation, and an accepted loop is added without starting again. First order, exact for the linearised graph.
+matrix products without factorisation, and an accepted loop is an update. First order, exact for the linearised graph.
 """
 
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edges, optimize_pose_graph
 
-CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a place
-CHI2_6_0999 = 22.458  # with 6: a place and a direction
-_FIRST_ORDER_RAD = 0.5  # a loop that turns the graph further is not to be added to first order
+CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a position
+CHI2_6_0999 = 22.458  # with 6: a pose
+_FIRST_ORDER_RAD = 0.5  # a loop that rotates the graph further must not be added to first order
 
 
 class GraphMarginals:
     """Covariances of relative transforms in the graph of `edges`, linearised at map_from_body (K, 4, 4).
 
     All covariances (6, 6) are rotation first, of a perturbation in the axes of i: true i_from_j = Exp(x) @ i_from_j,
-    as in PoseEdge. Some edge joins every keyframe with the next. Loops count in full: pass those that are believed.
-    Memory goes with the square of the edges beyond the chain, 1.2 kB times, and not with K.
+    as in PoseEdge. Some edge joins every keyframe with the next. Loops count in full: pass accepted ones only.
+    Memory grows with the square of the edges beyond the chain, 1.2 kB times, and not with K.
     """
 
     def __init__(self, map_from_body: Array, edges: Sequence[PoseEdge]) -> None:
@@ -37,7 +37,7 @@ class GraphMarginals:
 
     def _linearise(self, map_from_body: Array, edges: Sequence[PoseEdge]) -> None:
         self.linearised_at, self._edges = map_from_body, list(edges)
-        # Seen from the middle of the site: far from the origin, turns would drown everything else in rounding.
+        # Relative to the middle of the site: far from the origin, rotations would cause large rounding errors.
         self._middle_m = map_from_body[:, :3, 3].mean(axis=0)
         self._map_from_body = map_from_body.copy()
         self._map_from_body[:, :3, 3] -= self._middle_m
@@ -50,20 +50,20 @@ class GraphMarginals:
 
     @property
     def map_from_body(self) -> Array:
-        """(K, 4, 4) where the keyframes are by all edges that were added; to first order."""
+        """(K, 4, 4) poses of the keyframes by all added edges, to first order."""
         placed = self._map_from_body.copy()
         placed[:, :3, 3] += self._middle_m
         return placed
 
     @property
     def learned(self) -> int:
-        """How many edges count besides those of the chain."""
+        """Number of edges besides those of the chain."""
         return self._learned
 
     def add(self, edge: PoseEdge) -> None:
-        """Takes one more edge into account, such as a loop just accepted: what it says narrows and moves the graph.
+        """Add an edge, such as a loop just accepted: it narrows the covariances and moves the graph.
 
-        Narrowing alone would refuse the next true loop of a place whose drift this one has shown.
+        Narrowing alone would refuse the next true loop, at a place whose drift this one has shown.
         """
         check_edges(len(self._map_from_body), [edge], connected=False)
         self._edges.append(edge)
@@ -75,48 +75,48 @@ class GraphMarginals:
         self._map_from_body = _moved(self._map_from_body, self._measure(edge) @ said_map)
 
     def relative_cov(self, i: int, j: int) -> Array:
-        """(6, 6) covariance of i_from_j."""
+        """Return (6, 6) covariance of i_from_j."""
         return np.asarray(self.relative_covs(i, np.array([j]))[0])
 
     def relative_covs(self, i: int, js: Indices) -> Array:
-        """(M, 6, 6) covariances of i_from_j for each j of js (M,)."""
+        """Return (M, 6, 6) covariances of i_from_j for each j of js (M,)."""
         cov_map = self._covariance.of_differences(i, js)
         i_from_map = adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
     def reachable(self, i: int, js: Indices, reach_m: float | Array, chi2: float = CHI2_3_0999) -> NDArray[np.bool_]:
-        """(M,) whether keyframe j may be within `reach_m` of keyframe i, given how well their distance is known.
+        """Return (M,) True if keyframe j may be within `reach_m` of keyframe i, given the uncertainty of their distance.
 
-        True where (distance - reach)^2 / variance of the distance is at most `chi2`: no place inside the reach is
-        nearer than that in Mahalanobis distance, so nothing that is possible is ruled out.
+        True if (distance - reach)^2 / variance of the distance is at most `chi2`: no position within the reach is
+        nearer than that in Mahalanobis distance, so no possible one is excluded.
         """
         positions_map = self._map_from_body[:, :3, 3]
         apart = (positions_map[js] - positions_map[i]) @ self._map_from_body[i, :3, :3]  # in the axes of i
         distance_m = np.linalg.norm(apart, axis=1)
         beyond_m = np.maximum(distance_m - reach_m, 0.0)
         direction = apart / np.maximum(distance_m, 1e-12)[:, None]
-        # A perturbation (r, t) moves j by r x apart + t, and the first part is across the direction.
+        # A perturbation (r, t) moves j by r x apart + t; the first part is perpendicular to the direction.
         variance = np.einsum("ma,mab,mb->m", direction, self.relative_covs(i, js)[:, 3:, 3:], direction)
         return np.asarray(beyond_m**2 <= chi2 * variance)
 
     def known(self, i: int, js: Indices, sigmas: Array) -> NDArray[np.bool_]:
-        """(M,) whether i_from_j is known to sigmas (6,) or better, in all directions at once."""
+        """Return (M,) True if i_from_j is known to sigmas (6,) or better, in all directions at once."""
         whitened = self.relative_covs(i, js) / (sigmas[:, None] * sigmas)
         return np.asarray(np.linalg.eigvalsh(whitened)[:, -1] < 1.0)
 
     def innovation_squared(self, edge: PoseEdge) -> float:
-        """Squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from what the graph predicts.
+        """Return the squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from the graph's prediction.
 
-        The graph must not hold the edge yet. Compare with CHI2_6_0999.
+        The graph must not contain the edge yet. Compare with CHI2_6_0999.
         """
         innovation = self._innovation(edge)
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return float(innovation @ np.linalg.solve(cov, innovation))
 
     def innovations_squared_beside(self, edge: PoseEdge, steps_map: Array) -> Array:
-        """(M,) `innovation_squared` had the edge put keyframe i somewhere else: each of steps_map (M, 3) away, turned alike."""
+        """Return (M,) `innovation_squared` for an edge that puts keyframe i elsewhere: shifted by each of steps_map (M, 3)."""
         innovation = self._innovation(edge)
-        # A step moves the innovation's translation, not its rotation, and its logarithm is linear in that.
+        # A step changes only the innovation's translation, and its logarithm is linear in that.
         map_from_j = self._map_from_body[edge.j]
         away = steps_map @ (edge.i_from_j[:3, :3] @ map_from_j[:3, :3].T).T
         beside = np.tile(innovation, (len(steps_map), 1))
@@ -125,29 +125,29 @@ class GraphMarginals:
         return np.asarray(np.einsum("ma,am->m", beside, np.linalg.solve(cov, beside.T)))
 
     def gain(self, edge: PoseEdge, enough: Array) -> float:
-        """Largest ratio of what the graph does not know to what the edge does not, counting from a cov_rot_trans (6, 6) on
-        that is known well `enough`: below 1 the edge tells little.
+        """Return the largest variance ratio of the graph's prediction to the edge, counting from a cov_rot_trans (6, 6) that
+        is accurate `enough`: below 1 the edge adds little.
         """
         return float(np.max(scipy.linalg.eigvalsh(self.relative_cov(edge.i, edge.j), edge.cov_rot_trans + enough)))
 
     def _innovation(self, edge: PoseEdge) -> Array:
-        """(6,) what a measured edge says against the graph, in the axes of i."""
+        """Return (6,) innovation of a measured edge against the graph, in the axes of i."""
         j_from_i = se3_inverse(self._map_from_body[edge.j]) @ self._map_from_body[edge.i]
         return se3_log(edge.i_from_j @ j_from_i)
 
     def _cov_map(self, edge: PoseEdge) -> Array:
-        """(6, 6) covariance of an edge, of a perturbation in map axes."""
+        """Return (6, 6) covariance of an edge, of a perturbation in map axes."""
         map_from_i = adjoint(self._map_from_body[edge.i])
         return np.asarray(map_from_i @ edge.cov_rot_trans @ map_from_i.T)
 
     def _measure(self, edge: PoseEdge) -> Array:
-        """(K, 6, 6) how far each keyframe moves by what the edge says against the graph, which knows it from now on."""
+        """Return (K, 6, 6) displacement of each keyframe per innovation of the edge, which is then part of the graph."""
         self._learned += 1
         return self._covariance.measure(edge.i, edge.j, self._cov_map(edge))
 
 
 def _chain_and_others(count: int, edges: Sequence[PoseEdge]) -> tuple[list[PoseEdge], list[PoseEdge]]:
-    """One edge from each keyframe to the next, safe ones first, and all that are left."""
+    """Return one edge from each keyframe to the next, safe ones first, and the remaining ones."""
     chain: dict[int, PoseEdge] = {}
     others = []
     for edge in sorted(edges, key=lambda edge: edge.is_loop):
@@ -161,7 +161,7 @@ def _chain_and_others(count: int, edges: Sequence[PoseEdge]) -> tuple[list[PoseE
 
 
 def _moved(map_from_body: Array, perturbations: Array) -> Array:
-    """Exp(x_k) @ map_from_body (K, 4, 4) for perturbations (K, 6), to second order in the translation."""
+    """Return Exp(x_k) @ map_from_body (K, 4, 4) for perturbations (K, 6), to second order in the translation."""
     turns = Rotation.from_rotvec(perturbations[:, :3]).as_matrix()
     shifts = perturbations[:, 3:] + 0.5 * np.cross(perturbations[:, :3], perturbations[:, 3:])
     moved = map_from_body.copy()

@@ -1,4 +1,4 @@
-"""Pose graph optimization over SE(3): the poses that fit measured relative transforms best, and the outlying loops."""
+"""Pose graph optimization over SE(3): the best fit of poses to measured relative transforms, and the outlier loops."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class PoseEdge:
     """A measured i_from_j (4, 4) between keyframes i and j.
 
     cov_rot_trans (6, 6) is that of a perturbation in the axes of i: true i_from_j = Exp(perturbation) @ i_from_j.
-    Loops may be wrong, other edges are taken for true.
+    Loops may be wrong, other edges are assumed true.
     """
 
     i: int
@@ -36,9 +36,8 @@ class PoseEdge:
 class PoseGraphResult:
     """Optimised map_from_body (K, 4, 4).
 
-    loop_weights holds one number for each loop edge in their order: 1 believed, 0 disbelieved; below 0.5 a loop had
-    no part in the result. Costs are half the sum of squared normalised residuals of the believed edges, at the start
-    and at the result. iterations of the last solve.
+    loop_weights has one number for each loop edge in order: 1 accepted, 0 rejected; below 0.5 a loop did not affect the result. Costs are
+    half the sum of squared normalised residuals of the accepted edges, at the start and at the result. iterations of the last solve.
     """
 
     map_from_body: Array
@@ -49,7 +48,7 @@ class PoseGraphResult:
 
 
 def adjoint(target_from_source: Array) -> Array:
-    """(6, 6) matrix that carries a perturbation from source to target axes, rotation first. Source: Barfoot, 7.45."""
+    """Return the (6, 6) matrix that maps a perturbation from source to target axes, rotation first. Source: Barfoot, 7.45."""
     rotation = target_from_source[:3, :3]
     carried = np.zeros((6, 6))
     carried[:3, :3] = carried[3:, 3:] = rotation
@@ -64,13 +63,13 @@ def optimize_pose_graph(
     *,
     robust: bool = True,
 ) -> PoseGraphResult:
-    """The places of K keyframes that fit the edges best, from a start map_from_body (K, 4, 4); `fixed` stays.
+    """Return the poses of K keyframes with the best fit to the edges, from a start map_from_body (K, 4, 4); `fixed` is unchanged.
 
-    robust: loops that contradict the rest are disbelieved, by graduated non-convexity with truncated least squares in which all other edges
-    are known to be true; a loop counts as consistent while its squared residual stays within the 0.999 of chi-square. Where the
-    result is less likely than its edges' covariances allow, a second start without any guess (chordal relaxation of the rotations) is
-    tried, and the better result taken. Raises SurveyError for edges that leave a keyframe without connection, point outside or carry no
-    proper covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as gtsam has it.
+    robust: loops that contradict the rest are rejected, by graduated non-convexity with truncated least squares in which all other edges
+    are assumed true; a loop is consistent while its squared residual stays within the 0.999 of chi-square. If the
+    result is less likely than its edges' covariances allow, a second start without initial values (chordal relaxation of the rotations) is
+    tried, and the better result returned. Raises SurveyError for edges that leave a keyframe unconnected, have an invalid index or an
+    invalid covariance. Source: Yang et al. 2020 (GNC); Carlone et al. 2015 (chordal start), as in gtsam.
     """
     check_edges(len(map_from_body), edges)
     begin = start = _values(map_from_body)
@@ -92,18 +91,18 @@ def optimize_pose_graph(
     except RuntimeError as error:
         raise SurveyError(
             f"the pose graph of {len(map_from_body)} keyframes and {len(edges)} edges cannot be solved "
-            f"({str(error).strip().splitlines()[0]}); look for keyframes that only a wrong loop holds"
+            f"({str(error).strip().splitlines()[0]}); look for keyframes connected only by a wrong loop"
         ) from error
     solved = np.array([optimum.atPose3(k).matrix() for k in range(len(map_from_body))])
-    solved = map_from_body[fixed] @ se3_inverse(solved[fixed]) @ solved  # the prior leaves 1e-6 of play
+    solved = map_from_body[fixed] @ se3_inverse(solved[fixed]) @ solved  # the prior allows a deviation of 1e-6
     solved[fixed] = map_from_body[fixed]
     return PoseGraphResult(solved, weights, graph.error(start), graph.error(optimum), iterations)
 
 
 def check_edges(count: int, edges: Sequence[PoseEdge], *, connected: bool = True) -> None:
-    """Raises SurveyError unless every edge joins two of `count` keyframes with a proper covariance.
+    """Raise SurveyError unless every edge joins two of `count` keyframes with a valid covariance.
 
-    connected: also unless they join all keyframes.
+    connected: also raise unless they join all keyframes.
     """
     for edge in edges:
         if not (0 <= edge.i < count and 0 <= edge.j < count and edge.i != edge.j):
@@ -149,7 +148,7 @@ def _values(map_from_body: Array) -> gtsam.Values:
 
 
 def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam.NonlinearFactorGraph:
-    """The edges as factors, in their order, then the factor that fixes one keyframe."""
+    """Return the edges as factors, in order, then the factor that fixes one keyframe."""
     graph = gtsam.NonlinearFactorGraph()
     for edge in edges:
         j_from_i = adjoint(se3_inverse(edge.i_from_j))  # gtsam perturbs on the right, in the axes of j
@@ -162,7 +161,7 @@ def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam
 
 
 def _optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int) -> tuple[gtsam.Values, int]:
-    """The lowest minimum found, and the iterations that led there from the start that reached it."""
+    """Return the lowest minimum found, and the iterations from its start."""
     best, spent = _descend(graph, start, _FIRST_ITERATIONS)
     if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
         other, other_spent = _without_guess(graph, _FIRST_ITERATIONS)
@@ -175,7 +174,7 @@ def _optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: in
 
 
 def _without_guess(graph: gtsam.NonlinearFactorGraph, iterations: int) -> tuple[gtsam.Values | None, int]:
-    """What the chordal start leads to, None where the graph is too badly conditioned to have one."""
+    """Return the result from the chordal start, None if the graph is too badly conditioned for one."""
     try:
         return _descend(graph, gtsam.InitializePose3.initialize(graph), iterations)
     except RuntimeError:

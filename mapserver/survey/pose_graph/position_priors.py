@@ -1,8 +1,8 @@
-"""Position priors as edges of the loops' gate: what docks, tags and zones say of where keyframes lie to each other. Pure.
+"""Position priors as edges of the loops' gate: relative poses of keyframes by docks, tags and zones. Pure.
 
-A survey among like aisles is told from time to time where it is, to a metre. Its pose graph drifts by more than that; an aisle is 4.5 m
-wide. The gate therefore learns each prior against the first one that knows its heading. The map does not: its shape is what the sensors
-measured.
+In a survey among similar aisles some devices give its position to a metre from time to time. Its pose graph drifts by more than that;
+an aisle is 4.5 m wide. The gate therefore uses each prior relative to the first one with a heading. The map does not: its shape is
+measured by the sensors only.
 """
 
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMargin
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
 from mapserver.survey.state import OdometryPass
 
-_MAX_GAP_NS = 500_000_000  # between a prior and the frame that stands for its moment
+_MAX_GAP_NS = 500_000_000  # between a prior and the frame used for it
 _HEADING_KNOWN_RAD = 0.2
 _UNKNOWN_VARIANCE = np.array([1.0] * 3 + [1e4] * 3)  # rad^2, m^2
-# What a floor's unevenness and a robot's tilt add to a prior (roll, pitch, yaw in rad; x, y, z in m), and carrying it to a keyframe.
+# Errors of a prior by the floor's unevenness and a robot's tilt (roll, pitch, yaw in rad; x, y, z in m), and by its transfer to a keyframe.
 _BETWEEN = np.diag(np.square([0.05, 0.05, 0.0, 0.05, 0.05, 0.25]))
 
 
 def learn_priors(
     marginals: GraphMarginals, priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass
 ) -> int:
-    """Adds what position priors say to a graph of the odometry's keyframes; returns how many contradict it and were left out.
+    """Add position priors to a graph of the odometry's keyframes; return how many contradict it and were left out.
 
-    Without a prior that knows its heading nothing is added: positions alone do not say which way the survey looked.
+    Without a prior with a heading nothing is added: positions alone do not give the survey's heading.
     """
     usable = _usable(priors, odometry)
     first = next((n for n, (prior, _) in enumerate(usable) if prior.cov_rot_trans[2, 2] <= _HEADING_KNOWN_RAD**2), None)
@@ -51,7 +51,7 @@ def learn_priors(
 
 
 def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[tuple[PositionPrior, int]]:
-    """Priors of devices that know where they are in the plane, each with the frame nearest to its moment."""
+    """Return priors of devices with known position in the plane, each with the frame nearest in time."""
     stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
     found = []
     for prior in priors:
@@ -63,12 +63,12 @@ def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[tup
 
 
 def _keyframe_at(frame: int, odometry: OdometryPass) -> int:
-    """The keyframe that is nearest to a frame."""
+    """Return the keyframe nearest to a frame."""
     return int(np.argmin([abs(k.frame_index - frame) for k in odometry.keyframes]))
 
 
 def _led(keyframe: int, frame: int, odometry: OdometryPass) -> Array:
-    """keyframe_from_frame (4, 4) of the body, by odometry."""
+    """Return keyframe_from_frame (4, 4) of the body, by odometry."""
     first = odometry.odom_from_body[odometry.keyframes[keyframe].frame_index]
     return np.asarray(se3_inverse(first) @ odometry.odom_from_body[frame])
 
@@ -83,7 +83,7 @@ def _edge(
     led: Array,
     base_from_body: Array,
 ) -> PoseEdge:
-    """Where keyframe j lies to i, by their priors. Its heading is the graph's own, of which the edge says nothing."""
+    """Return the pose of keyframe j relative to i by their priors. Its heading is the graph's own and unconstrained by the edge."""
     placed = marginals.map_from_body
     turn_ij = placed[i, :3, :3].T @ placed[j, :3, :3]
     turn_map_j = map_from_i[:3, :3] @ turn_ij
@@ -91,14 +91,14 @@ def _edge(
     body_m = prior.map_from_base[:3, 3] + turn_map_base @ base_from_body[:3, 3] - turn_map_j @ led[:3, 3]
     i_from_j = se3(turn_ij, map_from_i[:3, :3].T @ (body_m - map_from_i[:3, 3]))
     turned = np.kron(np.eye(2), map_from_i[:3, :3].T)
-    free = adjoint(i_from_j)[:, :3]  # any turn of j about itself
-    where = np.diag([0.0] * 3 + [1.0] * 3)  # of the told one only its place counts
+    free = adjoint(i_from_j)[:, :3]  # any rotation of j about itself
+    where = np.diag([0.0] * 3 + [1.0] * 3)  # of the prior only its position counts
     covariance = turned @ (_finite(reference) + where @ _finite(prior) @ where + _BETWEEN) @ turned.T + free @ free.T
     return PoseEdge(i, j, i_from_j, covariance, is_loop=True)
 
 
 def _finite(prior: PositionPrior) -> Array:
-    """Its covariance (6, 6) with large variances in the place of infinite ones, which are of nothing else."""
+    """Return its covariance (6, 6) with large variances instead of infinite ones, which are uncorrelated."""
     variances = np.diag(prior.cov_rot_trans)
     finite = np.where(np.isfinite(prior.cov_rot_trans), prior.cov_rot_trans, 0.0)
     unknown = ~np.isfinite(variances)

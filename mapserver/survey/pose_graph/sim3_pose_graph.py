@@ -21,7 +21,7 @@ _ROUND_ITERATIONS = 4  # while the loops' weights still change
 
 @dataclass(frozen=True, slots=True)
 class SimilarityEdge:
-    """Measured: a point x of keyframe j lies at scale * R x + t for keyframe i; i_from_j (4, 4) holds R and t.
+    """Measurement: a point x of keyframe j is at scale * R x + t for keyframe i; i_from_j (4, 4) contains R and t.
 
     cov (7, 7) of the error: rotation, translation in lengths of i, logarithm of the scale. Loops may be wrong, other edges are true.
     """
@@ -36,9 +36,7 @@ class SimilarityEdge:
 
 @dataclass(frozen=True, slots=True)
 class SimilarityResult:
-    """Optimised places and directions map_from_body (K, 4, 4), the keyframes' scales (K,), and the loops' weights in their order (1
-    believed, 0 not).
-    """
+    """Optimised poses map_from_body (K, 4, 4), the keyframes' scales (K,), and the loops' weights in order (1 accepted, 0 not)."""
 
     map_from_body: Array
     scales: Array
@@ -46,12 +44,12 @@ class SimilarityResult:
 
 
 def optimize_similarities(map_from_body: Array, edges: Sequence[SimilarityEdge], fixed: int = 0) -> SimilarityResult:
-    """The similarities that fit the edges best, from a start map_from_body (K, 4, 4) of scale 1; keyframe `fixed` stays, and with it the
-    scale.
+    """Return the similarities with the best fit to the edges, from a start map_from_body (K, 4, 4) of scale 1; keyframe `fixed` and
+    its scale are unchanged.
 
-    Loops that contradict the rest are disbelieved, all other edges taken for true: by graduated non-convexity with Geman and McClure's
-    cost, which believes all loops at first; one whose square then stays within 0.999 of chi-square counts in full.
-    Edges must join all keyframes with proper covariances, or it does not end.
+    Loops that contradict the rest are rejected, all other edges assumed true: by graduated non-convexity with Geman and McClure's
+    cost, which accepts all loops at first; one with a squared residual within 0.999 of chi-square counts in full.
+    Edges must connect all keyframes with valid covariances; otherwise it does not terminate.
     Sources: Strasdat et al. 2010 (Sim(3) graphs), Yang et al. 2020 (GNC).
     """
     state, certain, loops = gtsam.Values(), gtsam.NonlinearFactorGraph(), list[gtsam.NoiseModelFactor]()
@@ -92,7 +90,7 @@ def optimize_similarities(map_from_body: Array, edges: Sequence[SimilarityEdge],
 
 
 def _factor(edge: SimilarityEdge) -> gtsam.NoiseModelFactor:
-    """The edge as gtsam has it: Similarity3(R, t, s) maps x to s (R x + t), and errors are in the axes of j."""
+    """Return the edge in gtsam's form: Similarity3(R, t, s) maps x to s (R x + t), and errors are in the axes of j."""
     measured = gtsam.Similarity3(gtsam.Rot3(edge.i_from_j[:3, :3]), edge.i_from_j[:3, 3] / edge.scale, edge.scale)
     j_from_i = measured.inverse().AdjointMap()
     cov = j_from_i @ edge.cov @ j_from_i.T

@@ -14,13 +14,13 @@ from mapserver.survey.state import Keyframe
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_task, view_overlap
 
 _NEAR_CANDIDATES = 40
-_BATCH = 32  # pairs: a tenth of a second of work; the twenty keyframes that travel with it cost a few milliseconds
+_BATCH = 32  # pairs: 0.1 s of work; sending their twenty keyframes costs a few milliseconds
 _MAX_VIEW_ANGLE_DEG = 75.0
 _NOBODY: list[int] = []
 
 
 class PairFinder:
-    """Matches keyframes that should see the same things, given where they are."""
+    """Matches keyframes that should see the same, given their poses."""
 
     def __init__(
         self,
@@ -37,9 +37,9 @@ class PairFinder:
         self._depths_m = np.array([k.median_depth_m for k in keyframes])
 
     def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
-        """Pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
+        """Return pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
 
-        only_near: no more than so many keyframes apart, before loops have been closed.
+        only_near: maximum distance in keyframes, before loops have been closed.
         """
         map_from_cam = map_from_body @ self._body_from_cam
         positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
@@ -76,7 +76,7 @@ class PairFinder:
         is_known: bool = True,
         progress: Callable[[int], None],
     ) -> list[PairMatch]:
-        """Verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
+        """Return verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
         map_from_cam = map_from_body @ self._body_from_cam
         predictions: list[_Prediction] = []
         for i, j in candidates:
@@ -95,21 +95,21 @@ class PairFinder:
 
 
 class NearPlaces:
-    """Places (K, 3) that one of two can reach, by reaches (K,): a keyframe costs what stands around it, not the whole site.
+    """Places (K, 3) that can reach each other, by reaches (K,): a query costs the near places, not the whole site.
 
-    Each lies in a cell as wide as it reaches at most, one of widths that double.
+    Each lies in a cell at least as wide as its reach; widths double from level to level.
     """
 
     def __init__(self, positions_m: Array, reach_m: Array) -> None:
         self._positions_m, self._reach_m = positions_m, reach_m
         least_m = max(float(np.median(reach_m)), 1e-3)
         self._widths_m = least_m * 2.0 ** np.ceil(np.log2(np.maximum(reach_m / least_m, 1.0)))
-        # Of how many keyframes, so that none is asked that comes later
+        # Limit of keyframes in the grid, so that later ones are not queried
         self._cells: dict[float, dict[tuple[int, int], list[int]]] = {}
         self._filled = 0
 
     def before(self, j: int, until: int) -> NDArray[np.int64]:
-        """Numbers below `until`, rising, of all that may reach j or be reached from it. `until` must not fall from call to call."""
+        """Return ascending numbers below `until` of all that may reach j or be reached from it. `until` must not decrease."""
         for k in range(self._filled, until):
             width_m = float(self._widths_m[k])
             x, y = np.floor(self._positions_m[k, :2] / width_m).astype(np.int64).tolist()
@@ -136,9 +136,9 @@ def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:
 
 
 def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:
-    """How far apart measured and predicted motion may be before loops are closed: three sigmas of the odometry since, and a floor.
+    """Return the allowed difference of measured and predicted motion before loop closure: three sigmas of odometry, and a floor.
 
-    covariances (K, 6, 6) of the keyframes' odometry; what was gained between two of them is their relative uncertainty.
+    covariances (K, 6, 6) of the keyframes' odometry; the growth between two of them is their relative uncertainty.
     """
 
     def allowed_m(i: int, j: int) -> float:
@@ -150,6 +150,6 @@ def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> C
 
 
 def fixed_allowance_m(map_from_body: Array) -> Callable[[int, int], float]:
-    """The same after bundle adjustment: what a well-matched pair may be off by."""
+    """Return the same after bundle adjustment: the error of a well-matched pair."""
     positions = map_from_body[:, :3, 3]
     return lambda i, j: 0.15 + 0.05 * float(np.linalg.norm(positions[j] - positions[i]))

@@ -1,4 +1,4 @@
-"""Depths of one camera's features from the keyframes around each: what a second camera would have told at once."""
+"""Depths of one camera's features, triangulated from neighbouring keyframes in place of a second camera."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from mapserver.survey.state import Keyframe
 
 
 class MonoDepths:
-    """Places features of single-camera keyframes by triangulation with neighbours in time; matches are looked for once."""
+    """Triangulates features of single-camera keyframes with neighbours in time; matches are searched once."""
 
     def __init__(self, keyframes: Sequence[Keyframe], camera: StereoCamera, settings: SurveySettings) -> None:
         self._camera, self._settings = camera, settings
@@ -24,7 +24,7 @@ class MonoDepths:
         self.grow(keyframes)
 
     def grow(self, keyframes: Sequence[Keyframe]) -> None:
-        """Takes a longer chain, of which those that are known come first."""
+        """Extend the chain; known keyframes come first."""
         known, pairs = len(self._keyframes), self._settings.pairs
         self._keyframes += keyframes[known:]
         for j in range(known, len(self._keyframes)):
@@ -33,11 +33,11 @@ class MonoDepths:
                 self._matches[i, j] = match_mutual(a, b, pairs.max_distance, pairs.ratio)
 
     def release(self, k: int) -> None:
-        """Lets go of a keyframe's pictures."""
+        """Release a keyframe's pictures."""
         self._keyframes[k] = self._keyframes[k].without_pictures()
 
     def keyframes_at(self, map_from_body: Array, body_from_cam: Array, first: int = 0) -> list[Keyframe]:
-        """The keyframes from `first` on with disparities and points of those features that several of them agree on, the others without."""
+        """Return the keyframes from `first` on with disparities and points of features on which several agree, the others without."""
         map_from_cam = map_from_body @ body_from_cam
         found: list[list[Array]] = [[] for _ in self._keyframes]  # rows of feature, inverse depth, its sigma
         for j in range(first, len(self._keyframes)):
@@ -52,7 +52,7 @@ class MonoDepths:
         ]
 
     def _measure(self, i: int, j: int, match: NDArray[np.int64], j_from_i: Array) -> tuple[Array, Array]:
-        """For both keyframes rows (P, 3) of feature, inverse depth and its sigma."""
+        """Return for both keyframes rows (P, 3) of feature, inverse depth and its sigma."""
         a, b, s = self._keyframes[i].features, self._keyframes[j].features, self._settings.monocular
         pixels_a, pixels_b = a.pixels[match[:, 0]], b.pixels[match[:, 1]]
         points, angle = triangulate_pair(self._camera, j_from_i, pixels_a, pixels_b)
@@ -62,7 +62,7 @@ class MonoDepths:
         off_b = np.linalg.norm(self._camera.pixel_from_point(seen)[:, :2] - pixels_b, axis=1)
         with np.errstate(invalid="ignore"):
             good = (off_a < limit) & (off_b < limit) & (angle > np.radians(s.min_angle_deg)) & (seen[:, 2] > 0)
-        sigma = np.sqrt(2.0) * s.match_sigma_px / (self._camera.focal_px * angle[good])  # as a share of the depth
+        sigma = np.sqrt(2.0) * s.match_sigma_px / (self._camera.focal_px * angle[good])  # relative to the depth
         return (
             np.column_stack([match[good, 0], 1.0 / points[good, 2], sigma / points[good, 2]]),
             np.column_stack([match[good, 1], 1.0 / seen[good, 2], sigma / seen[good, 2]]),
@@ -77,10 +77,10 @@ class MonoDepths:
 
 
 def fuse_inverse_depths(rows: Array, count: int, max_sigma_share: float) -> Array:
-    """(count, 2) inverse depth and sigma of each feature; NaN where nothing is known well enough or the views disagree.
+    """Return (count, 2) inverse depth and sigma of each feature; NaN if too uncertain or if the views disagree.
 
-    rows (P, 3): feature, inverse depth, sigma. The surest view decides; views within three sigmas of it are averaged with it, and a
-    feature that more views contradict than support is dropped.
+    rows (P, 3): feature, inverse depth, sigma. Views within three sigmas of the most accurate view are averaged with it, and a
+    feature with more contradicting than supporting views is dropped.
     """
     out = np.full((count, 2), np.nan)
     order = np.lexsort((rows[:, 2], rows[:, 0]))

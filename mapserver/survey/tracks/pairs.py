@@ -15,7 +15,7 @@ from mapserver.survey.settings import PairSettings
 from mapserver.survey.state import Keyframe
 
 Indices = NDArray[np.int64]
-_SCALES = 1.2 ** np.minimum(np.arange(128), 4).astype(np.float64)  # of the pixels on an octave
+_SCALES = 1.2 ** np.minimum(np.arange(128), 4).astype(np.float64)  # pixel scale of an octave
 _PROJECTED_SHARE = 0.4  # of the matches near their prediction: fewer, and the prediction was wrong
 
 
@@ -32,7 +32,7 @@ class PairMatch:
 
 @dataclass(frozen=True, slots=True)
 class MatchInputs:
-    """Keyframes by their numbers, without their pictures, as matching reads them: of a survey, or of a few pairs."""
+    """Keyframes by their numbers, without their pictures, for matching: of a survey, or of a few pairs."""
 
     keyframes: list[Keyframe] | dict[int, Keyframe]
     camera: StereoCamera
@@ -40,14 +40,14 @@ class MatchInputs:
 
 
 class PairTask(NamedTuple):
-    """Work for a process: pairs (i, j, predicted motion), and their keyframes. No process needs those of the whole survey."""
+    """Work for a process: pairs (i, j, predicted motion), and their keyframes only, not those of the whole survey."""
 
     pairs: "list[tuple[int, int, PredictedMotion]]"
     keyframes: dict[int, Keyframe]
 
     @classmethod
     def of(cls, pairs: "list[tuple[int, int, PredictedMotion]]", inputs: MatchInputs) -> "PairTask":
-        """The task of some of a survey's pairs."""
+        """Return the task of some of a survey's pairs."""
         numbers = sorted({k for i, j, _ in pairs for k in (i, j)})
         return cls(pairs, {k: inputs.keyframes[k] for k in numbers})
 
@@ -55,7 +55,7 @@ class PairTask(NamedTuple):
 class PredictedMotion(NamedTuple):
     """Camera motion j_from_i (4, 4) expected between two keyframes.
 
-    rotation_sigma_rad: of its rotation, None where it must not be used. is_known: good to a few pixels (after bundle
+    rotation_sigma_rad: of its rotation, None if it must not be used. is_known: accurate to a few pixels (after bundle
     adjustment), so that projection alone finds the matches.
     """
 
@@ -65,13 +65,13 @@ class PredictedMotion(NamedTuple):
 
 
 def match_task(shared: MatchInputs, task: PairTask) -> list[PairMatch | None]:
-    """The verified match of each pair of a task; `shared` needs no keyframes."""
+    """Return the verified match of each pair of a task; `shared` needs no keyframes."""
     inputs = replace(shared, keyframes=task.keyframes)
     return [match_pair(i, j, inputs, predicted) for i, j, predicted in task.pairs]
 
 
 def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion | None = None) -> PairMatch | None:
-    """The verified match of two keyframes, None where too little agrees."""
+    """Return the verified match of two keyframes, None if too little agrees."""
     a, b, settings = inputs.keyframes[i], inputs.keyframes[j], inputs.settings
     match, radii_px = None, [settings.search_px, settings.guided_radius_px, settings.guided_radius_px]
     if predicted is not None and predicted.is_known:
@@ -91,7 +91,7 @@ def match_pair(i: int, j: int, inputs: MatchInputs, predicted: PredictedMotion |
 def _match_guided(
     a: Keyframe, b: Keyframe, inputs: MatchInputs, b_from_a: Array, radii_px: list[float], least_share: float
 ) -> tuple[int, NDArray[np.int32], Array, Array]:
-    """How often matches near a motion gave the motion, the matches at last, the motion and its information."""
+    """Return how often matches near a motion gave the motion, the final matches, the motion and its information."""
     settings, camera = inputs.settings, inputs.camera
     motion, size_px = np.ascontiguousarray(b_from_a, np.float64), (camera.width_px, camera.height_px)
     limits = camera.lens, size_px, settings.match_sigma_px, REFINEMENT, settings.guided_distance
@@ -128,12 +128,12 @@ def _from_descriptors(
             matches, rotation, threshold_px=threshold_px, min_inliers=least, rotation_sigma_rad=sigma_rad
         )
     found = ransac_pnp(matches, threshold_px=4.0, min_inliers=least, seed=len(pairs))
-    # without a known rotation a few matches agree with something by chance: ask for a share of them too
+    # without a known rotation a few matches agree by chance: also require a share of them
     return found if found is not None and found.inliers.sum() >= 0.2 * len(pairs) else None
 
 
 def view_overlap(a: Keyframe, camera: StereoCamera, b_from_a: Array) -> float:
-    """Share of a's points with depth that b would see, at a similar distance."""
+    """Return the share of a's points with depth that b would see, at a similar distance."""
     motion, size_px = np.ascontiguousarray(b_from_a, np.float64), (camera.width_px, camera.height_px)
     places = np.ascontiguousarray(a.points_cam), np.ascontiguousarray(a.disparities)
     return core.share_in_view(motion, *places, camera.lens, size_px)

@@ -16,16 +16,14 @@ from mapserver.survey.tracks.pairs import PairMatch
 
 # Of an image: its pyramid, pixels (M, 2), octaves (M,) and angles (M,) of features, and which of them are chosen (N,).
 _PatchFeatures = tuple[patch_align.Pyramid, Array, NDArray[np.int8], NDArray[np.float32], NDArray[np.int64]]
-_SAME_WARP = (
-    0.01  # change of a patch's shape that moves its rim by less than a twentieth of a pixel, to all sides alike
-)
-_ROWS = 2**18  # observations whose warps are compared at once
-_BATCH = 16  # keyframes: their sources overlap, so that few pictures travel twice
+_SAME_WARP = 0.01  # isotropic change of a patch's shape that moves its rim by less than 0.05 px
+_ROWS = 2**18  # observations per comparison of warps
+_BATCH = 16  # keyframes: their sources overlap, so that few pictures are sent twice
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """What pairs connect: members (M,) of G tracks, one track after the other, by rising keyframe; starts (G,) of each."""
+    """Features connected by pairs: members (M,) of G concatenated tracks, by ascending keyframe; starts (G,) of each."""
 
     keyframes: NDArray[np.int64]
     features: NDArray[np.int64]
@@ -33,22 +31,22 @@ class Tracks:
 
     @classmethod
     def of(cls, marks: Landmarks) -> "Tracks":
-        """The observations of landmarks, each one's reference first."""
+        """Return the observations of landmarks, each one's reference first."""
         starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
         return cls(marks.obs_keyframe.astype(np.int64), marks.obs_feature, starts)
 
 
 def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
-    """Groups of features that pairs connect, no keyframe twice in a group; pairs with most matches are joined first.
+    """Group features connected by pairs, no keyframe twice in a group; pairs with the most matches are joined first.
 
-    known: what belongs together before any pair is asked.
+    known: groups joined before any pair.
     Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
     """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
     known = Tracks.of(Landmarks.empty()) if known is None else known
     if not ordered and not len(known.starts):
         return known
-    # Keyframes have far fewer features than pairs have matches: any feature is a node, and links stay small.
+    # Keyframes have far fewer features than pairs have matches: each feature is a node, and links stay small.
     stride = 1 + max([int(known.features.max(initial=0)), *(int(p.features.max(initial=0)) for p in ordered)])
     count = 1 + max([int(known.keyframes.max(initial=0)), *(p.j for p in ordered)])
     linked = (known.keyframes * stride + known.features).astype(np.int32)
@@ -70,9 +68,9 @@ def build_landmarks(
     executor: Executor = SERIAL,
     redundant: NDArray[np.bool_] | None = None,
 ) -> Landmarks:
-    """Tracks with a stereo point to start from, each observation's coordinate refined against the reference patch.
+    """Return landmarks of tracks with a stereo point, each observation's coordinate refined against the reference patch.
 
-    Tracks that fewer than two keyframes see which are not redundant (K,) give no landmark.
+    Tracks seen by fewer than two keyframes that are not redundant (K,) give no landmark.
     """
     redundant = np.zeros(len(posed.keyframes), bool) if redundant is None else redundant
     table, points_cam = _tracks_from_reference(posed.keyframes, tracks, redundant)
@@ -88,7 +86,7 @@ def build_landmarks(
 def refine_observations(
     posed: PosedKeyframes, marks: Landmarks, settings: SurveySettings, executor: Executor, before: Array
 ) -> Landmarks:
-    """The same landmarks with refined coordinates where better poses warp the patches better.
+    """Return the same landmarks with coordinates refined again where better poses improve the warp of patches.
 
     before: map_from_cam (K, 4, 4) at which they were observed.
     """
@@ -111,7 +109,7 @@ def refine_observations(
 def _warps(
     seen: tuple[NDArray[np.int64], NDArray[np.int64]], points_map: Array, map_from_cam: Array
 ) -> tuple[Array, Array]:
-    """Rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of how much farther it is than from there.
+    """Return rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of the ratio of their distances.
 
     seen: the keyframe (M,) of each observation and that of its reference. points_map (M, 3) of their landmarks.
     """
@@ -123,14 +121,14 @@ def _warps(
 
 
 def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(M,) which observations are the first of their landmark."""
+    """Return (M,) True for observations that are the first of their landmark."""
     return np.asarray(np.diff(table[:, 1], prepend=-1) != 0)
 
 
 def _tracks_from_reference(
     keyframes: list[Keyframe], tracks: Tracks, redundant: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Array]:
-    """(M, 3) keyframe, landmark, feature of the tracks that know a depth, each one's reference first; its points_cam (N, 3).
+    """Return (M, 3) keyframe, landmark, feature of the tracks with depth, each one's reference first; its points_cam (N, 3).
 
     The reference defines the landmark's patch: with depth, not redundant, finest octave, nearest.
     """
@@ -159,7 +157,7 @@ def _tracks_from_reference(
 def _observe(
     posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
 ) -> tuple[Array, Array]:
-    """Pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
+    """Return pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
     keyframes, map_from_cam, is_reference = posed.keyframes, posed.map_from_cam, _is_first(table)
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
@@ -185,7 +183,7 @@ def _observe(
 @dataclass(frozen=True, slots=True)
 class _ObservationBatch:
     """Observations (M, 3) of some keyframes, their references (M, 3), a mask of the references among them, their landmarks,
-    and the keyframes and poses that all of these need."""
+    and the required keyframes and poses."""
 
     table: NDArray[np.int64]
     references: NDArray[np.int64]
@@ -196,7 +194,7 @@ class _ObservationBatch:
 
 
 def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[Array, Array]:
-    """Pixels (M, 3) and sigmas (M, 2) of one batch."""
+    """Return pixels (M, 3) and sigmas (M, 2) of one batch."""
     noise, align, keyframes = settings.noise, settings.align, batch.keyframes
     limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))

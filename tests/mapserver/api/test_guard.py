@@ -80,7 +80,7 @@ def test_a_page_from_elsewhere_changes_nothing(server: Server) -> None:
     """Row 18."""
     with client_of(server) as client:
         for headers in ELSEWHERE:
-            check_problem(client.post(PUBLISH, json=ACT, headers=headers), 403, "a page from elsewhere")
+            check_problem(client.post(PUBLISH, json=ACT, headers=headers), 403, "a page of another origin")
             assert server.store.current("lab").version == 1
             assert client.get("/v1/sites", headers=headers).status_code == 200, "its browser keeps it from the page"
         form = client.post(PUBLISH, content=b"actor=ada", headers={"Content-Type": "text/plain"})
@@ -97,7 +97,7 @@ def test_programs_and_the_pages_themselves_do(server: Server, headers: dict[str,
     with client_of(server) as client:
         assert client.post(PUBLISH, json=ACT, headers=headers).status_code == 200
         assert server.store.last_events("lab", 1)[0].actor == "ada"
-        check_problem(client.post("/v1/sites/lab/rollback", json={}, headers=headers), 422, "say who acts")
+        check_problem(client.post("/v1/sites/lab/rollback", json={}, headers=headers), 422, "name the person who acts")
 
 
 def paths_of(client: TestClient) -> list[tuple[str, str]]:
@@ -127,7 +127,7 @@ def test_under_another_name_nothing_answers(server: Server) -> None:
     with client_of(server) as client, client_of(server, is_guarded=False) as unguarded:
         for host in hosts:
             for method, path in paths_of(client):
-                check_problem(client.request(method, path, headers={"Host": host}), 403, "is not called")
+                check_problem(client.request(method, path, headers={"Host": host}), 403, "unknown host name")
             assert unguarded.get("/v1/robots", headers={"Host": host}).status_code == 200
 
 

@@ -34,7 +34,7 @@ def test_a_day_ends_with_its_end() -> None:
 
 @pytest.mark.parametrize("text", ["soon", "14:03", "2026-13-01", "0001-01-01", "9999-12-31", "1e9", "2026-01-01T25:00"])
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"until .* is no time; write"):
+    with pytest.raises(UsageError, match=r"until .* is an invalid time; write"):
         read_moment(text, "until", UTC, is_end=True)
 
 

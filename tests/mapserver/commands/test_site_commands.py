@@ -87,11 +87,11 @@ def test_what_gives_no_alignment_is_refused_and_changes_nothing(run, site, tmp_p
         "name --pin": (),
         "--show to print": ("--show", *pins(*PINS)),
         "cannot be read": ("--plan", tmp_path / "none.png", *pins(*PINS)),
-        "no PNG, JPEG": ("--plan", tmp_path / "text.png", *pins(*PINS)),
+        "not a PNG, JPEG": ("--plan", tmp_path / "text.png", *pins(*PINS)),
         "cannot be decoded": ("--plan", tmp_path / "torn.png", *pins(*PINS)),
         "the limit is 100000000": ("--plan", tmp_path / "huge.png", *pins(*PINS)),
         "is not in plan.png, which has 600x500": ("--plan", tmp_path / "plan.png", *pins(*PINS, "d=700,0:9,9")),
-        "DXF is not read": ("--plan", tmp_path / "hall.dxf", *pins(*PINS)),
+        "DXF is not supported": ("--plan", tmp_path / "hall.dxf", *pins(*PINS)),
         "mirrored": pins("a=200,400:0,0", "b=200,0:20,0", "c=400,400:0,10"),
     }
     for words, arguments in refused.items():

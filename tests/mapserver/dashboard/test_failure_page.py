@@ -212,7 +212,7 @@ def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, ser
     expect(page.get_by_role("link", name="All failures")).to_have_attribute("href", re.compile(f"site={SITE}$"))
     expect(page.locator("#seen")).to_be_visible()
     expect(page.locator("main")).to_contain_text("no recording of the seconds around it")
-    expect(page.locator("main")).to_contain_text("No expected view: the report does not tell the robot's camera")
+    expect(page.locator("main")).to_contain_text("No expected view: the report lacks the robot's camera")
     assert page.get_by_role("slider", name="Moment").count() == 0
     assert any(mark["shape"] == "cross" for mark in marks(page))
     assert seen.faults == []

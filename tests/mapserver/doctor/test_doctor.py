@@ -109,7 +109,7 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
         ("left and right", swapped, "swapped"),
         ("left and right", rotated, "the images of both cameras are rotated by 180 degrees: switch the driver's"),
         ("epipolar error", right_lower_by_3_px, "calibrate the cameras again"),
-        ("sharpness", lambda f: replace(f, left=np.full_like(f.left, 90)), "look at the lens"),
+        ("sharpness", lambda f: replace(f, left=np.full_like(f.left, 90)), "check the lens"),
     ],
 )
 def test_faults_in_the_images(
@@ -158,7 +158,7 @@ def test_light_that_flickers_is_named(good: Recording, share: float, bands: int,
     flickering = replace(good, frames=ChangedFrames(good, lit))
     finding = flicker_check(flickering, flickering.read_frame)
     assert finding.verdict is verdict, finding
-    assert ("10 ms where the mains have 50 Hz" in finding.sentence) == (verdict is not Verdict.OK)
+    assert ("10 ms with 50 Hz mains" in finding.sentence) == (verdict is not Verdict.OK)
 
 
 @pytest.mark.parametrize("late_s", [-0.040, 0.030])
@@ -238,7 +238,7 @@ HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
         (camera_checks(stamps(0.05))[0], Verdict.OK, 20.0, "20.0 Hz"),
         (camera_checks(stamps(0.3))[0], Verdict.WARN, 3.33, "higher frame rate"),
         (camera_checks(stamps(0.05))[1], Verdict.OK, 0.05, "longest step is 0.050 s"),
-        (camera_checks(GAP)[1], Verdict.WARN, 31 * 0.05, "2.5 s after the start; look at the recorder's disk"),
+        (camera_checks(GAP)[1], Verdict.WARN, 31 * 0.05, "2.5 s after the start; check the recorder's disk"),
         (camera_checks(HOURS)[1], Verdict.FAIL, 18000.05, "5.0 s after the start; the recorder was paused"),
         (imu_checks(stamps(0.02))[0], Verdict.WARN, 50.0, "set the IMU to 200 Hz"),
         (imu_checks(np.delete(stamps(0.005), slice(50, 100)))[1], Verdict.FAIL, 0.255, "the driver's queue"),
@@ -249,7 +249,7 @@ HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
             "3 of 9; look for a clock",
         ),
         (camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0), Verdict.FAIL, 0.895, "of the frames have no IMU"),
-        (camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0), Verdict.OK, 0.0, "the IMU ran"),
+        (camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0), Verdict.OK, 0.0, "the IMU covers"),
     ],
 )
 def test_timing(finding: Finding, verdict: Verdict, value: float, says: str) -> None:

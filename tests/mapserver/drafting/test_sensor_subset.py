@@ -63,7 +63,7 @@ def test_one_camera_that_only_turns_makes_no_map(euroc: Path, tmp_path: Path) ->
     arguments = ["build", str(euroc), "--site", "lab", "--store", str(tmp_path / "store"), "--use", "mono"]
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, SurveyError), result.output
-    assert "that belong together" in str(result.exception)
+    assert "connected keyframe" in str(result.exception)
 
 
 def test_the_gate_refuses_a_map_without_metres(tmp_path: Path) -> None:

@@ -211,7 +211,7 @@ def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
     still = ride_sample(lambda _: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.zeros(3)), 20, 0.1)
     folder = write_euroc(tmp_path / "still", still)
     file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
-    with pytest.raises(UsageError, match="say its metres with --trajectory-scale METRES"):
+    with pytest.raises(UsageError, match="set its metres with --trajectory-scale METRES"):
         given(folder, OtherTrajectory(file, "body"), frames=20)
     assert "as said" in given(folder, OtherTrajectory(file, "body", scale=1.0), frames=20).words
 
@@ -281,7 +281,7 @@ def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp
         ("1 0 0 0 0 0 0 1\n2 1e13 0 0 0 0 0 1\n", "pose 2 is at"),
         ("1403636579763555584 0 0 0 0 0 0 1\n", "looks like ns; write seconds"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n", "pose 2 has no rotation"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0\n", "each line is to have twelve numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0\n", "each line must have twelve numbers"),
         ("\udcff", "not a text file"),
     ],
 )

@@ -171,7 +171,7 @@ def put(value: float) -> Callable[[Path], None]:
         (put(np.nan), "image 5 has values"),
         (put(-0.1), "image 5 has values"),
         (put(np.inf), "image 5 has values"),
-        (lambda run: (run / "disps.npy").write_bytes((run / "disps.npy").read_bytes()[:-100]), "no .npy file"),
+        (lambda run: (run / "disps.npy").write_bytes((run / "disps.npy").read_bytes()[:-100]), "not a .npy file"),
         (spoil(lambda array: array + 7200.0, "tstamps.npy"), "another recording"),
         (lambda run: np.save(run / "intrinsics.npy", np.ones(4)), r"intrinsics\.npy is of shape \(4,\)"),
         (lambda run: np.save(run / "intrinsics.npy", np.ones((31, 4))), "has its centre at"),

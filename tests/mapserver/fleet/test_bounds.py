@@ -147,7 +147,7 @@ def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monke
 )
 def test_pictures_that_are_none_are_refused(fleet: Fleet, store: MapStore, clock: Clock, jpeg: bytes) -> None:
     ack = fleet.take_failure_bytes("lab", "r1", encode_message(failure(clock, 1, jpeg=jpeg)))
-    assert "does not begin and end as a JPEG" in ack.refused
+    assert "is not a JPEG" in ack.refused
     assert store.fleet.failures(FailureFilter()) == []
     store.fleet.add_failure(failure(clock, 1, jpeg=jpeg), (1, 1), {})
     assert store.fleet.picture(1, 0) == jpeg, "the control: the store itself gives back what it was given"

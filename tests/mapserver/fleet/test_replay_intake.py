@@ -111,7 +111,7 @@ def test_bytes_that_are_no_recording_are_refused(server: Server, data: bytes) ->
 
 
 def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Server, tmp_path: Path) -> None:
-    assert "report must come first" in server.send(small_file(tmp_path / "f.mcap")).refused
+    assert "send its report first" in server.send(small_file(tmp_path / "f.mcap")).refused
     server.report()
     part = ReplayPart(id="f1", total_bytes=1 << 30, offset=0, data=b"x")
     assert "limit" in server.fleet.replays.take("lab", "r1", encode_message(part)).refused

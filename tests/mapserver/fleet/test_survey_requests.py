@@ -70,7 +70,7 @@ def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_
     assert [(event.kind, event.actor) for event in store.events(SITE)[-2:]] == [
         (f"survey request {made.id}", "ada")
     ] * 2
-    with pytest.raises(UsageError, match="may be done already"):
+    with pytest.raises(UsageError, match="may be closed already"):
         end_request(store, SITE, made.id, ADA)
 
 
@@ -133,7 +133,7 @@ def test_what_is_no_polygon_is_refused(store: MapStore, corners: list[tuple[floa
 def test_limits(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(requests, "MOST_REQUESTS", 1)
     ask_for_survey(store, SITE, AISLE, ADA)
-    with pytest.raises(StateError, match="not done"):
+    with pytest.raises(StateError, match="open requests"):
         ask_for_survey(store, SITE, AISLE, ADA)
     save_sample_draft(store, site="yard")
     with pytest.raises(StateError, match="no published map"):
@@ -156,6 +156,6 @@ def test_over_http(tmp_path: Path) -> None:
         check_problem(
             server.client.post(f"{path}/requests", json=asked | {"corners_map_m": [[1, 1]]}), 422, "corners_map_m"
         )
-        check_problem(server.client.post(f"{path}/requests/00000000/end", json={"actor": "ada"}), 404, "may be done")
+        check_problem(server.client.post(f"{path}/requests/00000000/end", json={"actor": "ada"}), 404, "may be closed")
         assert server.client.post(f"{path}/requests/{made['id']}/end", json={"actor": "ada"}).json() == {"status": "ok"}
         assert server.client.get(path).json()["requests"] == []

@@ -183,7 +183,7 @@ def test_sensors_that_say_nothing_are_not_waited_for(
         driven(site, drive, SensorSet.STEREO_INERTIAL)
     assert not record.exists(), "nothing was recorded"
     frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(3)]
-    with pytest.raises(RecordingError, match="no sample of the IMU"):
+    with pytest.raises(RecordingError, match="no sample of the calibration's IMU"):
         driven(site, SensorDrive(Scripted(frames), record, names), SensorSet.STEREO_INERTIAL)
     with open_recording(record, OpenOptions(topics=names)) as kept:
         assert 1 <= len(kept) <= len(frames)

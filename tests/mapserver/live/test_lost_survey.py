@@ -81,5 +81,5 @@ def test_the_draft_names_the_parts_that_nothing_joined(recording: Path, tmp_path
     assert len(apart.last.parts) == 2
     seen = [component for component in apart.survey.components if "saw" not in component.reason]
     assert len([component for component in seen if component.kept]) == 1
-    (left_out,) = (c for c in seen if "nothing says for sure where it lies" in c.reason)
+    (left_out,) = (c for c in seen if "relative to the largest part is uncertain" in c.reason)
     assert left_out.start_s > 7

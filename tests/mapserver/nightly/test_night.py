@@ -455,7 +455,7 @@ def test_half_copied_recordings_wait(tmp_path: Path) -> None:
         "sent.mcap.filepart": "sent.mcap.filepart is half copied",
         "old.mcap": "old.mcap is open for writing",
     }
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="not a folder"):
         arrivals(tmp_path / "nowhere", 0.0, now)
 
 

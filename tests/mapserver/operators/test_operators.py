@@ -179,7 +179,7 @@ def test_a_flood_of_refusals_does_not_fill_the_log(operators: Operators, clock: 
 
 def test_names_that_cannot_be(operators: Operators) -> None:
     for name in ("", "Ada", "ada\n", "a" * 65, "<b>", "ada bob"):
-        with pytest.raises(UsageError, match="no operator's name"):
+        with pytest.raises(UsageError, match="an invalid operator name"):
             operators.add(name, "viewer", PASSWORD, ADMIN)
     with pytest.raises(UsageError, match="there is an operator ada already"):
         operators.add("ada", "viewer", PASSWORD, ADMIN)

@@ -35,7 +35,7 @@ def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_
     assert states(store) == {1: "published", 2: "current", 3: "retired"}
     assert (tmp_path / "store" / current_path("lab")).read_text().strip() == store.version("lab", 2).manifest_sha256
     assert releases.roll_back(store, "lab") == 1
-    with pytest.raises(StateError, match="no version that was current before"):
+    with pytest.raises(StateError, match="no earlier current version"):
         releases.roll_back(store, "lab")
     releases.promote(store, "lab", 3, actor=ADA)
     releases.promote(store, "lab", 3)  # is current already
@@ -112,7 +112,7 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
     trusted = releases.trust_calibration(store, draft, ADA)
     assert store.version("lab", 1) == trusted != draft
     assert releases.trust_calibration(store, trusted, Actor("bob", "again")) == trusted
-    with pytest.raises(StateError, match="changed by somebody else"):
+    with pytest.raises(StateError, match="changed meanwhile by another operator"):
         releases.trust_calibration(store, draft, ADA)
     assert releases.publish(store, "lab") == 1
     assert store.trusted(trusted) == [TrustedCalibration("a1", ["metric scale"], "ada", "a test")]

@@ -56,7 +56,7 @@ def test_what_becomes_current_ends_the_canary() -> None:
 def test_a_rollback_takes_the_last_row_of_the_record_away() -> None:
     changes = rules.rollback(rows("published", "current", target=1), ADA)
     assert (changes.states, changes.drop_currents_after) == (((2, "retired"), (1, "current")), 3)
-    with pytest.raises(StateError, match="no version that was current before"):
+    with pytest.raises(StateError, match="no earlier current version"):
         rules.rollback(rows("current"), ADA)
 
 
@@ -66,7 +66,7 @@ def test_a_canary_begins_only_beside_the_version_that_it_was_judged_against() ->
     assert (begun.states, begun.new_canary) == (((2, "published"),), new)
     assert [entry.kind for entry in begun.log] == ["admitted", "canary_started"]
     for late in (rows("published", "draft", "current"), rows("current", "published", canary=CANARY)):
-        with pytest.raises(StateError, match="somebody else meanwhile"):
+        with pytest.raises(StateError, match="meanwhile by another operator"):
             rules.canary_start(late, new)
 
 
@@ -74,5 +74,5 @@ def test_a_canary_that_does_not_run_any_more_is_not_ended() -> None:
     taken_back = rules.canary_withdrawal(rows("current", "published", canary=CANARY), CANARY, "complaints", ADA)
     assert (taken_back.states, taken_back.ended_canary) == (((2, "retired"),), (7, "rolled_back", "complaints"))
     for end in (rules.canary_promotion, lambda *given: rules.canary_withdrawal(*given[:2], "late", given[2])):
-        with pytest.raises(StateError, match="not tried any more"):
+        with pytest.raises(StateError, match="no longer a canary"):
             end(rows("current", "published"), CANARY, ADA)

@@ -192,7 +192,7 @@ def test_robots_see_published_things_only(world: World) -> None:
     for key, words in (
         (robot_key("lab", "r1", "manifests/2"), "draft"),
         (robot_key("lab", "r1", "manifests/7"), "no version 7"),
-        (robot_key("lab", "r1", "manifests/x"), "no version number"),
+        (robot_key("lab", "r1", "manifests/x"), "invalid version number"),
         (robot_key("lab", "r1", f"blobs/{tile}"), "no published bytes"),
         (robot_key("lab", "r1", f"blobs/{archive}"), "no published bytes"),
         (robot_key("lab", "r1", f"blobs/{draft.manifest_sha256}"), "no published bytes"),
@@ -285,7 +285,7 @@ def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
             (row,) = other_process.fleet.failures(FailureFilter())
             assert (row.failure_id, row.tile, row.version) == ("f-1", "0,0", 1)
     stolen = robot_key("lab", "r2", "failures")
-    assert "speaks for" in decode_message(world.robot_bus.get(stolen, encode_message(report)), FailureAck).refused
+    assert "in the name of" in decode_message(world.robot_bus.get(stolen, encode_message(report)), FailureAck).refused
     with pytest.raises(LinkError, match="FailureReport"):
         world.robot_bus.get(key, b"nonsense")
     assert world.counts[-1] == ("failure", "refused", 0)
@@ -324,7 +324,7 @@ def test_bad_messages_are_counted_and_change_nothing(world: World, caplog: pytes
         ("health", "refused", 0)
     ]
     assert world.fleet.robots() == []
-    assert "speaks for 'r2'" in caplog.text
+    assert "in the name of 'r2'" in caplog.text
 
 
 def test_reports_have_a_size_and_a_rate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:

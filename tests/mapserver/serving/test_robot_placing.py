@@ -44,7 +44,7 @@ def test_a_robot_hears_the_word_and_the_history_who_gave_it(server: Server) -> N
         (PATH, {"x_map_m": 5000.0}, 404, "outside of version 1: it has no tile"),
         (PATH, {"sigma_m": 0}, 422, "sigma_m"),
         (PATH, {"x_map_m": None}, 422, "x_map_m"),
-        (PATH, {"actor": None}, 422, "say who acts"),
+        (PATH, {"actor": None}, 422, "name the person who acts"),
     ],
 )
 def test_what_cannot_be_is_refused_and_nobody_hears_it(

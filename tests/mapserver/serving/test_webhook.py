@@ -133,7 +133,7 @@ def test_a_rate_is_too_high_only_when_chance_does_not_explain_it(store: MapStore
 
 
 def test_it_is_told_once_and_once_more_when_it_is_over(clock: Clock, tmp_path: Path) -> None:
-    held = [Alert("FleetmapRobotLost", "lab", "r1", clock(), "r1 of lab has not known where it is for 5 min")]
+    held = [Alert("FleetmapRobotLost", "lab", "r1", clock(), "r1 of lab has had no known position for 5 min")]
     (tmp_path / "token").write_text("secret\n")
     with receiver() as (address, got):
         sender = Webhook(AlertSettings(webhook=address, token_file=str(tmp_path / "token")))
@@ -223,7 +223,7 @@ def test_a_dead_receiver_costs_a_bounded_queue(
     [
         ("ftp://elsewhere.example/", "write it like"),
         ("https://", "write it like"),
-        ("http://elsewhere.example/x", "only https://"),
+        ("http://elsewhere.example/x", "use https://"),
         ("https://ada:secret@elsewhere.example/", "token_file"),
         ("https://elsewhere.example/\r\nX: y", "write it like"),
         ("https://elsewhere.example:99999/", "webhook"),

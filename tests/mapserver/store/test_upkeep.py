@@ -62,7 +62,7 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     text = "\n".join(found.faults)
     for words in (f"{first} is damaged", f"{second} is missing", "does not name the current", "the database says"):
         assert words in text
-    assert "does not mention exactly" in text
+    assert "reference different" in text
     assert (found.leftovers, found.orphans) == (1, 2)
 
 

@@ -105,7 +105,7 @@ def test_picture_and_geojson_say_the_same(rooms: tuple[Surfels, Surfels, Surfels
 
 
 def test_versions_without_surfels_and_wild_places_are_refused(rooms: tuple[Surfels, Surfels, Surfels]) -> None:
-    with pytest.raises(UsageError, match="without any surfel"):
+    with pytest.raises(UsageError, match="without surfels"):
         changes_between(site(NONE), site(rooms[0]))
     far = replace(rooms[0], points_map=rooms[0].points_map * np.float32(1e4))
     with pytest.raises(UsageError, match="cells"):

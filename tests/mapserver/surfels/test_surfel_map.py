@@ -97,7 +97,7 @@ def test_what_is_not_there_or_damaged_is_told(tmp_path: Path) -> None:
         )
     first = msgspec.json.decode(blobs[0])["tiles"][0]["sha256"]
     swapped = {index: blobs[0], first: blobs[2]}
-    with pytest.raises(MapFormatError, match="stands in the place of"):
+    with pytest.raises(MapFormatError, match="is at the place of"):
         surfels_of(manifest, lambda sha: swapped.get(sha, blobs[1]))
     with pytest.raises(MapFormatError, match="surfel tile"):
         surfels_of(manifest, lambda sha: blobs[0] if sha == index else blobs[1][:40])

@@ -78,13 +78,13 @@ def test_row_35_a_copied_bundle(world: World) -> None:
     register = world.store.folder / "keys" / "robots.json"
     before = register.read_bytes()
     world.ask(bundle, own)
-    with pytest.raises(LinkError, match="was the bundle used before"):
+    with pytest.raises(LinkError, match="the bundle was already used"):
         world.ask(bundle, thiefs)
-    assert "was the bundle used before" in world.refusals()[0]
+    assert "the bundle was already used" in world.refusals()[0]
     # Who is first cannot be told; the robot's own refusal tells it.
     other = world.bundle("r2").own.encode()
     assert world.ask(other, thiefs, "r2")
-    with pytest.raises(LinkError, match="was the bundle used before"):
+    with pytest.raises(LinkError, match="the bundle was already used"):
         world.ask(other, own, "r2")
     world.register.revoke("lab", ["r2"])
     with pytest.raises(LinkError, match="not enrolled"):
@@ -188,7 +188,7 @@ def test_the_servers_key_on_a_stick(tmp_path: Path) -> None:
         authorities = RobotRegister(store).authorities
         with pytest.raises(StateError, match="trust init --here --host NAME"):
             _ = RobotRegister(store).tls
-        with pytest.raises(UsageError, match="no name or address"):
+        with pytest.raises(UsageError, match="an invalid name or address"):
             authorities.init(["a b"], None, None)
         stick = tmp_path / "ada" / "servers-ca.pem"
         authorities.init(["maps.example"], stick, "abcd-efgh")

@@ -41,7 +41,7 @@ def test_certificates_that_nobody_would_believe_are_errors(tmp_path: Path, autho
     with pytest.raises(UsageError, match="KEY_VALUES_MISMATCH"):
         HttpCertificate(*write(tmp_path, good, other))
     ended = authority.sign(own.public_key(), "h", -0.003, hosts=["maps.example"])
-    with pytest.raises(UsageError, match=r"http.crt ended at .* UTC, .*put a renewed one"):
+    with pytest.raises(UsageError, match=r"http.crt ended at .* UTC, .*replace"):
         HttpCertificate(*write(tmp_path, ended, own))
     served = HttpCertificate(*write(tmp_path, good, own))
     served.certificate.write_bytes(b"")  # while it is replaced
@@ -56,7 +56,7 @@ def test_certificates_that_nobody_would_believe_are_errors(tmp_path: Path, autho
     ("case", "words"),
     [
         ("as it should be", ""),
-        ("ends soon", "in 5.0 days; put a renewed one"),
+        ("ends soon", "in 5.0 days; replace"),
         ("another name", "is not for maps.example: it names 10.0.0.1, other.example"),
         ("a wildcard", ""),
         ("half a chain", "give the full chain"),

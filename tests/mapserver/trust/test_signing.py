@@ -117,7 +117,7 @@ def test_two_servers_do_not_make_the_keys_of_a_store_at_once(
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
         lists = SignedLists(store.folder).folder
         init_here(store)
-        with pytest.raises(StateError, match="has signed lists already"):
+        with pytest.raises(StateError, match="already has signed lists"):
             init_here(store)
     assert made == ["root", "online"]
 
@@ -174,7 +174,7 @@ def test_another_key_than_the_root_key_changes_nothing(store: MapStore) -> None:
         lambda: repository.replace_root(thief, thief),
         lambda: repository.sign_online(thief),
     ):
-        with pytest.raises(StateError, match="not signed as robots demand"):
+        with pytest.raises(StateError, match="not signed as robots require"):
             sign()
     assert {path: path.read_bytes() for path in store.folder.glob("[kt]*/*.*")} == before
 
@@ -196,8 +196,8 @@ def test_the_root_key_goes_from_this_machine_to_a_stick(store: MapStore, tmp_pat
 
 
 RETIRED = {
-    "threshold of the root": ("root", {"threshold": 2}, "2 keys must sign root; .* begin anew: .*trust init"),
-    "threshold of the targets": ("targets", {"threshold": 2}, "2 keys must sign targets; .* begin anew: .*trust init"),
+    "threshold of the root": ("root", {"threshold": 2}, "2 keys must sign root; .* start again: .*trust init"),
+    "threshold of the targets": ("targets", {"threshold": 2}, "2 keys must sign targets; .* start again: .*trust init"),
     "a token's root key": ("root", {"scheme": 1}, "a key of root is of the kind ecdsa, as PKCS#11 tokens have"),
     "threshold of a site": (
         "site",

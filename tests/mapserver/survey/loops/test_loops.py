@@ -125,7 +125,7 @@ def test_a_true_return_is_accepted_with_the_motion_that_was() -> None:
     ("shift", "sigma_m", "why"),
     [
         ([0, 5.0, 0], 0.1, "too far apart"),  # farther than one can see: not even looked at
-        ([0, 1.5, 0], 0.1, "from where the robot cannot be"),  # looked at, fits perfectly, and is still impossible
+        ([0, 1.5, 0], 0.1, "from an impossible position"),  # looked at, fits perfectly, and is still impossible
         ([12.0, 0, 0], 1.0, "too far apart"),
     ],
 )
