@@ -77,8 +77,9 @@ class FailureMonitor:
 
         speed_mps: by wheels or odometry, None if unknown. may_be_mapped: False if the map does not cover the place.
         """
-        # Of other statuses it decides nothing.
-        radius_m = radius_95_m(estimate.cov_rot_trans) if estimate.status is Status.DEGRADED else float("inf")
+        # Of other frames it decides nothing.
+        has_say = estimate.status is Status.DEGRADED or estimate.fix is not None
+        radius_m = radius_95_m(estimate.cov_rot_trans) if has_say else float("inf")
         is_lost = self._is_lost(estimate, radius_m, is_driving(speed_mps), may_be_mapped=may_be_mapped)
         self._last, now_ns = estimate, estimate.stamp_ns
         contradicted_ns = self._contradicted_ns or now_ns

@@ -55,6 +55,14 @@ def test_the_cause_is_named(about: dict[str, object], image: ImageQuality, cause
     assert [failure.cause for failure in play(monitor, 1, 4, image, **about)] == [cause]
 
 
+def test_between_sparse_frames_a_fix_counts_as_far_as_its_position_is_known() -> None:
+    for sigma_m, told in ((0.02, []), (0.5, ["not_found"])):
+        monitor = FailureMonitor()
+        frames = [estimate(2.0 * k, Status.INITIALISING, fix=True, sigma_m=sigma_m) for k in range(15)]
+        found = [monitor.handle(replace(frame, image=GOOD)) for frame in frames]
+        assert [failure.kind for failure in found if failure is not None] == told
+
+
 def test_what_is_no_failure_is_not_told() -> None:
     assert play(FailureMonitor(), 0, 20, status=Status.LOST, known=False) == [], "never had a fix"
     monitor = FailureMonitor()
