@@ -152,7 +152,7 @@ class Guard:
         right = _needed(scope)
         if right is None or not self._settings.is_sign_in_on:
             return None
-        who = self._settings.identify(scope)
+        who = self._settings.identify(scope, uses=_is_somebodys(scope))
         if who is None and (name := proxied_name(scope)):
             return _refuse(
                 scope, 403, f"none of the groups of {name} has a role here; --sign-in-group gives one a role"
@@ -190,6 +190,12 @@ def _needed(scope: Scope) -> Right | None:
     if path == "/metrics":
         return Right.METRICS
     return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
+
+
+def _is_somebodys(scope: Scope) -> bool:
+    """Whether somebody asks, and not an open page by itself."""
+    headers = _headers(scope)
+    return "fleetmap-renewal" not in headers and headers.get("accept") != "text/event-stream"
 
 
 def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | None = None) -> Response:

@@ -201,6 +201,7 @@ class Console:
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
             site = site if site in sites else None  # links lead somewhere
+        listed = f"{root}/{page if page in PAGES else ''}"  # what is of one site is not looked for in another
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
@@ -208,6 +209,7 @@ class Console:
             "pages": PAGES,
             "page": page,
             "sites": sites,
+            "elsewhere": listed if request.path_params or page not in PAGES else None,
             "site": site,
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),
@@ -216,7 +218,9 @@ class Console:
             "may_change": who is None or Scope.CHANGE in who.scopes,
             "warning": self.services.guard.warning,
         }
-        return HTMLResponse(TEMPLATES.get_template(template).render(frame | found), status)
+        return HTMLResponse(
+            TEMPLATES.get_template(template).render(frame | found), status, {"Cache-Control": "no-store"}
+        )
 
 
 async def load(function: Callable[..., T], *arguments: object) -> T:

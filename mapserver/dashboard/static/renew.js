@@ -1,5 +1,7 @@
 // Shows what is marked `data-renew` anew every 5 or so many seconds, as it would be loaded,
 // unless somebody writes into it; and what lies on maps.
+import { isSignedOut, loaded } from "./stream.js";
+
 const EVERY_MS = 1000 * (document.querySelector("[data-renew]")?.dataset.renew || 5);
 const shown = new Map([...document.querySelectorAll("[data-renew]")].map((part) => [part, part.innerHTML]));
 
@@ -15,9 +17,9 @@ function renewMap(element, scene) {
 }
 
 export async function renew() {
-  const answer = await fetch(location.href).catch(() => undefined);
+  const answer = await loaded();
   if (document.querySelector("dialog[open]")) return; // somebody acts
-  if (answer?.redirected || answer?.status === 401) return location.reload(); // to sign in
+  if (isSignedOut(answer)) return location.reload();
   if (!answer?.ok) return;
   const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
   for (const [part, before] of shown) {

@@ -3,6 +3,7 @@
 Each attack also runs against the same application without the guard, where it works.
 """
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ from mapserver.api.guard import Guard, GuardSettings, set_session
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard.sign_in_page import install as install_sign_in
-from mapserver.operators.operators import Operators
+from mapserver.operators.operators import IDLE_S, Operators
 from mapserver.store import Actor
 from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import Server, check_problem, served_api
@@ -192,6 +193,19 @@ def test_each_role_may_what_it_may(server: Server, name: str, reads: int, sees_m
         forged = client.post("/v1/sites/lab/rollback", json={"actor": "bob"}, headers=headers)
         check_problem(forged, 403, "")
         assert [event for event in server.store.events("lab") if event.actor == "bob"] == []
+
+
+def test_an_open_page_keeps_no_session_from_ending(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    headers, now_s = named(server)["vic"], time.time()
+    monkeypatch.setattr(server.store, "now_ns", lambda: int(now_s * 1e9))
+    with client_of(server) as client:
+        for by_itself in ({"Fleetmap-Renewal": "1"}, {"Accept": "text/event-stream"}):
+            assert client.get("/v1/sites", headers=headers).status_code == 200
+            now_s += IDLE_S - 60
+            assert client.get("/v1/sites", headers=headers | by_itself).status_code == 200
+            now_s += 30
+        now_s += 60
+        assert client.get("/v1/sites", headers=headers).status_code == 401
 
 
 def test_a_token_does_what_it_was_made_for(server: Server) -> None:

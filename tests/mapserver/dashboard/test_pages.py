@@ -236,6 +236,35 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         assert httpx.get(f"{served.http}/dashboard/{path}").status_code == 404
 
 
+def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None:
+    for path, leads_to in (
+        ("failures/1", ' action="/dashboard/failures"'),
+        ("robots/tug-7", ' action="/dashboard/"'),
+        ("space", ""),
+    ):
+        text = httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text
+        assert f'<form method="get"{leads_to}><label>Site' in text, path
+
+
+def test_a_refused_stream_is_opened_again_and_a_hidden_page_has_none(page: Page, served: Served) -> None:
+    page.add_init_script(
+        """window.streams = [];
+        window.EventSource = class extends EventSource { constructor(to) { super(to); window.streams.push(this); } };"""
+    )
+    page.route("**/now?*", lambda route: route.fulfill(status=502))
+    opened(page, served, "")
+    line = page.locator("#line")
+    expect(line).to_have_text("The server does not answer; trying again.")
+    page.unroute("**/now?*")
+    expect(line).to_contain_text("robots")
+    turned = "on => { Object.defineProperty(document, 'hidden', { value: on, configurable: true });"
+    turned += "document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(turned, True)
+    assert page.evaluate("streams.every(stream => stream.readyState === 2)")
+    page.evaluate(turned, False)
+    wait_until(page, "() => streams.at(-1).readyState === 1")
+
+
 def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -> None:
     def shown(query: str, zone: str) -> str:
         answer = httpx.get(f"{served.http}/dashboard/failures?{query}", cookies={"fleetmap_zone": zone}, timeout=60)

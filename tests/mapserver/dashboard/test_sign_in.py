@@ -117,6 +117,7 @@ def test_every_page_and_every_act_runs_under_the_policy(page: Page, served: Serv
     for path in ("", "trends", "failures", "failures/1", "live", "space", "robots/tug-7", "surveys", "map"):
         answer = page.goto(f"{served.http}/dashboard/{path}")
         assert "unsafe" not in answer.headers["content-security-policy"]
+        assert answer.headers["cache-control"] == "no-store", "the way back shows nothing to whoever comes after"
         expect(page.locator("header")).to_contain_text("olga (operator)")
     for words, told in (
         ("Roll back to version 1", "Robots should use version 1."),
