@@ -190,10 +190,12 @@ class Console:
         root, site, found, status = _root(request), request.query_params.get("site"), {}, 200
         sites: list[str] = []
         try:
-            growing = await load(under_way)
-            sites = sorted({*await load(self.services.maps.sites), *growing})
-            if site not in growing:
-                site = growing[0] if site is None and growing else await load(self.services.maps.chosen_site, site)
+            growing, stored = await load(under_way), await load(self.services.maps.sites)
+            sites = sorted({*stored, *growing})
+            if site is None and growing and (page == "live" or not stored):
+                site = growing[0]
+            elif site not in growing:
+                site = await load(self.services.maps.chosen_site, site)
             check_query(request, knows)
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(root, site, zone, request.query_params)

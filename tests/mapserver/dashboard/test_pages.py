@@ -246,6 +246,13 @@ def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None
         assert f'<form method="get"{leads_to}><label>Site' in text, path
 
 
+def test_surveys_begin_with_a_site_that_has_a_map(served: Served) -> None:
+    with MapStore.open(served.folder) as store:
+        store.update_job(store.begin_job("depot", "build"), "failed", "no images", {})
+    assert "Surveys of hall" in httpx.get(f"{served.http}/dashboard/surveys", timeout=60).text
+    assert "no images" in httpx.get(f"{served.http}/dashboard/surveys?site=depot", timeout=60).text
+
+
 def test_a_refused_stream_is_opened_again_and_a_hidden_page_has_none(page: Page, served: Served) -> None:
     page.add_init_script(
         """window.streams = [];
