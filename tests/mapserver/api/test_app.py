@@ -306,14 +306,14 @@ def test_lists_come_in_pages(server: Server) -> None:
     jobs = server.client.get("/v1/jobs?site=lab").json()["jobs"]
     assert [job["message"] for job in jobs] == ["night 2", "night 1", "night 0"]
     assert server.client.get(f"/v1/jobs/{jobs[0]['id']}").json() == jobs[0]
-    check_problem(server.client.get("/v1/jobs/99"), 404, "no job 99")
+    check_problem(server.client.get("/v1/jobs/99"), 404, "job 99 does not exist")
     begun = jobs[0]["started"]
     assert server.client.get("/v1/jobs", params={"since": begun}).json()["jobs"][0] == jobs[0]
     assert server.client.get("/v1/jobs", params={"until": jobs[-1]["started"]}).json()["jobs"] == []
     later = f"{datetime.fromisoformat(begun) + timedelta(seconds=1):%Y-%m-%dT%H:%M:%SZ}"
     assert server.client.get("/v1/jobs", params={"since": later}).json()["jobs"] == []
     assert server.client.get("/v1/jobs", params={"until": later}).json()["jobs"][0] == jobs[0]
-    check_problem(server.client.get("/v1/jobs?since=soon"), 422, "is no time")
+    check_problem(server.client.get("/v1/jobs?since=soon"), 422, "is an invalid time")
     check_problem(server.client.get("/v1/sites?limit=0"), 422, "limit")
 
 

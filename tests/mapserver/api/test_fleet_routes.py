@@ -55,7 +55,7 @@ def test_failures_are_found_by_what_they_are(server: Server) -> None:
     assert (picture.content, picture.headers["content-type"]) == (b"\xff\xd8picture\xff\xd9", "image/jpeg")
     assert picture.headers["content-security-policy"] == "default-src 'none'; sandbox"
     assert picture.headers["x-content-type-options"] == "nosniff"
-    check_problem(server.client.get("/v1/failures/9"), 404, "no failure 9")
+    check_problem(server.client.get("/v1/failures/9"), 404, "failure 9 does not exist")
     check_problem(server.client.get("/v1/failures/2/pictures/7"), 404, "no picture 7")
 
 
@@ -102,7 +102,7 @@ def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
     (robot,) = server.client.get("/v1/robots").json()["robots"]
     assert (robot["wanted_version"], robot["is_canary"], robot["version"]) == (2, True, 1)
     check_problem(
-        server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada"}), 409, "tries version 2 already"
+        server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada"}), 409, "has a canary of version 2"
     )
     check_problem(
         server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada", "share": 7}), 422, "share"
@@ -192,7 +192,7 @@ def test_a_range_of_time_is_kept_to_and_nothing_is_ignored(server: Server) -> No
     events = server.client.get("/v1/sites/lab/events", params={"since": before}).json()["events"]
     assert events
     assert all(isinstance(event["stamp_ns"], str) for event in events)
-    check_problem(server.client.get("/v1/failures?since=soon"), 422, "since 'soon' is no time")
+    check_problem(server.client.get("/v1/failures?since=soon"), 422, "since 'soon' is an invalid time")
     check_problem(server.client.get("/v1/failures?since=2026-01-02&until=2026-01-01T00:00"), 422, "exchange them")
     check_problem(
         server.client.get("/v1/failures?sinc=2026-01-01"), 422, "unknown query parameter 'sinc'; this address knows"
