@@ -177,7 +177,7 @@ def test_beyond_the_machine_http_is_refused_until_it_is_protected(tmp_path: Path
         pass
     arguments = ["--store", str(tmp_path), "--zenoh", "tcp/127.0.0.1:0", "--http", "0.0.0.0:0"]
     for more, words in (
-        ([], "--http-cert and --http-key, and name who may sign in"),
+        ([], "--http-cert and --http-key, and add an operator"),
         (["--http", "127.0.0.1:0", "--http-name", "maps.example"], "--http-name maps.example is reached from other"),
     ):
         refused = CliRunner().invoke(cli.app, ["serve", *arguments, *more])

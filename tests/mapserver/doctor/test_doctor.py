@@ -246,7 +246,7 @@ HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
             stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]),
             Verdict.FAIL,
             1.0,
-            "3 of 9; look for a clock",
+            "3 of 9; check for a clock",
         ),
         (camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0), Verdict.FAIL, 0.895, "of the frames have no IMU"),
         (camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0), Verdict.OK, 0.0, "the IMU covers"),

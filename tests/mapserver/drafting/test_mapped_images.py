@@ -85,7 +85,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(mapped_images.os, "posix_fallocate", full)
-    with MappedImageStore(tmp_path) as shelf, pytest.raises(StoreError, match="make space"):
+    with MappedImageStore(tmp_path) as shelf, pytest.raises(StoreError, match="free space"):
         shelf.keep([np.zeros((3, 2))])
 
 

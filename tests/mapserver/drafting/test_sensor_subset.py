@@ -43,7 +43,7 @@ def test_each_reduction_has_what_its_name_says(euroc: Path) -> None:
 def test_what_a_recording_lacks_cannot_be_used(euroc: Path) -> None:
     with open_recording(euroc) as whole, pytest.raises(RecordingError, match=r"it cannot be used as rgbd; use it as"):
         reduced(whole, SensorSet.RGBD)
-    with pytest.raises(UsageError, match=r"--use lidar: the sensor sets are"):
+    with pytest.raises(UsageError, match=r"--use lidar: unknown sensor set; choose one of"):
         named_sensor_set("lidar")
 
 

@@ -213,7 +213,7 @@ def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
     file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
     with pytest.raises(UsageError, match="set its metres with --trajectory-scale METRES"):
         given(folder, OtherTrajectory(file, "body"), frames=20)
-    assert "as said" in given(folder, OtherTrajectory(file, "body", scale=1.0), frames=20).words
+    assert "as stated" in given(folder, OtherTrajectory(file, "body", scale=1.0), frames=20).words
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
@@ -280,7 +280,7 @@ def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp
         ("1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", "line 2.*NaN"),
         ("1 0 0 0 0 0 0 1\n2 1e13 0 0 0 0 0 1\n", "pose 2 is at"),
         ("1403636579763555584 0 0 0 0 0 0 1\n", "looks like ns; write seconds"),
-        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n", "pose 2 has no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0 0 0 1 0 0 0 0 1 0\n", "pose 2 has an invalid rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n2 0 0\n", "each line must have twelve numbers"),
         ("\udcff", "not a text file"),
     ],
@@ -314,7 +314,7 @@ def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("change", "use", "said"),
     [
-        ({"frame": "lidar"}, None, "--trajectory-frame lidar: it is one of camera, body"),
+        ({"frame": "lidar"}, None, "--trajectory-frame lidar: unknown frame; use one of camera, body"),
         ({"scale": 0.0}, None, "--trajectory-scale 0.0"),
         ({}, SensorSet.MONO, "needs stereo or depth"),
         ({"file": Path("nowhere.tum")}, None, "cannot be read"),
@@ -331,5 +331,5 @@ def test_what_does_not_fit_is_refused(
 def test_one_file_belongs_to_one_recording(sample: Sample, recording: Path, tmp_path: Path) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
     options = BuildOptions(trajectory=OtherTrajectory(file, "body"))
-    with pytest.raises(UsageError, match="is of one recording, 2 are named"):
+    with pytest.raises(UsageError, match="is for one recording, 2 are named"):
         build_map([recording, recording], tmp_path / "maps", "hall", options)

@@ -163,14 +163,14 @@ def put(value: float) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (spoil(lambda array: array.astype(object)), r"disps\.npy is no \.npy file of numbers"),
+        (spoil(lambda array: array.astype(object)), r"disps\.npy is not a \.npy file of numbers"),
         (spoil(lambda array: array[:-1]), "30 images for 31 poses"),
         (spoil(lambda array: array[0]), r"of shape \(30, 40\)"),
         (spoil(lambda array: array.astype(np.int32)), "type int32"),
         (spoil(lambda array: np.swapaxes(array, 1, 2)), "images of 30x40, the camera 320x240"),
-        (put(np.nan), "image 5 has values"),
-        (put(-0.1), "image 5 has values"),
-        (put(np.inf), "image 5 has values"),
+        (put(np.nan), "image 5 has invalid inverse depths"),
+        (put(-0.1), "image 5 has invalid inverse depths"),
+        (put(np.inf), "image 5 has invalid inverse depths"),
         (lambda run: (run / "disps.npy").write_bytes((run / "disps.npy").read_bytes()[:-100]), "not a .npy file"),
         (spoil(lambda array: array + 7200.0, "tstamps.npy"), "another recording"),
         (lambda run: np.save(run / "intrinsics.npy", np.ones(4)), r"intrinsics\.npy is of shape \(4,\)"),

@@ -144,7 +144,7 @@ def test_a_canary_from_the_command_line(tmp_path: Path) -> None:
     done = CliRunner().invoke(
         app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", "5%", "--reason", "new racks"]
     )
-    assert "0.05 of the robots try version 2, the others stay on 1" in done.output
+    assert "0.05 of the robots run version 2, the others stay on 1" in done.output
     with MapStore.open(tmp_path) as store:
         (row,) = store.canaries("lab", running=True)
         assert (row.version, row.base_version, row.share, row.reason) == (2, 1, 0.05, "new racks")

@@ -75,7 +75,7 @@ def test_two_pins_are_enough_but_check_nothing() -> None:
         (pins_at(HALL, mirrored=True), METRES_PER_PX, "mirrored"),
         (pins_at(HALL[:3]), 0.05, "fit at 0.0213 metres per unit of the plan, not at 0.05"),
         (pins_at(HALL[:3], np.array([(0, 0), (0, 0), (3.0, 0)])), METRES_PER_PX, "add a fourth"),
-        (pins_at(HALL, np.array([(0, 0), (0, 2.0), (0, 0), (0, 0)])), None, "3 pins agree, off are: p1 by 2.0"),
+        (pins_at(HALL, np.array([(0, 0), (0, 2.0), (0, 0), (0, 0)])), None, "3 pins agree, wrong are: p1 by 2.0"),
         ([Pin("a", (0, 0), (0, 0)), Pin("a", (9, 9), (9, 9))], None, "two pins have the name 'a'"),
         ([Pin("a", (5, 5), (0, 0)), Pin("b", (5, 5), (9, 9))], None, "the same point"),
     ],
@@ -89,7 +89,7 @@ def test_two_wrong_pins_of_seven_are_named() -> None:
     points = np.concatenate([HALL, HALL[:3] * 0.5 + 5])
     clicked = np.zeros((7, 2))
     clicked[2], clicked[5] = (1.0, -2.0), (4.0, 4.0)
-    with pytest.raises(UsageError, match=r"5 pins agree, off are: p2 by 2\.\d+ m, p5 by 5\.\d+ m"):
+    with pytest.raises(UsageError, match=r"5 pins agree, wrong are: p2 by 2\.\d+ m, p5 by 5\.\d+ m"):
         fit_pins(pins_at(points, clicked), METRES_PER_PX, HALL)
 
 

@@ -66,7 +66,7 @@ def test_a_robot_that_is_away_is_not_told(server: Server, monkeypatch: pytest.Mo
 
     here = [("lab", "r1")]
     assert (answered(9.0, here), answered(11.0, here), answered(2.0, []), answered(4.0, [])) == (200, 409, 200, 409)
-    check_problem(server.client.post(PATH, json=WORD), 409, "last heard 4 s ago and would not hear this")
+    check_problem(server.client.post(PATH, json=WORD), 409, "last seen 4 s ago and is not connected")
     assert answered(1.0, here) == 200
     word = InitialPoseMessage(site="lab", robot="r1", x_map_m=1.5, y_map_m=2.0)
     with pytest.raises(StateError, match="no bus"):

@@ -213,7 +213,7 @@ def test_a_dead_receiver_costs_a_bounded_queue(
     for _ in range(500):
         sender.put({"alerts": []})
     assert time.monotonic() - begun_s < 1.0
-    assert "50 wait for the webhook" in caplog.text
+    assert "the queue of the webhook is full (50)" in caplog.text
     sender.close()
     assert not sender._thread.is_alive()
 

@@ -144,7 +144,7 @@ def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
 
     with monkeypatch.context() as patch:
         patch.setattr(database_module, "sync_path", is_full)
-        with pytest.raises(StoreError, match="make space: the store is unchanged"):
+        with pytest.raises(StoreError, match="free some space: the store is unchanged"):
             MapStore.open(tmp_path)
     assert format_of(path) == FORMAT
     copy.unlink()

@@ -175,7 +175,7 @@ def test_rotations(world: World) -> None:
     authorities.rotate_robots_ca(is_stolen=True)
     assert authorities.tls.authority.read_text().count("BEGIN CERTIFICATE") == 1
     assert world.register.revoke_all() == 1
-    with pytest.raises(UsageError, match="is not there"):
+    with pytest.raises(UsageError, match="is missing"):
         authorities.rotate_server(Path("nowhere.pem"), None)
     with pytest.raises(UsageError, match="not the key of servers-ca"):
         authorities.rotate_server(authorities.folder / "robots-ca.pem", None)

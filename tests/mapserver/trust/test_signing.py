@@ -207,7 +207,7 @@ RETIRED = {
     "no predecessors": (
         "site",
         {"previous": 0},
-        "site lab: its lists admit no version but .*trust admit lab --key ROOT",
+        "site lab: its lists admit only .*trust admit lab --key ROOT",
     ),
     "the site's key elsewhere": ("key", {}, r"site lab is not .*/site-lab.pem .*trust admit lab --key ROOT"),
 }
