@@ -94,7 +94,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         Layer("Survey that you draw"),
     ]
     return {
-        "used": _used(rows),
+        "used": _used(services, rows),
         "versions": [_card(maps, rows, events, info, robots, shown) for info in reversed(rows.versions.values())],
         "shown": shown,
         "scene": scene_of(services, context, shown, over, shows_coverage=not compares),
@@ -109,11 +109,15 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     }
 
 
-def _used(rows: SiteReleases) -> str:
+def _used(services: Services, rows: SiteReleases) -> str:
     if rows.current is None:
         return "No version is published yet."
-    tried = f" Version {rows.canary.version} is tried by {share(rows.canary.share)} of them." if rows.canary else ""
-    return f"Robots should use version {rows.current.version}.{tried}"
+    used = f"Robots should use version {rows.current.version}."
+    if rows.canary is None:
+        return used
+    trials = services.health.site(rows.site).trials
+    said = next((f": {trial.finding}" for trial in trials if trial.finding and trial.canary.id == rows.canary.id), "")
+    return f"{used} Version {rows.canary.version} is tried by {share(rows.canary.share)} of them{said}."
 
 
 def _card(

@@ -88,7 +88,7 @@ def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> 
         expect(used).to_have_text("Robots should use version 2.")
         change(page, "Publish draft 3")
         expect(used).to_have_text("Robots should use version 3.")
-        expect(page.get_by_role("region", name="History")).to_contain_text("robots lose themselves in aisle 3")
+        expect(page.get_by_role("list", name="History")).to_contain_text("robots lose themselves in aisle 3")
 
         # Somebody else acts: the page follows, and what it still offered before is refused.
         page.get_by_role("button", name="Roll back to version 2").click()

@@ -124,7 +124,7 @@ def test_every_page_and_every_act_runs_under_the_policy(page: Page, served: Serv
         ("Promote version 2", "Robots should use version 2."),
         ("Publish draft 3", "Robots should use version 3."),
         ("Roll back to version 2", "Robots should use version 2."),
-        ("Try version 3 on 5% of the robots", "Robots should use version 2. Version 3 is tried by 5.0 % of them."),
+        ("Try version 3 on 5% of the robots", "Robots should use version 2. Version 3 is tried by 5.0 % of them"),
         ("Stop trying version 3", "taken back by hand: robots lose themselves in aisle 3"),
     ):
         page.get_by_role("button", name=words, exact=True).click()
