@@ -1,4 +1,4 @@
-"""The memory of a robot that drives for an hour: laps of one recording, its stamps going on, in the map of another day.
+"""The memory of a robot that drives for an hour: laps of a survey's loop, its stamps going on, in the map made of it.
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_laps.py [--minutes M] [--work FOLDER] [--out FILE.json]`; recording and map as in
 bench_localization.py. Resident megabytes, the recording's samples of the whole drive among them, are taken once a minute of the drive; the
@@ -13,7 +13,6 @@ from pathlib import Path
 
 from benchmarks.common.laps import repeated
 from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, resident_mb, show, surveyed, write_results
-from benchmarks.robot.bench_localization import CASES
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     arguments.work.mkdir(parents=True, exist_ok=True)
-    store, path = surveyed(arguments.work), recorded(arguments.work, CASES["next day"])
+    store, path = surveyed(arguments.work), recorded(arguments.work, ())
     address, resident, tracking = MapAddress(site=SITE, robot="bench", store=str(store)), [], 0
     with open_recording(path) as once, connected(address) as link:
         laps = 2
