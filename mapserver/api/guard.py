@@ -193,7 +193,7 @@ def _needed(scope: Scope) -> Right | None:
 
 
 def _is_somebodys(scope: Scope) -> bool:
-    """Whether somebody asks, and not an open page by itself."""
+    """True if a user sends the request, not an open page by itself."""
     headers = _headers(scope)
     return "fleetmap-renewal" not in headers and headers.get("accept") != "text/event-stream"
 
