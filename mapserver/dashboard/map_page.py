@@ -81,7 +81,8 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
     robots = [robot.version for robot in services.robots.look(site).robots]
     asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
-    shown = asked or after or maps.current_version(site) or max(rows.versions, default=None)
+    known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
+    shown = next((number for number in known if number is not None), None)
     if shown is None:
         raise UsageError(f"site {site} has no version yet; `mapserver build` makes one from a recording")
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)

@@ -33,14 +33,17 @@ document.addEventListener("click", ({ target }) => {
   dialog.showModal();
 });
 refuse.addEventListener("click", () => dialog.close());
+dialog.addEventListener("cancel", (event) => refuse.disabled && event.preventDefault()); // an act that goes on
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
+  const act = asked;
   const named = isNamed ? {} : { actor: form.actor.value };
   const body = JSON.stringify({ ...JSON.parse(asked.dataset.body || "{}"), ...named, reason: form.reason.value });
-  confirm.disabled = true;
-  const answer = await fetch(asked.dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => undefined);
-  confirm.disabled = false;
+  confirm.disabled = refuse.disabled = true;
+  const answer = await fetch(act.dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => undefined);
+  confirm.disabled = refuse.disabled = false;
   if (answer?.ok) return location.reload();
   const told = await answer?.json().catch(() => undefined);
+  if (asked !== act) return; // a browser may close the dialog all the same
   refused(told?.detail ?? "The server does not answer; try again.");
 });
