@@ -178,7 +178,10 @@ def test_beyond_the_machine_http_is_refused_until_it_is_protected(tmp_path: Path
     arguments = ["--store", str(tmp_path), "--zenoh", "tcp/127.0.0.1:0", "--http", "0.0.0.0:0"]
     for more, words in (
         ([], "--http-cert and --http-key, and add an operator"),
-        (["--http", "127.0.0.1:0", "--http-name", "maps.example"], "--http-name maps.example can be reached from other"),
+        (
+            ["--http", "127.0.0.1:0", "--http-name", "maps.example"],
+            "--http-name maps.example can be reached from other",
+        ),
     ):
         refused = CliRunner().invoke(cli.app, ["serve", *arguments, *more])
         assert isinstance(refused.exception, UsageError) and words in str(refused.exception)
