@@ -5,7 +5,7 @@ A position failure begins when
 * the status is TRACKING and the estimate is more than 0.30 m or 5 degrees off for longer than 1 s (a silent failure), or
 * after the first fix the robot has been LOST, AMBIGUOUS, or DEGRADED with a 95 % radius above 0.30 m, for more than 2 s, or
 * the error of any estimate leaves its own 99.9 % bound for longer than 1 s, or
-* the robot cannot localize itself: 20 s of driving or 60 s of standing since the start, or since it was last localised, at a place that
+* the robot cannot localize itself: 20 s of driving or 60 s of standing since the start, or since it was last localized, at a place that
   the map covers or may cover;
 
 it ends after 5 s of good tracking. A lasting failure counts once. docs/reports.md has the definition for users.

@@ -90,7 +90,7 @@ def test_users_read_the_same_definition() -> None:
         "for more than 2 s",
         "99.9 % bound for longer than 1 s",
         "5 s of good tracking",
-        "20 s of driving or 60 s of standing since the start, or since it was last localised",
+        "20 s of driving or 60 s of standing since the start, or since it was last localized",
     ):
         assert words in told
         assert words in page

@@ -121,7 +121,7 @@ def test_compressed_depth_is_metres_in_bags_and_live(tmp_path: Path, form: str, 
         ("32FC1; compressedDepth png", head() + png(SAMPLE.left[0]), "uint8 pixels.*16 bits and one channel"),
         ("32FC1; compressedDepth png", head()[:9], "a depth image of 9 bytes"),
         ("32FC1; compressedDepth", png(QUANTIZED), "their format is '32FC1; compressedDepth'"),
-        ("16UC1; jpeg compressed ", cv2.imencode(".jpg", SAMPLE.left[0])[1].tobytes(), "no depth image; use 16UC1"),
+        ("16UC1; jpeg compressed ", cv2.imencode(".jpg", SAMPLE.left[0])[1].tobytes(), "not a depth image; use 16UC1"),
     ],
 )
 def test_depths_that_cannot_be_read_are_named(tmp_path: Path, form: str, data: bytes, says: str) -> None:

@@ -67,9 +67,9 @@ def test_lists_that_do_not_pair(folder: Path) -> None:
     [
         ("1.0 ../../secret.png", "not inside the folder"),
         ("1.0 /etc/passwd", "not inside the folder"),
-        ("noon rgb/1.png", "no stamp in seconds and a file name"),
-        ("1.0", "no stamp in seconds and a file name"),
-        ("1e300 rgb/1.png", "no stamp in seconds and a file name"),
+        ("noon rgb/1.png", "not a stamp in seconds and a file name"),
+        ("1.0", "not a stamp in seconds and a file name"),
+        ("1e300 rgb/1.png", "not a stamp in seconds and a file name"),
         ("# nothing", r"rgb\.txt names no image"),
         ("5.0 rgb/none.png", "none of the 1 images is there"),
     ],

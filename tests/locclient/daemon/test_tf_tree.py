@@ -280,7 +280,7 @@ def two_drivers(world: World, at_ms: int) -> None:
     [
         (lambda *_: None, "none has come"),
         (link(("odom_combined", "base_link")), "'base_link' in 'odom_combined': set [output] odom_frame"),
-        (link(("odom", "base_footprint")), "'base_footprint' in 'odom', and /tf_static no way"),
+        (link(("odom", "base_footprint")), "'base_footprint' in 'odom', and /tf_static has no chain"),
         (link(("odom", "base_link"), shift_ms=-9000), "the newest one is stamped 8.9"),
         (link(("odom", "base_link"), shift_ms=9000), "the oldest one is stamped"),
         (two_drivers, "do two programs publish it?"),

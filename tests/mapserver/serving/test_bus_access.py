@@ -98,7 +98,7 @@ def test_a_certificate_that_nobody_would_believe_is_an_error_at_start(
             at.check()
     else:
         at.check()
-        assert "ends in 6 days" in caplog.text
+        assert "expires in 6 days" in caplog.text
 
 
 def test_a_key_that_is_not_the_certificates_is_an_error_at_start(register: RobotRegister) -> None:

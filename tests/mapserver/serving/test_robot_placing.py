@@ -40,7 +40,7 @@ def test_a_robot_hears_the_word_and_the_history_who_gave_it(server: Server) -> N
     ("path", "changes", "status", "words"),
     [
         (PATH.replace("lab", "yard"), {}, 404, "no site yard"),
-        (PATH.replace("r1", "r9"), {}, 404, "never heard of a robot 'r9'"),
+        (PATH.replace("r1", "r9"), {}, 404, "has no robot 'r9'"),
         (PATH, {"x_map_m": 5000.0}, 404, "outside of version 1: it has no tile"),
         (PATH, {"sigma_m": 0}, 422, "sigma_m"),
         (PATH, {"x_map_m": None}, 422, "x_map_m"),

@@ -131,7 +131,7 @@ def test_unknown_pixels_are_filled_from_their_surroundings() -> None:
 
 
 def test_wrong_orders_are_told() -> None:
-    with pytest.raises(UsageError, match="at most"):
+    with pytest.raises(UsageError, match="the limit is"):
         expected_view(wall(), resized(PINHOLE, int(2 * np.sqrt(MOST_PIXELS))), FORWARD)
     with pytest.raises(UsageError, match="rotation"):
         expected_view(wall(), PINHOLE, np.diag([1.0, 1.0, 2.0, 1.0]))
