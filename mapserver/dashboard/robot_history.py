@@ -11,7 +11,7 @@ from mapserver.dashboard.map_layers import Line
 from mapserver.store import TraceRow
 
 GAP_NS = 45_000_000_000
-"""Robots report every second, of which one in ten seconds is kept: after so long without one it was silent."""
+"""A row is kept at least each ten seconds: after so long without one the robot was silent."""
 
 _COLUMNS = 300  # of a curve
 _STEP_M = 0.5

@@ -21,13 +21,18 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 _CANARIES_KEPT_NS = _AREAS_KEPT_NS = 1_000_000_000
 _LEAST_BETWEEN_TRACES_NS = 900_000_000
+_TRACE_STEP_M = 0.5
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 _DAY_NS = 86_400_000_000_000
 
 
 class IngestSettings(Section, frozen=True):
-    """Rate of the robots' stored traces, and retention of their reports."""
+    """Rate of the robots' stored traces, and retention of their reports.
+
+    trace_every_s: of a robot that stands. One that drives gets a row each half metre, with a longer step as it uses up as many rows a
+    day as standing gives.
+    """
 
     trace_every_s: Positive = 10.0
     trace_days: Positive = 2.0
@@ -44,6 +49,8 @@ class IngestSettings(Section, frozen=True):
 class _Stream:
     health: HealthStream = field(default_factory=HealthStream)
     trace_ns: int = -(1 << 62)
+    trace_map_m: tuple[float, float] | None = None
+    rows_left: float = math.inf  # until it is first bounded by the rows of a day
     status: str = ""
     hour: int | None = None
 
@@ -118,7 +125,7 @@ class Ingest:
                 self._batch.add(site, "tile", grid.key(place[0], place[1]), hour, counts)
                 if areas:
                     self._batch.add(site, "area", areas.at(place[0], place[1]) or OUTSIDE, hour, counts)
-            if self._is_trace_due(stream, health, now_ns):
+            if self._is_trace_due(stream, health, place, now_ns):
                 self._batch.traces.append(_trace(health, place, now_ns))
 
     def take_failure(self, report: FailureReport, now_ns: int, ahead_s: float | None) -> bool:
@@ -172,15 +179,23 @@ class Ingest:
         kept = deque((*batch.traces, *newer.traces), maxlen=_MAX_KEPT_TRACES)
         batch.traces = list(kept)
 
-    def _is_trace_due(self, stream: _Stream, health: RobotHealth, now_ns: int) -> bool:
-        """True if a trace row is due by time; a changed status also counts, but at most once a second."""
+    def _is_trace_due(
+        self, stream: _Stream, health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int
+    ) -> bool:
+        """True if a trace row is due by time, or at most once a second by the distance driven or a changed status."""
+        most_rows = _DAY_NS / (self._settings.trace_every_s * 1e9)
         quiet_ns = now_ns - stream.trace_ns
         if quiet_ns < 0:  # the clock was set back
             quiet_ns = _DAY_NS
-        is_changed = health.status != stream.status and quiet_ns >= _LEAST_BETWEEN_TRACES_NS
-        due = quiet_ns >= self._settings.trace_every_s * 1e9 or is_changed
+        rows_left = min(most_rows, stream.rows_left + quiet_ns * most_rows / _DAY_NS)
+        here, before = None if place is None else place[:2], stream.trace_map_m
+        has_moved = here is not None and (
+            before is None or math.dist(here, before) * max(0.0, rows_left - 1) >= _TRACE_STEP_M * most_rows
+        )
+        is_changed = health.status != stream.status or has_moved
+        due = quiet_ns >= self._settings.trace_every_s * 1e9 or (is_changed and quiet_ns >= _LEAST_BETWEEN_TRACES_NS)
         if due:
-            stream.trace_ns, stream.status = now_ns, health.status
+            stream.trace_ns, stream.status, stream.trace_map_m, stream.rows_left = now_ns, health.status, here, rows_left - 1
         return due
 
     def _grid(self, site: str, version: int | None) -> _Grid | None:

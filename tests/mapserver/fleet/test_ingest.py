@@ -3,7 +3,9 @@
 import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 
 import msgspec
 import numpy as np
@@ -20,7 +22,7 @@ from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
-from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive
 from support.storage.map_samples import save_sample_draft
 
 START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
@@ -233,18 +235,32 @@ def test_a_disk_that_refuses_costs_nothing(site: Site, monkeypatch: pytest.Monke
     assert total.reports == site.known.health
 
 
-def test_traces_are_thinned_but_show_every_change(site: Site) -> None:
+def test_a_trace_shows_the_way_and_every_change(site: Site) -> None:
     robots = made(site, 1, rate_per_robot_day=3000.0)
     site.run(robots, 300)
     trace = site.store.fleet.trace("lab", "r0")
-    changes = 2 * site.known.failures["robot", "r0"]
-    assert changes >= 6
-    assert 30 <= len(trace) <= 30 + changes
+    assert site.known.failures["robot", "r0"] >= 3
     assert {row.status for row in trace} == {"TRACKING", "LOST"}
     assert all(0 <= row.x_map_m <= 32 for row in trace)
-    heard = [row.heard_ns for row in trace]
-    assert heard == sorted(heard)
-    assert 0 < heard[-1] - heard[0] < 300 * NS
+    assert all(0.9 * NS < after.heard_ns - before.heard_ns < 2.1 * NS for before, after in pairwise(trace))
+    assert max(abs(after.x_map_m - before.x_map_m) for before, after in pairwise(trace)) < 2 * SPEED_MPS
+
+
+def test_the_rows_of_a_trace_are_bounded(site: Site) -> None:
+    """A robot that goes on driving has farther and farther steps, to the end; one that stands has a row in each interval."""
+    every_s = 864.0  # 100 rows a day
+    site.fleet = Fleet(site.store, clock_ns=site.store.now_ns, settings=IngestSettings(trace_every_s=every_s))
+    site.run(made(site, 1, rate_per_robot_day=0.0), 600)
+    trace = site.store.fleet.trace("lab", "r0")
+    gaps_s = [(after.heard_ns - before.heard_ns) / NS for before, after in pairwise(trace)]
+    assert 50 <= len(trace) <= 102
+    assert fmean(gaps_s[:20]) < 2 < 5 < fmean(gaps_s[-5:])
+    site.run([robot := MadeRobot("lab", "r1", np.random.default_rng(1), site.known, rate_per_robot_day=0.0)], 1)
+    for second in range(1, 2000):
+        site.set_ns(START_NS + second * NS)
+        site.fleet.take_health("lab", "r1", replace_struct(robot.second(START_NS)[-1], stamp_ns=START_NS + second * NS))
+    site.fleet.flush()
+    assert len(site.store.fleet.trace("lab", "r1")) <= 4
 
 
 def test_old_and_many_things_go(site: Site) -> None:
