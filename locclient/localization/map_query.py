@@ -166,8 +166,8 @@ class MapQuery:
         features = yield from _extract(query, frame, relocalizer)
         confirmed = tracker.confirmed
         if confirmed is None:
-            fixes = yield from self._search(features, relocalizer)
-            return (yield from tracker.update_candidates(fixes))
+            fixes, outside = yield from self._search(features, relocalizer)
+            return (yield from tracker.update_candidates(fixes, outside=outside))
         near = self._near(features, relocalizer, confirmed)
         fixes = [] if near is None else [near]
         if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
@@ -186,8 +186,8 @@ class MapQuery:
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
         return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]
 
-    def _search(self, features: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[list[Fix]]:
-        """Return fixes in the whole map, or within the prior; near the candidates first."""
+    def _search(self, features: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[tuple[list[Fix], bool]]:
+        """Return fixes in the whole map, or within the prior; near the candidates first. True if some lie outside the prior."""
         tracker, fixes = self._tracker, list[Fix]()
         candidates = tracker.candidates.hypotheses
         for number, candidate in enumerate(candidates, start=1):
@@ -203,14 +203,15 @@ class MapQuery:
         fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
         prior = tracker.prior
         if prior is None:
-            return fixes
+            return fixes, False
         within = tracker.within_prior(fixes)
         if within or not prior.is_revisable:
-            return fixes if prior.is_revisable else within  # an operator may have chosen an alias of the place
+            # An operator may have chosen an alias of the place.
+            return fixes if prior.is_revisable else within, len(within) < len(fixes)
         yield
         fixes = yield from relocalizer.anywhere(features, None, None)
         fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
-        return fixes if tracker.drops_prior(fixes) else []
+        return fixes if tracker.drops_prior(fixes) else [], bool(fixes)
 
 
 def _extract(query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer) -> TimeSliced[FrameFeatures]:

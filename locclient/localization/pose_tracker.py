@@ -21,6 +21,7 @@ from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
+OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given initial pose")
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,8 +267,11 @@ class PoseTracker:
             self.confirmed = None
             self.prior = None  # it led to that pose
 
-    def update_candidates(self, fixes: list[Fix]) -> TimeSliced[QueryResult]:
-        """Update the candidates, and confirm one without competitors and with enough support or a tight prior."""
+    def update_candidates(self, fixes: list[Fix], *, outside: bool) -> TimeSliced[QueryResult]:
+        """Update the candidates, and confirm one without competitors and with enough support or a tight prior.
+
+        outside: True if fixes outside the prior were left out.
+        """
         assert self.odom_from_body is not None
         candidates = self.candidates
         is_near = self.prior is not None and self.prior.is_tight(self._track.near_prior_sigma_m)
@@ -276,7 +280,7 @@ class PoseTracker:
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self.lookalikes
         yield from candidates.update(self.observations(fixes), self.odom_from_body)
         if not fixes:
-            return NO_AGREEMENT
+            return OUTSIDE_PRIOR if outside else NO_AGREEMENT
         (best, *_), competitors = candidates.ranking()
         if competitors:
             told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))

@@ -2,7 +2,7 @@
 
     from fleetsim import Order, record_order
 
-    record_order(Order("small-loop", robot="tote-1", frames=100), Path("tote.mcap"), "mcap")
+    record_order(Order("small-loop", robot="tote-1", frames=100), Path("tote.mcap"))
 
 `prepare` gives the samples and the renderer of a run without writing them. Names are imported at their first use.
 """

@@ -246,7 +246,7 @@ def test_a_site_keeps_its_frame_and_takes_no_map_of_another_place(nights: Nights
     to_store = ["--site", "lab", "--store", nights.store]
     error = invoke(app, "build", nights.folder / "night2", *to_store, "--frame-from-ground-truth").exception
     assert isinstance(error, UsageError)
-    assert "frame stays" in str(error)
+    assert "frame is fixed" in str(error)
     write_euroc(tmp_path / "foreign", make_sample(20))
     error = invoke(app, "build", tmp_path / "foreign", *to_store).exception
     assert isinstance(error, SurveyError)

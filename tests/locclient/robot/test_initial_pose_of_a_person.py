@@ -56,7 +56,7 @@ def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(tmp_path: Path) -> Non
     assert off_m(told, GIVEN) == pytest.approx(6.0, abs=0.1)
     assert (estimates[-1].status, off_m(estimates[-1], FRAMES - 1) < 0.1) == (Status.TRACKING, True)
     back = next(n for n in range(GIVEN, FRAMES) if estimates[n].status is Status.TRACKING)
-    agreed = sum(one.fix is not None or "agrees" in one.refused for one in estimates[GIVEN:back])
+    agreed = sum(one.fix is not None or "outside the given" in one.refused for one in estimates[GIVEN:back])
     assert agreed > robot_world.SETTINGS.track.confirming_fixes, "one search does not move it"
     passed = np.array([robot_world.truth(number)[:3, 3] for number in range(GIVEN, back + 1)])
     travelled_m = np.linalg.norm(np.diff(passed, axis=0), axis=1).sum()
