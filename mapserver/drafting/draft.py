@@ -55,12 +55,12 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
-from mapserver.grid.survey_grid import GridSession, grow_grid
+from mapserver.grid.survey_grid import GridGrower, GridSession, Grower, grow
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.surfels.surfel_map import Surfels, encode_surfels, known_surfels, surfel_report
-from mapserver.surfels.survey_surfels import grow_surfels
+from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
@@ -287,21 +287,21 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
     tiles = tiles_from_survey(survey_map, chosen=for_robots)
-    run.times.begin("grid")
+    run.times.begin("grid and surfels")
     places = [trajectory.frame_from_body for trajectory in map_trajectories(built.joined)]
     sessions = [GridSession(s.entry.name, s.survey, place) for s, place in zip(built.taken, places, strict=True)]
-    wanted_sessions = sessions if run.settings.occupancy_grid else []
-    grid_tiles, without = grow_grid({} if parent is None else parent.grid, wanted_sessions, run.settings.stereo)
-    grid = encode_grid(grid_tiles)
-    grid_said = grid_report(grid, without) if grid or without else None
-    run.times.begin("surfels")
-    surfels: list[bytes] = []
-    surfels_said = None
+    grid_grower = GridGrower({} if parent is None else parent.grid, run.settings.stereo)
+    growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
     if run.settings.surfel_map:
         known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
-        grown, without = grow_surfels(known, sessions, run.settings.stereo)
-        surfels = encode_surfels(grown)
-        surfels_said = surfel_report(surfels, len(grown), without)
+        growers["surfels"] = surfel_grower = SurfelGrower(known)
+    without = grow(growers, sessions, run.settings.stereo)
+    grid, surfels = encode_grid(grid_grower.tiles), list[bytes]()
+    grid_said = grid_report(grid, without.get("grid", {})) if grid or without.get("grid") else None
+    surfels_said = None
+    if run.settings.surfel_map:
+        surfels = encode_surfels(surfel_grower.surfels)
+        surfels_said = surfel_report(surfels, len(surfel_grower.surfels), without["surfels"])
     run.times.begin("examining")
     evidence = _evidence(run, built, tiles, parent)
     run.times.begin("storing")

@@ -195,7 +195,12 @@ class Ingest:
         is_changed = health.status != stream.status or has_moved
         due = quiet_ns >= self._settings.trace_every_s * 1e9 or (is_changed and quiet_ns >= _LEAST_BETWEEN_TRACES_NS)
         if due:
-            stream.trace_ns, stream.status, stream.trace_map_m, stream.rows_left = now_ns, health.status, here, rows_left - 1
+            stream.trace_ns, stream.status, stream.trace_map_m, stream.rows_left = (
+                now_ns,
+                health.status,
+                here,
+                rows_left - 1,
+            )
         return due
 
     def _grid(self, site: str, version: int | None) -> _Grid | None:

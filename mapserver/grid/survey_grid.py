@@ -1,7 +1,7 @@
-"""Update of the previous version's grid by a build's recordings: their keyframes are matched densely at their final poses."""
+"""Dense matching of a build's keyframes at their final poses, and the update of the previous version's grid by it."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,33 +54,70 @@ def depth_views(session: GridSession, settings: StereoSettings, chosen: slice) -
         yield DepthView(keyframe, disparity_px - yaw_px, sigma_px, map_from_cam)
 
 
-def grow_grid(
-    before: Mapping[tuple[int, int], Counts], sessions: Sequence[GridSession], settings: StereoSettings
-) -> tuple[Tiles, dict[str, str]]:
-    """Return the tiles after all sessions, in order, and by name the reason why a recording adds nothing."""
-    tiles, without = dict(before), {}
+class Grower(Protocol):
+    """A product of densely matched keyframes, updated session by session."""
+
+    def begin(self, session: GridSession) -> str | None:
+        """Begin a session; return the reason if it adds nothing, None if its views are to be added."""
+
+    def add(self, view: DepthView) -> None:
+        """Add a keyframe of the session."""
+
+    def end(self) -> None:
+        """Update the product by the session."""
+
+
+def grow(
+    growers: Mapping[str, Grower], sessions: Sequence[GridSession], settings: StereoSettings
+) -> dict[str, dict[str, str]]:
+    """Match each keyframe of all sessions once for all growers.
+
+    Return for each grower, by the names of recordings that add nothing, the reasons.
+    """
+    without: dict[str, dict[str, str]] = {name: {} for name in growers}
     for session in sessions:
-        views = _views(session, settings, tiles)
-        if isinstance(views, str):
-            without[session.name] = views
-        else:
-            tiles = updated(views)
-    return tiles, without
+        wanted = []
+        for name, grower in growers.items():
+            reason = grower.begin(session)
+            if reason is None:
+                wanted.append(grower)
+            else:
+                without[name][session.name] = reason
+        for view in depth_views(session, settings, slice(None)) if wanted else ():
+            for grower in wanted:
+                grower.add(view)
+        for grower in wanted:
+            grower.end()
+    return without
 
 
-def _views(session: GridSession, settings: StereoSettings, before: Tiles) -> SessionViews | str:
-    survey, camera = session.survey, session.survey.state.camera
-    if not measures_depth(survey):
-        return "one camera measures no depth; a grid needs a stereo pair or a depth camera"
-    keyframes = survey.odometry.keyframes
-    few = slice(None, None, max(1, len(keyframes) // _FLOOR_VIEWS))
-    near = depth_views(session, settings, few)
-    floor_m = floor_distance_m(((view.disparity_px, view.map_from_cam) for view in near), camera)
-    if floor_m is None:
-        return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
-    views = SessionViews(before)
-    for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
-        views.add((disparity_px, sigma_px), camera, map_from_cam, floor_m)
-    frames = [keyframe.frame_index for keyframe in keyframes]
-    views.add_path((session.map_from_body[frames] @ survey.state.body_from_cam)[:, :3, 3], floor_m)
-    return views
+class GridGrower:
+    """The tiles of a site's grid."""
+
+    def __init__(self, before: Mapping[tuple[int, int], Counts], settings: StereoSettings) -> None:
+        self.tiles: Tiles = dict(before)
+        self._settings = settings
+
+    def begin(self, session: GridSession) -> str | None:
+        survey, camera = session.survey, session.survey.state.camera
+        if not measures_depth(survey):
+            return "one camera measures no depth; a grid needs a stereo pair or a depth camera"
+        keyframes = survey.odometry.keyframes
+        few = slice(None, None, max(1, len(keyframes) // _FLOOR_VIEWS))
+        near = depth_views(session, self._settings, few)
+        floor_m = floor_distance_m(((view.disparity_px, view.map_from_cam) for view in near), camera)
+        if floor_m is None:
+            return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
+        self._floor_m, self._session, self._views = floor_m, session, SessionViews(self.tiles)
+        return None
+
+    def add(self, view: DepthView) -> None:
+        camera = self._session.survey.state.camera
+        self._views.add((view.disparity_px, view.sigma_px), camera, view.map_from_cam, self._floor_m)
+
+    def end(self) -> None:
+        survey = self._session.survey
+        frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
+        places = (self._session.map_from_body[frames] @ survey.state.body_from_cam)[:, :3, 3]
+        self._views.add_path(places, self._floor_m)
+        self.tiles = updated(self._views)

@@ -56,27 +56,27 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     count = len(every.logs)
     if count < _MIN_SAMPLES:
         return Exposure(np.zeros(views), np.zeros(FALLOFF))
-    points, shown = np.unique(every.points, return_inverse=True)
+    _, shown = np.unique(every.points, return_inverse=True)
+    # Columns of the lens and of the views; the points' own are eliminated by the Schur complement.
     first = FALLOFF + views
-    rows = np.repeat(np.arange(count), FALLOFF + 2)
-    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views, first + shown])
-    values = np.column_stack([_powers(every.squared), np.ones((count, 2))])
-    design = scipy.sparse.csr_array(
-        (values.ravel(), (rows, columns.ravel().astype(np.int64))), (count, first + len(points))
-    )
+    rows = np.repeat(np.arange(count), FALLOFF + 1)
+    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views.astype(np.int64)])
+    values = np.column_stack([_powers(every.squared), np.ones(count)])
+    design = scipy.sparse.csr_array((values.ravel(), (rows, columns.ravel())), (count, first))
+    points = scipy.sparse.csr_array((np.ones(count), (np.arange(count), shown)))
     # Gauge: brighter views with darker points are equivalent. Unobserved values stay 0.
-    prior = scipy.sparse.csr_array(
-        (np.full(first, _PRIOR), (np.arange(first), np.arange(first))), (first, design.shape[1])
-    )
-    weights, start = np.ones(count), np.zeros(design.shape[1])
-    start[first:] = every.logs.mean()
+    prior = _PRIOR**2 * np.eye(first)
+    weights, start = np.ones(count), np.zeros(first)
     for _ in range(_ROUNDS):
-        whole = scipy.sparse.vstack([scipy.sparse.diags_array(weights) @ design, prior])
-        rest = np.concatenate([weights * every.logs, np.zeros(first)])
-        start = scipy.sparse.linalg.lsmr(whole, rest, atol=1e-6, btol=1e-6, maxiter=200, x0=start)[0]
-        off = np.abs(every.logs - design @ start)
-        weights = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(off, 1e-9)))
-    logs = start[FALLOFF:first]
+        weighted = design.T @ scipy.sparse.diags_array(weights)
+        sums, sums_of_logs = (np.asarray(points.T @ column) for column in (weights, weights * every.logs))
+        of_points = points.T @ weighted.T
+        means = scipy.sparse.diags_array(np.reciprocal(sums)) @ of_points
+        left = (weighted @ design - of_points.T @ means).toarray()
+        start = np.linalg.solve(left + prior, weighted @ every.logs - means.T @ sums_of_logs)
+        off = np.abs(every.logs - design @ start - (sums_of_logs / sums - means @ start)[shown])
+        weights = np.minimum(1.0, _HUBER / np.maximum(off, 1e-9))
+    logs = start[FALLOFF:]
     return Exposure(logs - logs.mean(), start[:FALLOFF])
 
 

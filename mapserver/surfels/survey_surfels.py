@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fleetmap import core
-from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.grid.dense_stereo import nearest_around
 from mapserver.grid.site_grid import AGAINST, HIT, OCCUPIED, REACH_PX
-from mapserver.grid.survey_grid import GridSession, depth_views, measures_depth
+from mapserver.grid.survey_grid import DepthView, GridSession, measures_depth
 from mapserver.surfels.exposure import Sample, estimate_exposure, squared_tangent
 from mapserver.surfels.surfel_map import EDGE_M, EXPOSURE, LEVELS, MAX_RANGE_M, Surfels
 from mapserver.survey.state import Keyframe
@@ -30,19 +29,6 @@ _SAMPLED, _SATURATED = 16, 250  # one surfel of this many is used for exposure; 
 _MIN_FINER = 2  # voxels of the next finer level that replace a coarse one
 
 
-def grow_surfels(
-    before: Surfels, sessions: Sequence[GridSession], settings: StereoSettings
-) -> tuple[Surfels, dict[str, str]]:
-    """Return the surfels after all sessions, in order, and by name the reason why a recording adds nothing."""
-    surfels, without = before, {}
-    for session in sessions:
-        if measures_depth(session.survey):
-            surfels = _grown(surfels, session, settings)
-        else:
-            without[session.name] = "one camera measures no depth; surfels need a stereo pair or a depth camera"
-    return surfels, without
-
-
 class _Look(NamedTuple):
     """Data kept of a keyframe: disparities as of `nearest_around`, their standard deviation, its pose."""
 
@@ -51,27 +37,44 @@ class _Look(NamedTuple):
     cam_from_map: Array
 
 
-def _grown(before: Surfels, session: GridSession, settings: StereoSettings) -> Surfels:
-    """Return the surfels after one session: surfels that it saw through are removed, equally fine or finer new ones replace old ones."""
-    camera, table, looks = session.survey.state.camera, core.VoxelTable(), list[_Look]()
-    keyframes = session.survey.odometry.keyframes
-    for _, disparity_px, sigma_px, map_from_cam in depth_views(session, settings, slice(None)):
-        table.add(disparity_px, sigma_px, camera.lens, np.ascontiguousarray(map_from_cam))
+class SurfelGrower:
+    """The surfels of a site: a session removes those that it saw through, and its equally fine or finer ones replace old ones."""
+
+    def __init__(self, before: Surfels) -> None:
+        self.surfels = before
+
+    def begin(self, session: GridSession) -> str | None:
+        if not measures_depth(session.survey):
+            return "one camera measures no depth; surfels need a stereo pair or a depth camera"
+        self._session, self._table, self._looks = session, core.VoxelTable(), list[_Look]()
+        return None
+
+    def add(self, view: DepthView) -> None:
+        disparity_px, images = view.disparity_px, view.keyframe.images
+        lens = self._session.survey.state.camera.lens
+        self._table.add(disparity_px, view.sigma_px, lens, np.ascontiguousarray(view.map_from_cam))
         kept = slice(None, None, _KEPT_STEP_PX), slice(None, None, _KEPT_STEP_PX)
         nearest = np.where(disparity_px[kept] > 0, nearest_around(disparity_px, REACH_PX)[kept], np.float32(0.0))
-        looks.append(_Look(keyframes[0].images.keep([nearest])[0], sigma_px, se3_inverse(map_from_cam)))
-    points_map, normals, levels, views = table.surfels()
-    new = Surfels(points_map, normals, levels, np.zeros_like(levels))
-    hits, passes = _judged(new, looks, camera)
-    new = new[HIT * np.maximum(hits, views) - passes >= OCCUPIED]
-    new = _coloured(new[~_known_finer(new, new, finer_by=1)], keyframes, looks, camera)
-    hits, passes = _judged(before, looks, camera)
-    old = before[HIT * hits - passes > -AGAINST]
-    new = _as_bright_as(old, new)
-    if len(new.exposures) and len(old.exposures):  # in the overlap of both drives, the last one defines the brightness
-        gaps_m = cKDTree(new.exposures[:, :3]).query(old.exposures[:, :3])[0]
-        old = replace(old, exposures=old.exposures[gaps_m > _OWN_LIGHT_M])
-    return Surfels.joined([old[~_known_finer(old, new, finer_by=0)], new])
+        self._looks.append(_Look(images.keep([nearest])[0], view.sigma_px, se3_inverse(view.map_from_cam)))
+
+    def end(self) -> None:
+        before, looks, camera = self.surfels, self._looks, self._session.survey.state.camera
+        points_map, normals, levels, views = self._table.surfels()
+        new = Surfels(points_map, normals, levels, np.zeros_like(levels))
+        hits, passes = _judged(new, looks, camera)
+        new = new[HIT * np.maximum(hits, views) - passes >= OCCUPIED]
+        new = _coloured(
+            new[~_known_finer(new, new, finer_by=1)], self._session.survey.odometry.keyframes, looks, camera
+        )
+        hits, passes = _judged(before, looks, camera)
+        old = before[HIT * hits - passes > -AGAINST]
+        new = _as_bright_as(old, new)
+        if len(new.exposures) and len(
+            old.exposures
+        ):  # in the overlap of both drives, the last one defines the brightness
+            gaps_m = cKDTree(new.exposures[:, :3]).query(old.exposures[:, :3])[0]
+            old = replace(old, exposures=old.exposures[gaps_m > _OWN_LIGHT_M])
+        self.surfels = Surfels.joined([old[~_known_finer(old, new, finer_by=0)], new])
 
 
 def _as_bright_as(old: Surfels, new: Surfels) -> Surfels:
@@ -97,23 +100,38 @@ def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def _judged(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> tuple[Array, Array]:
     """Return (N,) numbers of views that see each surfel and that see through it, counted as in the planner grid."""
     hits, passes = np.zeros((2, len(surfels)))
-    for number, rows in _near(surfels, looks):
+    for number, rows in _near(surfels, looks, camera):
         marks, weights, _ = _look(surfels, rows, looks[number], camera)
         hits[rows] += marks == _SEEN
         passes[rows] += weights * (marks == _SEEN_THROUGH)
     return hits, passes
 
 
-def _near(surfels: Surfels, looks: Sequence[_Look]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Yield every view with the surfels of blocks that it may see."""
+def _near(surfels: Surfels, looks: Sequence[_Look], camera: StereoCamera) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Yield every view with the surfels of blocks that it may see: near ones that reach into its pyramid."""
     places = np.floor(surfels.points_map[:, :2] / _BLOCK_M).astype(np.int64)
-    blocks, order = np.unique(places, axis=0, return_inverse=True)
+    keys, order = np.unique(places @ [1 << 32, 1], return_inverse=True)  # on integers, not on rows: thirty times faster
+    x = (keys + (1 << 31)) >> 32
+    blocks = np.stack([x, keys - (x << 32)], axis=-1)
     ends = np.cumsum(np.bincount(order, minlength=len(blocks)))
     parts = np.split(np.argsort(order, kind="stable"), ends[:-1])
     middles = (blocks + 0.5) * _BLOCK_M
+    heights_m = (
+        np.array([surfels.points_map[:, 2].min(), surfels.points_map[:, 2].max()]) if len(surfels) else np.zeros(2)
+    )
+    left, above = camera.cx_px + 1, camera.cy_px + 1
+    right, below = camera.width_px - camera.cx_px, camera.height_px - camera.cy_px
+    focal = camera.focal_px
+    sides = np.array(
+        [[focal, 0, left], [-focal, 0, right], [0, focal, above], [0, -focal, below]]
+    )  # inwards, of the pyramid
     for number, look in enumerate(looks):
         place = -look.cam_from_map[:3, :3].T @ look.cam_from_map[:3, 3]
-        near = np.flatnonzero(np.linalg.norm(middles - place[:2], axis=1) < MAX_RANGE_M + _BLOCK_M)
+        normals = sides @ look.cam_from_map[:3, :3]
+        farthest = (middles - place[:2]) @ normals[:, :2].T + _BLOCK_M * np.linalg.norm(normals[:, :2], axis=1)
+        farthest += (np.multiply.outer(heights_m - place[2], normals[:, 2])).max(axis=0)
+        is_near = np.linalg.norm(middles - place[:2], axis=1) < MAX_RANGE_M + _BLOCK_M
+        near = np.flatnonzero(is_near & (farthest > 0).all(axis=1))
         if len(near):
             yield number, np.concatenate([parts[i] for i in near])
 
@@ -156,7 +174,7 @@ def _shown(
     surfels: Surfels, keyframes: Sequence[Keyframe], looks: Sequence[_Look], camera: StereoCamera, every: int
 ) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float32], Array]]:
     """Yield per view its number, a sample of its visible surfels (N,), their pixels (N, 2) and brightness (N,)."""
-    for number, near in _near(surfels, looks):
+    for number, near in _near(surfels, looks, camera):
         rows = near[near % every == 0]
         marks, _, pixels = _look(surfels, rows, looks[number], camera)
         rows, pixels = rows[marks == _SEEN], pixels[marks == _SEEN]

@@ -254,7 +254,8 @@ def test_the_rows_of_a_trace_are_bounded(site: Site) -> None:
     trace = site.store.fleet.trace("lab", "r0")
     gaps_s = [(after.heard_ns - before.heard_ns) / NS for before, after in pairwise(trace)]
     assert 50 <= len(trace) <= 102
-    assert fmean(gaps_s[:20]) < 2 < 5 < fmean(gaps_s[-5:])
+    assert fmean(gaps_s[:20]) < 2
+    assert fmean(gaps_s[-5:]) > 5
     site.run([robot := MadeRobot("lab", "r1", np.random.default_rng(1), site.known, rate_per_robot_day=0.0)], 1)
     for second in range(1, 2000):
         site.set_ns(START_NS + second * NS)

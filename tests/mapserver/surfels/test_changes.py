@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.grid.survey_grid import GridSession
 from mapserver.surfels.changes import APPEARED, VANISHED, SeenSite, changes_between, changes_geojson, changes_png
 from mapserver.surfels.surfel_map import Surfels
-from mapserver.surfels.survey_surfels import grow_surfels
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT
-from support.storage.room_sessions import Seen, ride, session_at
+from support.storage.room_sessions import Seen, grown_surfels, ride, session_at
 
 NONE = Surfels.joined([])
 PLACES = [place for place in ride([0.8] * 8)[2:6] for _ in range(2)]
@@ -46,7 +44,7 @@ def rooms() -> tuple[Surfels, Surfels, Surfels]:
     for number in range(3):
         session = session_at(PLACES, has_depth=True)
         session = with_board(session) if number == 1 else session
-        versions.append(grow_surfels(versions[-1], [session], StereoSettings())[0])
+        versions.append(grown_surfels(versions[-1], [session])[0])
     return versions[1], versions[2], versions[3]
 
 

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
-from fleetmap.features.settings import StereoSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.grid.survey_grid import GridSession
 from mapserver.surfels.expected_view import expected_view, pinhole
 from mapserver.surfels.exposure import Sample, estimate_exposure, lens_factor
 from mapserver.surfels.surfel_map import Surfels, encode_surfels
-from mapserver.surfels.survey_surfels import grow_surfels
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
-from support.storage.room_sessions import CAMERA, Seen, ride, session_at
+from support.storage.room_sessions import CAMERA, Seen, grown_surfels, ride, session_at
 from support.worlds.box_room import ROOM_M, stereo_pair
 
 NONE = Surfels.joined([])
@@ -19,7 +17,7 @@ PLACES = ride([0.8] * 16)
 
 
 def grown(session: GridSession, before: Surfels = NONE) -> Surfels:
-    surfels, without = grow_surfels(before, [session], StereoSettings())
+    surfels, without = grown_surfels(before, [session])
     assert without == {}
     return surfels
 
@@ -102,7 +100,7 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
 def test_one_camera_adds_nothing_and_says_so() -> None:
     mono = StereoCamera(FOCAL, CAMERA.cx_px, CAMERA.cy_px, 0.0, WIDTH, HEIGHT)
     first = grown(session_at(PLACES[:4], has_depth=True))
-    surfels, without = grow_surfels(first, [session_at(PLACES[:2], mono)], StereoSettings())
+    surfels, without = grown_surfels(first, [session_at(PLACES[:2], mono)])
     assert surfels is first
     assert "no depth" in without["ride"]
 

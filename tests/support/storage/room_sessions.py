@@ -1,13 +1,18 @@
 """Results of surveys of the box room, without surveying it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
 
+from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from mapserver.grid.survey_grid import GridSession
+from fleetmap.version_grid import Tiles
+from mapserver.grid.survey_grid import GridGrower, GridSession, grow
+from mapserver.surfels.surfel_map import Surfels
+from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, points_seen, stereo_pair
@@ -49,3 +54,17 @@ def ride(height_m: list[float]) -> list[Array]:
         se3(down, np.array([-1.0 + 0.2 * n, 0.4 + 0.05 * n, ROOM_M[0, 2] + height]))
         for n, height in enumerate(height_m)
     ]
+
+
+def grown_grid(before: Tiles, sessions: Sequence[GridSession]) -> tuple[Tiles, dict[str, str]]:
+    """Tiles after these sessions, and why recordings add nothing."""
+    grower = GridGrower(before, StereoSettings())
+    without = grow({"grid": grower}, sessions, StereoSettings())
+    return grower.tiles, without["grid"]
+
+
+def grown_surfels(before: Surfels, sessions: Sequence[GridSession]) -> tuple[Surfels, dict[str, str]]:
+    """Surfels after these sessions, and why recordings add nothing."""
+    grower = SurfelGrower(before)
+    without = grow({"surfels": grower}, sessions, StereoSettings())
+    return grower.surfels, without["surfels"]
