@@ -154,7 +154,7 @@ class SurveySettings(Section, frozen=True):
     """All settings of a survey."""
 
     seed: int = 0
-    occupancy_grid: bool = False
+    occupancy_grid: bool = True
     surfel_map: bool = False
     odometry: OdometrySettings = OdometrySettings()
     orb: OrbSettings = OrbSettings(count=1200)
