@@ -15,7 +15,7 @@ from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
 from mapserver.dashboard.space.loops import Loop, loops_of_version
-from mapserver.dashboard.space.points import space_bytes
+from mapserver.dashboard.space.points import space_bytes, surfel_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
@@ -23,7 +23,7 @@ from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.expected_views import failure_camera
 from mapserver.store import JobInfo, MapStore, VerdictRow, VersionInfo
-from mapserver.surfels.surfel_map import index_address
+from mapserver.surfels.surfel_map import index_address, surfels_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -112,6 +112,10 @@ class MapData:
         """A version's landmarks and places for the view in space; made at each call, since browsers keep it."""
         manifest = self.store.manifest(site, version)
         return space_bytes([decode_tile(self.store.blob(entry.sha256)) for entry in manifest.tiles])
+
+    def surfels(self, site: str, version: int) -> bytes:
+        """A version's surfels for the view in space, as `space`; StateError without any."""
+        return surfel_bytes(surfels_of(self.store.manifest(site, version), self.store.blob))
 
     def loops(self, site: str, version: int) -> list[Loop]:
         """Loops of the build that made a version, as far as a job that is kept tells them."""

@@ -73,6 +73,11 @@ def _install_files(pages: FastAPI, services: Services) -> None:
         """Landmarks and places of a version."""
         return _file(services.maps.space(site, version), "application/octet-stream", lasting)
 
+    @pages.get("/surfels/{site}/{version}.bin")
+    def surfels(site: str, version: int) -> Response:
+        """Surfels of a version."""
+        return _file(services.maps.surfels(site, version), "application/octet-stream", lasting)
+
     @pages.get("/underlays/{site}/{version}/{kind}.png")
     def underlay(site: str, version: int, kind: Literal["floor", "grid"]) -> Response:
         """What lies under a map: the floor plan or the occupancy grid."""

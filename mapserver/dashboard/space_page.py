@@ -28,6 +28,7 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
         "version": version,
         "scene": {
             "address": f"{context.root}/spaces/{site}/{version}.bin",
+            "surfels": None if lacks else f"{context.root}/surfels/{site}/{version}.bin",
             "view": None if lacks else f"../v1/sites/{site}/versions/{version}/view.png",
             "tangents": [side / 2 / camera.focal_px for side in (camera.width_px, camera.height_px)],
             "cameras": cameras,
@@ -37,7 +38,9 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
         "plan": scene_of(services, context, version, [Layer("Where you stand")]),
         "lacks": lacks,
         "own": len(cameras),
-        "absent": {"loops", "refused loops"} - {"loops" if loop.is_accepted else "refused loops" for loop in loops},
+        "absent": {"loops", "refused loops", "surfels"}
+        - {"loops" if loop.is_accepted else "refused loops" for loop in loops}
+        - (set() if lacks else {"surfels"}),
         "exactness": f"{1e3 * FINEST_M:g} mm or better|{1e3 * COARSEST_M:g} mm or worse",
         "above": context.to("map", version=version),
     }

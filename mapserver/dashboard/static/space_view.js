@@ -24,10 +24,11 @@ const [canvas, where, bar, picture, caption] = ["canvas", ".where", ".bar", ".ex
 const scene = JSON.parse(element.dataset.space);
 const world = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(FIELD_DEG, 1, 0.05, 2000);
-const groups = Object.fromEntries(["landmarks", "places", "robots", "floor", "loops", "refused loops"].map((name) => [name, new THREE.Group()]));
+const groups = Object.fromEntries(["surfels", "landmarks", "places", "robots", "floor", "loops", "refused loops", "measured"].map((name) => [name, new THREE.Group()]));
 const robots = new Map(); // name: what is drawn, and what the server says of it
 let renderer, controls, box, points, exactness, rows, asked, player, viewTimer;
 let [places, at, turn, viewAsked] = [0, 0, 0, 0];
+let measuring; // the ends that were clicked
 let from = "aside"; // until somebody moves it, everything is in sight
 
 const about = where.textContent;
@@ -90,6 +91,24 @@ async function fetchMap() {
   rows = new Float32Array(bytes, 8 + 12 * count, 12 * places);
   exactness = new Uint8Array(bytes, 8 + 12 * count + 48 * places, count);
   box = new THREE.Box3().setFromArray(count ? points : [-5, -5, 0, 5, 5, 2]);
+}
+
+// A Points for each level, as wide as its voxels.
+async function drawSurfels() {
+  const answer = await fetch(scene.surfels);
+  if (!answer.ok) throw new Error(`The surfels could not be fetched: ${await answer.text()}`);
+  const bytes = await answer.arrayBuffer(), levels = new DataView(bytes).getUint32(0, true);
+  const counts = new Uint32Array(bytes, 4, levels), edges = new Float32Array(bytes, 4 + 4 * levels, levels);
+  const first = 4 + 8 * levels, total = counts.reduce((sum, count) => sum + count, 0);
+  let begun = 0;
+  counts.forEach((count, level) => {
+    const shape = new THREE.BufferGeometry(), greys = new Uint8Array(bytes, first + 12 * total + begun, count);
+    shape.setAttribute("position", new THREE.BufferAttribute(new Float32Array(bytes, first + 12 * begun, 3 * count), 3));
+    shape.setAttribute("color", new THREE.BufferAttribute(Uint8Array.from({ length: 3 * count }, (_, n) => greys[Math.floor(n / 3)]), 3, true));
+    groups.surfels.add(new THREE.Points(shape, new THREE.PointsMaterial({ size: 1.5 * edges[level], vertexColors: true })));
+    begun += count;
+  });
+  draw();
 }
 
 function drawMap() {
@@ -209,6 +228,36 @@ function pointedAt({ offsetX, offsetY }) {
   return best;
 }
 
+// The foremost point of what is shown within reach of the pointer.
+function surfaceAt({ offsetX, offsetY }) {
+  const seen = new THREE.Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).elements;
+  const [x, y] = [(2 * offsetX) / canvas.clientWidth - 1, 1 - (2 * offsetY) / canvas.clientHeight];
+  const [wide, high] = [canvas.clientWidth, canvas.clientHeight].map((side) => (2 * REACH_PX) / side);
+  let best, least = Infinity;
+  for (const cloud of [groups.surfels, groups.landmarks].filter((group) => group.visible).flatMap((group) => group.children)) {
+    const at = cloud.geometry.getAttribute("position").array;
+    for (let n = 0; n < at.length; n += 3) {
+      const row = (k) => seen[k] * at[n] + seen[k + 4] * at[n + 1] + seen[k + 8] * at[n + 2] + seen[k + 12];
+      const away = row(3);
+      if (away > 0 && away < least && Math.abs(row(0) / away - x) < wide && Math.abs(row(1) / away - y) < high) [best, least] = [at.subarray(n, n + 3), away];
+    }
+  }
+  return best && new THREE.Vector3(...best);
+}
+
+function measure(event) {
+  const end = surfaceAt(event);
+  if (!end) return say("Nothing is drawn there; click on a surface or a landmark.");
+  if (measuring.length === 2) (measuring = []), groups.measured.clear();
+  measuring.push(end);
+  const [one, other] = measuring;
+  if (!other) return say("Click on the other end.");
+  const words = `${one.distanceTo(other).toFixed(2)} m`;
+  groups.measured.add(lines([...one, ...other], TONES.accent), sign(words, "#fff", TONES.accent).translateX((one.x + other.x) / 2).translateY((one.y + other.y) / 2).translateZ((one.z + other.z) / 2));
+  say(`${words} apart: ${Math.hypot(one.x - other.x, one.y - other.y).toFixed(2)} m along the floor, ${Math.abs(one.z - other.z).toFixed(2)} m in height.`);
+  draw();
+}
+
 function walkTo(place) {
   if (!places) return;
   [at, turn] = [place, 0];
@@ -223,6 +272,13 @@ const ACTS = {
   start: () => walkTo(at),
   above: () => look("above"),
   aside: () => look("aside"),
+  measure() {
+    measuring = measuring ? undefined : [];
+    groups.measured.clear();
+    element.querySelector("[data-do=measure]").setAttribute("aria-pressed", Boolean(measuring));
+    say(measuring ? "Click on one end of the distance." : about);
+    draw();
+  },
   left: () => ((turn = (turn + TURN_DEG) % 360), stand()),
   right: () => ((turn = (turn - TURN_DEG) % 360), stand()),
   begin: () => ((at = 0), stand()),
@@ -321,14 +377,18 @@ function draw() {
 }
 
 // A canvas does not say what it shows.
+element.onPage = (place) => {
+  const on = new THREE.Vector3(...place).project(camera);
+  return [(on.x + 1) / 2, (1 - on.y) / 2];
+};
 element.seen = () => {
   const told = ({ mark, robot }) => {
-    const on = mark.position.clone().project(camera);
     const view = mark.children[2]?.geometry.getAttribute("position").array;
-    return { ...robot, view: view && Array.from(view), page: [(on.x + 1) / 2, (1 - on.y) / 2] };
+    return { ...robot, view: view && Array.from(view), page: element.onPage(mark.position) };
   };
   const loops = Object.fromEntries(["loops", "refused loops"].map((name, n) => [name, scene.loops.filter((loop) => loop[4] === 1 - n).length]));
-  return { landmarks: exactness?.length ?? 0, loops, camera: camera.position.toArray(), robots: [...robots.values()].map(told) };
+  const surfels = groups.surfels.children.reduce((sum, cloud) => sum + cloud.geometry.getAttribute("position").count, 0);
+  return { landmarks: exactness?.length ?? 0, surfels, loops, camera: camera.position.toArray(), robots: [...robots.values()].map(told) };
 };
 
 function listen() {
@@ -352,6 +412,7 @@ function listen() {
   });
   canvas.addEventListener("click", (event) => {
     if (!down || Math.hypot(event.offsetX - down[0], event.offsetY - down[1]) > STILL_PX) return;
+    if (measuring) return measure(event);
     const found = pointedAt(event);
     if (found?.address) location.assign(found.address);
     else if (found !== undefined) walkTo(found);
@@ -368,7 +429,7 @@ async function begin() {
   camera.up.set(0, 0, 1);
   element.style.setProperty("--aspect", scene.tangents[0] / scene.tangents[1]);
   for (const [name, group] of Object.entries(groups)) {
-    group.visible = element.querySelector(`[name="${name}"]`)?.checked ?? false;
+    group.visible = element.querySelector(`[name="${name}"]`)?.checked ?? name === "measured";
     world.add(group);
   }
   try {
@@ -382,6 +443,7 @@ async function begin() {
   drawMap();
   listen();
   fit();
+  if (scene.surfels) drawSurfels().catch((error) => say(error.message, "bad"));
   follow("now", ({ marks }) => showRobots(marks));
   if (scene.start) walkTo(nearest(...scene.start));
 }

@@ -2,6 +2,7 @@
 
 import math
 import re
+from pathlib import Path
 
 import cv2
 import msgspec
@@ -14,12 +15,14 @@ from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.dashboard.space import points
-from mapserver.dashboard.space.points import space_bytes
+from mapserver.dashboard.space.points import space_bytes, surfel_bytes
 from mapserver.dashboard.space.robot_views import robot_views
-from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, talking, wait_until
+from mapserver.store import MapStore
+from mapserver.surfels.surfel_map import EDGE_M
+from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
-from support.storage.map_samples import random_tile
+from support.storage.map_samples import random_tile, save_surfel_draft, seen_wall
 
 SEEN = "document.querySelector('.space-view').seen()"
 
@@ -62,6 +65,47 @@ def test_too_many_landmarks_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None
     assert 20 <= count <= 30
 
 
+def test_surfels_come_by_level_and_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = seen_wall(with_board=True)
+    for most in (1_000_000, len(wall) // 2):
+        monkeypatch.setattr(points, "MAX_SURFELS", most)
+        step = math.ceil(len(wall) / most)
+        data = surfel_bytes(wall)
+        levels = int(np.frombuffer(data, "<u4", 1)[0])
+        counts, edges_m = np.frombuffer(data, "<u4", levels, 4), np.frombuffer(data, "<f4", levels, 4 + 4 * levels)
+        chosen = wall[np.arange(0, len(wall), step)]
+        assert counts.tolist() == np.bincount(chosen.levels, minlength=levels).tolist()
+        np.testing.assert_allclose(edges_m, EDGE_M * 2.0 ** np.arange(levels) * math.sqrt(step), rtol=1e-6)
+        at = np.frombuffer(data, "<f4", 3 * len(chosen), 4 + 8 * levels).reshape(-1, 3)
+        greys = np.frombuffer(data, np.uint8, offset=4 + 8 * levels + 12 * len(chosen))
+        order = np.argsort(chosen.levels, kind="stable")
+        np.testing.assert_array_equal(at, chosen.points_map[order])
+        np.testing.assert_array_equal(greys, chosen.greys[order])
+
+
+def test_surfaces_are_seen_and_measured(page: Page, tmp_path: Path) -> None:
+    """A wall with known ends: what is clicked is as far apart as the surfels under the pointer."""
+    wall = seen_wall(with_board=False)
+    with MapStore.open(tmp_path, create=True) as store:
+        version = save_surfel_draft(store, wall)
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "space", site="lab", version=version)
+        wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.surfels === {len(wall)}")
+        expect(page.get_by_role("checkbox", name="landmarks")).not_to_be_checked()
+        page.get_by_role("button", name="Measure a distance").click()
+        box = box_of(page.locator(".views canvas"))
+        page.mouse.click(box["x"] + 2, box["y"] + 2)
+        expect(page.locator(".where")).to_contain_text("Nothing is drawn there")
+        ends = [wall.points_map[wall.points_map[:, 1].argmin()], wall.points_map[wall.points_map[:, 1].argmax()]]
+        for end in ends:
+            x, y = page.evaluate(f"document.querySelector('.space-view').onPage({end.tolist()})")
+            page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        expect(page.locator(".where")).to_contain_text("m apart")
+        told = float(page.locator(".where").inner_text().split(" m apart")[0])
+        assert told == pytest.approx(float(np.linalg.norm(ends[1] - ends[0])), abs=0.6)
+    assert seen.faults == []
+
+
 def test_an_empty_version_is_empty() -> None:
     assert space_bytes([]) == bytes(8)
 
@@ -76,7 +120,7 @@ def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) ->
     page.wait_for_timeout(500)
     amount, by_height = inked(page)
     assert amount > 500, "something is drawn"
-    page.get_by_label("Colour").select_option("exactness")
+    page.get_by_label("Landmarks by").select_option("exactness")
     page.wait_for_timeout(500)
     assert np.abs(inked(page)[1] - by_height).max() > 5, "other colours"
     page.get_by_role("checkbox", name="landmarks").uncheck()
