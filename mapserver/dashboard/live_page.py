@@ -1,13 +1,11 @@
 """The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
 
 from base64 import b64encode
-from hashlib import sha256
 
 import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
-from fleetmap.messages import encode_message
 from mapserver.dashboard.console import Console, PageContext
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
@@ -41,7 +39,7 @@ def _heard(survey: LiveSurvey | None) -> dict[str, object]:
     """Changes when the page does."""
     if survey is None:
         return {"heard": None}
-    return {"heard": sha256(encode_message(survey.state)).hexdigest(), "silent": survey.is_silent}
+    return {"heard": survey.number, "silent": survey.is_silent}
 
 
 def _page(surveys: LiveSurveys, context: PageContext) -> dict[str, object]:

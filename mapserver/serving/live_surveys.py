@@ -12,10 +12,11 @@ SILENT_S = 5.0  # surveys report twice a second during the drive
 
 
 class LiveSurvey(NamedTuple):
-    """A state, and the time since it was received."""
+    """A state, the time since it was received, and its number: of all states that differ from the one before."""
 
     state: LiveSurveyState
     seconds_since: float
+    number: int
 
     @property
     def is_silent(self) -> bool:
@@ -27,15 +28,19 @@ class LiveSurveys:
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
-        self._states: dict[str, tuple[LiveSurveyState, float]] = {}
+        self._states: dict[str, tuple[LiveSurveyState, float, int]] = {}
+        self._last_number = 0
         self._lock = threading.Lock()
 
     def take(self, state: LiveSurveyState) -> None:
         """Store a state; LinkError for invalid arrays, which are not stored."""
         state.path(), state.part_numbers(), state.landmarks(), state.loop_lines(), state.covered()
         with self._lock:
-            self._states.pop(state.site, None)
-            self._states[state.site] = state, self._clock_s()
+            before = self._states.pop(state.site, None)
+            is_new = before is None or before[0] != state
+            self._last_number += is_new
+            number = self._last_number if is_new or before is None else before[2]
+            self._states[state.site] = state, self._clock_s(), number
             if len(self._states) > _MOST_SITES:
                 del self._states[next(iter(self._states))]
 
@@ -47,4 +52,4 @@ class LiveSurveys:
         """Return the site's survey, None if none was received since the server's start."""
         with self._lock:
             found = self._states.get(site)
-            return None if found is None else LiveSurvey(found[0], self._clock_s() - found[1])
+            return None if found is None else LiveSurvey(found[0], self._clock_s() - found[1], found[2])

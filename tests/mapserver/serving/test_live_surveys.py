@@ -74,6 +74,16 @@ def test_silence_is_seen_only_of_surveys_that_should_speak() -> None:
     assert not found.is_silent
 
 
+def test_a_state_that_is_told_again_keeps_its_number() -> None:
+    surveys, numbers = LiveSurveys(lambda: 0.0), []
+    for site, phase in (("hall", "tracking"), ("hall", "tracking"), ("yard", "tracking"), ("hall", "adjusting")):
+        surveys.take(state(site, phase=phase))
+        found = surveys.of(site)
+        assert found is not None
+        numbers.append(found.number)
+    assert numbers == [1, 1, 2, 3]
+
+
 def test_the_number_of_sites_is_bounded() -> None:
     surveys = LiveSurveys(lambda: 0.0)
     for number in range(100):
