@@ -7,6 +7,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 from fleetmap.errors import UsageError
 
 _LATEST_YEAR = 2200
+_HOUR_NS = 3_600_000_000_000
 _NAME = re.compile(r"[A-Za-z0-9_+\-/]{1,64}", re.ASCII)
 _LOST_PLUS = re.compile(r"(T[\d:.]+) (\d\d:?\d\d)$")  # `+` in a URL means a space
 
@@ -38,7 +39,8 @@ def clock_text(stamp_ns: int, zone: tzinfo | None) -> str:
 def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_end: bool = False) -> int | None:
     """Return nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone (None: the machine's). None for no text.
 
-    A day alone is its beginning, or its end with `is_end`. Raises UsageError for other text, naming the parameter.
+    A day alone is its beginning, or its end with `is_end`. A time that a clock change repeats is its first one, or its last with
+    `is_end`. Raises UsageError for other text, naming the parameter.
     """
     if not text:
         return None
@@ -55,8 +57,40 @@ def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_e
         raise UsageError(
             f"{name} {text[:40]!r} is an invalid time; write 2026-01-31T14:03, with +01:00 or Z if it is not local"
         )
-    if at.tzinfo is None:
-        at = at.replace(tzinfo=zone) if zone is not None else at.astimezone()
+    if at.tzinfo is not None:
+        return _stamp_ns(at)
+    return (max if is_end else min)(_local_ns(at, zone))
+
+
+def written(stamp_ns: int, zone: tzinfo | None) -> str:
+    """Return a stamp as `read_moment` takes it, to the minute; with its offset where a clock change repeats the time of day."""
+    at = datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).astimezone(zone)
+    local = at.replace(tzinfo=None, second=0, microsecond=0)
+    return (local if len(set(_local_ns(local, zone))) == 1 else at).isoformat(timespec="minutes")
+
+
+def steps(first_ns: int, end_ns: int, step_ns: int, zone: tzinfo | None) -> list[int]:
+    """Return the edges of equal steps around a range, by the clock of the zone: days begin at midnight, also after a clock change."""
+    offset = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).astimezone(zone).utcoffset() or timedelta()
+    offset_ns = offset // timedelta(microseconds=1) * 1000
+    begin_ns = (first_ns + offset_ns) // step_ns * step_ns  # as the clock shows it
+    edges = [begin_ns + n * step_ns for n in range((end_ns + offset_ns - begin_ns) // step_ns + 3)]
+    if step_ns > _HOUR_NS:
+        shown = (datetime.fromtimestamp(edge // 1_000_000_000, UTC).replace(tzinfo=None) for edge in edges)
+        edges = [_local_ns(at, zone)[0] for at in shown]
+    else:
+        edges = [edge - offset_ns for edge in edges]
+    return edges[: next(n for n, edge in enumerate(edges) if edge >= end_ns) + 1]
+
+
+def _local_ns(at: datetime, zone: tzinfo | None) -> tuple[int, int]:
+    """Return both stamps of a local time, which differ only around a clock change."""
+    both = (at.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
+    first, last = (_stamp_ns(each if zone is not None else each.astimezone()) for each in both)
+    return first, last
+
+
+def _stamp_ns(at: datetime) -> int:
     whole_s, part_s = divmod(at.timestamp(), 1)
     return int(whole_s) * 1_000_000_000 + round(part_s * 1e6) * 1000
 

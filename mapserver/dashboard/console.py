@@ -8,7 +8,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, tzinfo
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,7 +20,7 @@ from markupsafe import Markup
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, UsageError
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
-from mapserver.api.moments import moment_text, read_moment, read_range, zone_of
+from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
@@ -77,7 +77,7 @@ class PageContext:
 
     def range_fields(self) -> list[tuple[str, str, str]]:
         """Label, name and value of the fields to choose that range by."""
-        since, until = ("" if ns is None else self.written(ns) for ns in self.time_range())
+        since, until = ("" if ns is None else self.written(ns)[:16] for ns in self.time_range())
         return [("From", "since", since), ("Until", "until", until)]
 
     def range_presets(self) -> list[tuple[str, str]]:
@@ -87,8 +87,8 @@ class PageContext:
         return [("Last hour", hour), ("Today", today), ("Last 7 days", week)]
 
     def written(self, stamp_ns: int) -> str:
-        """A stamp as `since` and `until` of an address take it, to the minute."""
-        return f"{datetime.fromtimestamp(stamp_ns / 1e9, UTC).astimezone(self.zone):%Y-%m-%dT%H:%M}"
+        """A stamp as `since` and `until` of an address take it."""
+        return written(stamp_ns, self.zone)
 
     def to(self, path: str, **query: object) -> str:
         """The address of a page of the same site."""
@@ -119,7 +119,7 @@ class Console:
         @self.app.exception_handler(404)
         async def missing(request: Request, _: Exception) -> HTMLResponse:
             """Within the frame, with a way back."""
-            return await self._shown(request, "none", "", no_page, tuple(request.query_params), list)
+            return await self._shown(request, "none", "", no_page, tuple(request.query_params))
 
     def page(
         self,
@@ -129,18 +129,20 @@ class Console:
         *,
         knows: Sequence[str] = (),
         under_way: Callable[[], list[str]] = list,
+        of_site: bool = True,
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of that and the parts of `path` in braces; it may block.
 
         A FleetmapError becomes a notice within the frame. knows: query parameters beside the site. under_way: sites that the page
-        knows though the store has no version of them.
+        knows though the store has no version of them. of_site: False for a page that shows the same whatever site its address names.
         """
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> HTMLResponse:
             """A page."""
             page = path.partition("/")[0]
-            return await self._shown(request, _UNDER.get(page, page), template, fill, knows, under_way)
+            page = _UNDER.get(page, page)
+            return await self._shown(request, page, template, fill, knows, under_way, of_site=of_site)
 
     def stream(
         self,
@@ -160,17 +162,17 @@ class Console:
             chosen = site if site in await load(under_way) else await load(self.services.maps.chosen_site, site)
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(_root(request), chosen, zone, request.query_params)
-            guard = self.services.guard
+            guard, ended = self.services.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
 
             def event() -> bytes:
                 is_signed_in = getattr(request.state, "operator", None) is not None
                 if is_signed_in and guard.identify(request.scope, uses=False) is None:
-                    return b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
+                    return ended
                 return b"data: %s\n\n" % to_json(one(context, **request.path_params))
 
             async def events() -> AsyncIterator[bytes]:
                 told = b""
-                while not await request.is_disconnected():
+                while told != ended and not await request.is_disconnected():
                     found = await load(event)
                     yield b":\n\n" if found == told else found
                     told = found
@@ -185,7 +187,9 @@ class Console:
         template: str,
         fill: Callable[..., dict[str, object]],
         knows: Sequence[str],
-        under_way: Callable[[], list[str]],
+        under_way: Callable[[], list[str]] = list,
+        *,
+        of_site: bool = True,
     ) -> HTMLResponse:
         root, site, found, status = _root(request), request.query_params.get("site"), {}, 200
         sites: list[str] = []
@@ -194,6 +198,8 @@ class Console:
             sites = sorted({*stored, *growing})
             if site is None and growing and (page == "live" or not stored):
                 site = growing[0]
+            elif not of_site:
+                site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 site = await load(self.services.maps.chosen_site, site)
             check_query(request, knows)

@@ -21,7 +21,12 @@ _LISTED = 6
 def install(console: Console) -> None:
     """Adds the page."""
     services = console.services
-    console.page("failures/{failure}", "failure.html", lambda context, failure: _page(services, context, failure))
+    console.page(
+        "failures/{failure}",
+        "failure.html",
+        lambda context, failure: _page(services, context, failure),
+        of_site=False,
+    )
 
 
 def _page(services: Services, context: PageContext, failure: str) -> dict[str, object]:

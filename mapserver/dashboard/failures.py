@@ -1,13 +1,15 @@
 """The list of failures: what fails, and is it one or many? Causes over time, counts by cause, place, version and robot, cards."""
 
 import time
+from bisect import bisect
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
+from itertools import pairwise
 from typing import NamedTuple
 
 from fleetmap.messages import Cause, FailureKind
+from mapserver.api.moments import steps
 from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
@@ -153,25 +155,23 @@ def _chart(
     times = [row.happened_ns for row in rows]
     first_ns, end_ns = since_ns or min(times), until_ns or max(time.time_ns(), max(times) + 1)
     step_ns = next((step for step in _STEPS_NS if (end_ns - first_ns) / step < _BARS), max(_STEPS_NS))
-    offset = datetime.fromtimestamp(first_ns / 1e9, UTC).astimezone(context.zone).utcoffset()
-    offset_ns = int(offset.total_seconds()) * 10**9 if offset else 0  # days begin at midnight where one looks
-    begin_ns = (first_ns + offset_ns) // step_ns * step_ns - offset_ns
-    counts = [Counter[str]() for _ in range(-((begin_ns - end_ns) // step_ns))]
+    edges = steps(first_ns, end_ns, step_ns, context.zone)
+    counts = [Counter[str]() for _ in edges[1:]]
     for row in rows:
-        counts[(row.happened_ns - begin_ns) // step_ns][row.cause] += 1
+        counts[bisect(edges, row.happened_ns) - 1][row.cause] += 1
     most, bars = max(count.total() for count in counts), []
-    for n, count in enumerate(counts):
-        start_ns, parts, below = begin_ns + n * step_ns, [], 0
+    for (start_ns, stop_ns), count in zip(pairwise(edges), counts, strict=True):
+        parts, below = [], 0
         for cause, part in sorted(count.items(), key=lambda item: shades.get(item[0], _SHADES - 1)):
             below += part
             parts.append(
                 {"shade": shades.get(cause, _SHADES - 1), "top": 100 - 100 * below / most, "height": 100 * part / most}
             )
         told = ", ".join(f"{part} {cause.replace('_', ' ') or 'unknown'}" for cause, part in count.most_common())
-        span = {"since": context.written(start_ns), "until": context.written(start_ns + step_ns)}
+        span = {"since": context.written(start_ns), "until": context.written(stop_ns)}
         words = f"{context.moment(start_ns)}, {_STEPS_NS[step_ns]}: {told or 'none'}"
         bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
-    ends = [context.written(ns).replace("T", " ") for ns in (begin_ns, end_ns)]
+    ends = [context.written(ns)[:16].replace("T", " ") for ns in (edges[0], end_ns)]
     return {"bars": bars, "most": most, "step": _STEPS_NS[step_ns], "ends": ends}
 
 

@@ -1,12 +1,13 @@
 """Moments in addresses and on pages."""
 
 from datetime import UTC
+from itertools import pairwise
 from zoneinfo import ZoneInfo
 
 import pytest
 
 from fleetmap.errors import UsageError
-from mapserver.api.moments import moment_text, read_moment, read_range, zone_of
+from mapserver.api.moments import moment_text, read_moment, read_range, steps, written, zone_of
 
 BERLIN = ZoneInfo("Europe/Berlin")
 NOON_NS = 1_767_268_800_000_000_000  # 2026-01-01T12:00Z
@@ -50,3 +51,27 @@ def test_moments_name_their_zone() -> None:
     for name in (None, "", "Nowhere/At_all", "../../etc/passwd", "x" * 70, "a\nb"):
         assert zone_of(name) is None
     assert zone_of("Europe/Berlin") == BERLIN
+
+
+@pytest.mark.parametrize("day", ["2026-10-25", "2026-03-29"])
+@pytest.mark.parametrize("minutes", [5, 60, 6 * 60, 24 * 60])
+def test_steps_around_a_clock_change_are_ranges_that_can_be_asked_for(day: str, minutes: int) -> None:
+    first_ns, end_ns = read_range(day, day, BERLIN)
+    assert first_ns is not None
+    assert end_ns is not None
+    edges = steps(first_ns, end_ns, minutes * 60 * 10**9, BERLIN)
+    assert (edges[0], edges[-1]) == (first_ns, end_ns)
+    for edge, following in pairwise(edges):
+        assert read_range(written(edge, BERLIN), written(following, BERLIN), BERLIN) == (edge, following)
+
+
+def test_days_begin_at_midnight_also_after_a_clock_change() -> None:
+    first_ns, end_ns = read_range("2026-10-24", "2026-10-26", BERLIN)
+    edges = steps(first_ns or 0, end_ns or 0, 24 * 3600 * 10**9, BERLIN)
+    assert [written(edge, BERLIN) for edge in edges] == [f"2026-10-{day}T00:00" for day in (24, 25, 26, 27)]
+
+
+def test_a_time_that_is_repeated_is_the_longest_range() -> None:
+    since_ns, until_ns = read_range("2026-10-25T02:30", "2026-10-25T02:30", BERLIN)
+    assert (until_ns or 0) - (since_ns or 0) == 3600 * 10**9
+    assert written(until_ns or 0, BERLIN) == "2026-10-25T02:30+01:00"

@@ -244,6 +244,8 @@ def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None
     ):
         text = httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text
         assert f'<form method="get"{leads_to}><label>Site' in text, path
+    failed = httpx.get(f"{served.http}/dashboard/failures/1?site=nowhere", timeout=60)
+    assert (failed.status_code, "Failure 1 of tug-7" in failed.text) == (200, True), "its number alone names it"
 
 
 def test_surveys_begin_with_a_site_that_has_a_map(served: Served) -> None:

@@ -5,6 +5,7 @@ import ipaddress
 import re
 import time
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import httpx
@@ -166,6 +167,17 @@ def test_a_viewer_has_no_buttons_and_a_session_that_is_gone_changes_nothing(page
         page.wait_for_url(re.compile("/sign-in"), timeout=60_000)
         store.operators.set_role("ada", "admin", Actor("root"))
         Operators(store).set_password("ada", PASSWORD, Actor("root"))
+
+
+def test_a_stream_ends_with_its_session(served: Served) -> None:
+    with httpx.Client(base_url=served.http, verify=False, timeout=60) as client:
+        client.post("/sign-in", data={"name": "paul", "password": PASSWORD})
+        with client.stream("GET", f"/dashboard/now?site={SITE}") as answer, MapStore.open(served.folder) as store:
+            lines = answer.iter_lines()
+            assert next(lines).startswith("data: ")
+            Operators(store).set_password("paul", PASSWORD, Actor("root"))
+            assert "event: ended" in lines
+            assert list(islice(lines, 5)) == ["data: /sign-in", ""]
 
 
 def injected(context: BrowserContext, served: Served) -> bool:
