@@ -24,6 +24,7 @@ from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.request_limits import RequestLimits
+from mapserver.api.server_routes import install_server_routes
 from mapserver.api.version_routes import ApiSettings, install_version_routes
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
@@ -66,6 +67,7 @@ def create_app(
     install_file_routes(app, store)
     install_version_routes(app, store, settings)
     install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
+    install_server_routes(app, store, fleet, settings)
     describe.install(app)
     return app
 

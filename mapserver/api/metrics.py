@@ -1,23 +1,28 @@
 """Prometheus metrics of the server.
 
-Label values come from fixed sets or are names of sites, versions and areas in the store, causes (a few dozen at most) and statuses.
+Label values come from fixed sets or are names of sites, versions and areas in the store, causes (a few dozen at most), statuses, and
+those of the twenty robots of a site that are lost for longest.
 """
 
 from collections import Counter as Counts
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from fleetmap.errors import FleetmapError, StateError, StoreError
+from fleetmap.errors import FleetmapError, StateError, StoreError, UsageError
 from fleetmap.messages import Status
+from mapserver.fleet.alerts import AlertSettings, lost_since_ns
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
 from mapserver.floor_plan.areas import OUTSIDE
+from mapserver.serving.server_health import HTTP
 from mapserver.store import MapStore
+from mapserver.trust.http_certificate import HttpCertificate
 from mapserver.trust.status import trust_status
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -59,15 +64,25 @@ _ROBOTS = {
     "robots_current": "Robots on the wanted version.",
     "robots_present": "Robots on the bus now.",
     "robots_copied": "Robots connected twice.",
+    "robots_lost": "Robots that have not known their position for longer than [alerts] lost_s.",
     "clock_skew_max_seconds": "Largest clock error of a robot.",
     "map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",
 }
+_LOST_WORDS = "Time since such a robot lost its position, of those of a site that are lost for longest."
+_MOST_LOST = 20  # of a site: each is a series of its own
+_USUAL_ALERTS = AlertSettings()
 
 
 class Metrics:
     """Counters of one server, in a registry of their own."""
 
-    def __init__(self, store: MapStore, fleet: Fleet) -> None:
+    def __init__(
+        self,
+        store: MapStore,
+        fleet: Fleet,
+        alerts: AlertSettings = _USUAL_ALERTS,
+        certificate: HttpCertificate | None = None,
+    ) -> None:
         own = self._registry = CollectorRegistry()
         ProcessCollector(registry=own)
         labels = ["method", "route", "status"]
@@ -78,7 +93,7 @@ class Metrics:
         self._bus_messages = Counter(name, words, ["what", "result"], registry=own)
         name, words = "fleetmap_bus_sent_bytes_total", "Bytes sent in answers."
         self._bus_bytes = Counter(name, words, ["what"], registry=own)
-        own.register(_FleetCollector(store, fleet))
+        own.register(_FleetCollector(store, fleet, alerts, certificate))
 
     def count_http(self, method: str, route: str, status: int, seconds_s: float) -> None:
         """Count one HTTP request; `route` is the template, not the path, so paths cannot create new series."""
@@ -99,8 +114,10 @@ class _FleetCollector(Collector):
     The store deletes old data; Prometheus treats the decrease as a restart.
     """
 
-    def __init__(self, store: MapStore, fleet: Fleet) -> None:
-        self._store, self._fleet = store, fleet
+    def __init__(
+        self, store: MapStore, fleet: Fleet, alerts: AlertSettings, certificate: HttpCertificate | None
+    ) -> None:
+        self._store, self._fleet, self._alerts, self._certificate = store, fleet, alerts, certificate
 
     def collect(self) -> Iterator[Metric]:
         """State of sites and robots, sums by site, version and cause."""
@@ -117,7 +134,8 @@ class _FleetCollector(Collector):
         family = CounterMetricFamily("fleetmap_site_canaries_rolled_back", "Versions rolled back.", labels=["site"])
         yield _filled(family, (((info.site,), rolled_back[info.site]) for info in sites))
         yield from self._robots([info.site for info in sites])
-        yield from _trust(self._store)
+        yield from _trust(self._store, self._certificate)
+        yield from _disk(self._store)
         totals = [((site,), counts) for (site, _), counts in counters(None, "site").items()]
         yield from _sums("site", _SITE_SUMS, ["site"], totals)
         kept = {(info.site, str(version.version)) for info in sites for version in self._store.versions(info.site)}
@@ -140,6 +158,7 @@ class _FleetCollector(Collector):
         robots = self._fleet.robots()
         gauges = {name: _gauge(f"site_{name}", words) for name, words in _ROBOTS.items()}
         statuses = _gauge("site_robots_status", "Robots seen in the last minute.", "status")
+        lost, now_ns = _gauge("site_robot_lost_seconds", _LOST_WORDS, "robot"), self._store.now_ns()
         drifting = _gauge(
             "site_robots_calibration", "Robots seen in the last minute that drift, by parameter.", "parameter"
         )
@@ -157,6 +176,10 @@ class _FleetCollector(Collector):
                 "clock_skew_max_seconds": max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0),
                 "map_word_hours_max": max((hours for hours in proofs if isinstance(hours, int | float)), default=0.0),
             }
+            since = [(lost_since_ns(robot, self._alerts, now_ns), robot.robot) for robot in seen]
+            longest = sorted((since_ns, name) for since_ns, name in since if since_ns is not None)
+            figures["robots_lost"] = len(longest)
+            _filled(lost, [((site, name), (now_ns - since_ns) / 1e9) for since_ns, name in longest[:_MOST_LOST]])
             for name, figure in figures.items():
                 gauges[name].add_metric([site], figure)
             counts = Counts(each.get("status") for each in health)
@@ -165,13 +188,30 @@ class _FleetCollector(Collector):
             _filled(statuses, [((site, "other"), other)])
             drifts = Counts(f.name for each in health for f in calibration_figures(each) if f.is_drifted)
             _filled(drifting, [((site, name), drifts[name]) for name in PARAMETERS])
-        yield from (*gauges.values(), statuses, drifting)
+        yield from (*gauges.values(), lost, statuses, drifting)
 
 
-def _trust(store: MapStore) -> Iterator[Metric]:
-    """Days that the signed lists last; no figures for a store that is not signed."""
+def _disk(store: MapStore) -> Iterator[Metric]:
+    """No figures from a disk that does not answer."""
+    free = GaugeMetricFamily("fleetmap_store_disk_free_bytes", "Free space of the store's disk.")
+    total = GaugeMetricFamily("fleetmap_store_disk_total_bytes", "Size of the store's disk.")
+    with suppress(StoreError):
+        found = store.disk_space()
+        free.add_metric([], found.free_bytes)
+        total.add_metric([], found.total_bytes)
+    yield free
+    yield total
+
+
+def _trust(store: MapStore, http: HttpCertificate | None) -> Iterator[Metric]:
+    """Days that certificates and signed lists last; of those of the bus no figures for a store that is not signed."""
     faults = GaugeMetricFamily("fleetmap_trust_faults", "Faults that block new maps for robots, now or soon.")
     days = GaugeMetricFamily("fleetmap_trust_days_left", "Days until a role expires.", labels=["role"])
+    words = "Days until a certificate expires."
+    certificates = GaugeMetricFamily("fleetmap_certificate_days_left", words, labels=["certificate"])
+    if http is not None:
+        with suppress(UsageError):  # while its file is replaced
+            certificates.add_metric([HTTP], http.days_left())
     try:
         found = trust_status(store)
     except StateError:  # an unsigned store
@@ -183,8 +223,11 @@ def _trust(store: MapStore) -> Iterator[Metric]:
         for role in found.roles:
             if role.days_left is not None:
                 days.add_metric([role.role], role.days_left)
+        for each in found.certificates:
+            certificates.add_metric([each.file], each.days_left)
     yield faults
     yield days
+    yield certificates
 
 
 def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:

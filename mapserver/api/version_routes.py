@@ -11,21 +11,29 @@ from mapserver import releases
 from mapserver.api import views
 from mapserver.api.guard import GuardSettings, actor_of
 from mapserver.api.parameters import Site, Version
+from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.canary_controller import find
+from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
+from mapserver.serving.webhook import Webhook
 from mapserver.store import CanaryRow, MapStore, VersionInfo
+from mapserver.trust.http_certificate import HttpCertificate
 
 
 class ApiSettings(NamedTuple):
-    """Settings of access, the gate, canaries and tiles."""
+    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, and the webhook, None without one."""
 
     guard: GuardSettings = GuardSettings()
     gate: GateSettings = GateSettings()
     canary: CanarySettings = CanarySettings()
     resurvey: ResurveySettings = ResurveySettings()
+    alerts: AlertSettings = AlertSettings()
+    ingest: IngestSettings = IngestSettings()
+    certificate: HttpCertificate | None = None
+    webhook: Webhook | None = None
 
 
 def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
+from mapserver.fleet.alerts import Alert
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
@@ -247,6 +248,21 @@ class Problem(BaseModel):
     status: int
     detail: str
     instance: str
+
+
+@dataclass(frozen=True, slots=True)
+class AlertList:
+    """Active alerts, by site, name and subject. since_ns: start; the time of the answer if it is unknown."""
+
+    alerts: list[Alert]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class AlertTest:
+    """Answer of the webhook to an accepted test alert."""
+
+    detail: str
 
 
 @dataclass(frozen=True, slots=True)

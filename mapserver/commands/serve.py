@@ -213,7 +213,7 @@ def _run(
     if guard.warning:
         logging.getLogger(__name__).warning("%s", guard.warning)
     fleet = Fleet(maps, settings=settings.ingest)
-    metrics = Metrics(maps, fleet)
+    metrics = Metrics(maps, fleet, settings.alerts, certificate)
     webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
     bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
@@ -235,7 +235,16 @@ def _run(
         await asyncio.gather(*background, return_exceptions=True)
         _bound_the_end(fleet)
 
-    api = ApiSettings(guard, settings.gate, settings.canary, settings.resurvey)
+    api = ApiSettings(
+        guard,
+        settings.gate,
+        settings.canary,
+        settings.resurvey,
+        settings.alerts,
+        settings.ingest,
+        certificate,
+        webhook,
+    )
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
     # Outside the middleware that replaces the proxy's address by the client's.

@@ -1,5 +1,6 @@
 """Alerts for operators: robots fail too often, one stays lost, a nightly run failed, a version was rolled back."""
 
+import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,6 +16,10 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, figure, hour_of, 
 from mapserver.store import MapStore
 
 _HEARD_WITHIN_S = 60.0
+_LEAST_FREE_SHARE, _LEAST_FREE_BYTES = (
+    0.1,
+    50_000_000_000,
+)  # of a large disk less than a tenth is enough for some nights
 _RATE_HOURS = 24
 _TOLD_NS = 24 * HOUR_NS  # duration of the alert for a rolled back version
 _LOST = {Status.LOST, Status.AMBIGUOUS, Status.INITIALISING}
@@ -37,9 +42,9 @@ class AlertSettings(Section, frozen=True):
 @dataclass(frozen=True, slots=True)
 class Alert:
     """A present condition. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapNightFailed,
-    FleetmapCanaryRolledBack or FleetmapTrustFault.
+    FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault.
 
-    about: its robot, job or version, empty for a site as a whole; since_ns: start, nanoseconds since 1970.
+    about: its robot, job or version, empty for a site as a whole; since_ns: start, nanoseconds since 1970, now if it is unknown.
     """
 
     name: str
@@ -54,12 +59,19 @@ class Alert:
 
 
 def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
-    """Return all active alerts, by site, then faults of lists and certificates; errors are the store's."""
+    """Return all active alerts, by site, then those of the disk, lists and certificates; errors are the store's."""
     from mapserver.trust.status import (
         trust_status,
     )  # imported late: it needs zenoh, and builds, which read the settings, do not
 
     found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, info.site, now_ns)]
+    disk = store.disk_space()
+    if disk.free_bytes < min(_LEAST_FREE_SHARE * disk.total_bytes, _LEAST_FREE_BYTES):
+        words = (
+            f"the store's disk is nearly full: {disk.free_bytes / 1e9:.1f} of {disk.total_bytes / 1e9:.0f} GB are free; "
+            f"`mapserver gc --store {shlex.quote(str(store.folder))}` removes old versions"
+        )
+        found.append(Alert("FleetmapDiskFills", "", "", now_ns, words))
     with suppress(StateError):  # an unsigned store
         found += [
             Alert("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
@@ -99,12 +111,17 @@ def _failure_rate(store: MapStore, settings: AlertSettings, site: str, now_ns: i
         yield Alert("FleetmapFailureRate", site, "", now_ns, words)
 
 
-def _lost(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> Iterator[Alert]:
-    status = (robot.last_health or {}).get("status")
-    since_ns = robot.state_since_ns
+def lost_since_ns(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> int | None:
+    """Return since when a robot has not known its position, None unless it reports that, and for longer than the limit."""
+    status, since_ns = (robot.last_health or {}).get("status"), robot.state_since_ns
     if status not in _LOST or since_ns is None or robot.seconds_since > _HEARD_WITHIN_S:
-        return
-    if now_ns - since_ns >= settings.lost_s * 1e9:
-        minutes = (now_ns - since_ns) / 60e9
-        words = f"{robot.robot} of {robot.site} has had no known position for {minutes:.0f} min ({status})"
+        return None
+    return since_ns if now_ns - since_ns >= settings.lost_s * 1e9 else None
+
+
+def _lost(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> Iterator[Alert]:
+    since_ns = lost_since_ns(robot, settings, now_ns)
+    if since_ns is not None:
+        told = f"{(now_ns - since_ns) / 60e9:.0f} min ({(robot.last_health or {}).get('status')})"
+        words = f"{robot.robot} of {robot.site} has had no known position for {told}"
         yield Alert("FleetmapRobotLost", robot.site, robot.robot, since_ns, words)

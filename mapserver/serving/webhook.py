@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import UsageError, disk_errors
+from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
 from mapserver.fleet.alerts import Alert, AlertSettings
 from mapserver.serving.http_connections import is_loopback_name
@@ -37,7 +37,7 @@ class Webhook:
     def __init__(self, settings: AlertSettings) -> None:
         """UsageError for a forbidden address or an unreadable token."""
         address = check_address(settings.webhook or "")
-        self._secure, self._host, self._port = address.scheme == "https", address.hostname or "", address.port
+        self._secure, self.host, self._port = address.scheme == "https", address.hostname or "", address.port
         self._path = f"{address.path or '/'}{f'?{address.query}' if address.query else ''}"
         self._headers = {"Content-Type": "application/json", "User-Agent": "fleetmap"}
         if settings.token_file is not None:
@@ -45,6 +45,7 @@ class Webhook:
         self._waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
         self._ended = threading.Event()
         self._refusals = LogLimit(_log)
+        self._testing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
         self._thread.start()
 
@@ -53,6 +54,17 @@ class Webhook:
             self._waiting.put_nowait(to_json(body))
         except queue.Full:
             self._refusals.warning("full", "an alert is dropped: the queue of the webhook is full (%d)", _MOST_WAITING)
+
+    def test(self, now_ns: int) -> tuple[bool, str]:
+        """Send a test alert once, and wait: whether the receiver accepted it, and its answer. StateError while another is under way."""
+        test = Alert("FleetmapTest", "", "", now_ns, "A test of the webhook. Nothing is wrong.")
+        if not self._testing.acquire(blocking=False):
+            raise StateError("another test alert is on its way; wait for its answer")
+        try:
+            is_accepted, answer = self._attempt(to_json(message([test], "firing", now_ns)))
+        finally:
+            self._testing.release()
+        return is_accepted, f"{self.host} {'accepted' if is_accepted else 'did not accept'} the test alert: {answer}"
 
     def close(self) -> None:
         self._ended.set()
@@ -68,34 +80,35 @@ class Webhook:
 
     def _deliver(self, body: bytes) -> None:
         for pause_s in (*_PAUSES_S, None):
-            fault = self._attempt(body)
-            if not fault:
+            is_accepted, answer = self._attempt(body)
+            if is_accepted:
                 return
-            self._refusals.warning("fault", "the webhook at %s did not accept an alert: %s", self._host, fault)
+            self._refusals.warning("fault", "the webhook at %s did not accept an alert: %s", self.host, answer)
             if pause_s is not None and self._ended.wait(pause_s):
                 return
         self._refusals.warning("dropped", "an alert is dropped: the webhook refused it %d times", len(_PAUSES_S) + 1)
 
-    def _attempt(self, body: bytes) -> str:
-        made = http.client.HTTPConnection(self._host, self._port or (443 if self._secure else 80), timeout=_ATTEMPT_S)
+    def _attempt(self, body: bytes) -> tuple[bool, str]:
+        """Send once: whether the receiver accepted it, and its status or what went wrong."""
+        made = http.client.HTTPConnection(self.host, self._port or (443 if self._secure else 80), timeout=_ATTEMPT_S)
         # A socket timeout restarts with each byte: a receiver that sends single bytes would block this thread for ever.
         watch = threading.Timer(_ATTEMPT_S, _cut, (made,))
         try:
             made.connect()
             if self._secure:
                 tls = ssl.create_default_context()
-                made.sock = tls.wrap_socket(made.sock, server_hostname=self._host, do_handshake_on_connect=False)
+                made.sock = tls.wrap_socket(made.sock, server_hostname=self.host, do_handshake_on_connect=False)
             watch.start()
             if isinstance(made.sock, ssl.SSLSocket):
                 made.sock.do_handshake()
             made.request("POST", self._path, body, self._headers)
             status = made.getresponse().status
         except Exception as error:  # after any error the next alert is still tried
-            return f"{type(error).__name__}: {error}"[:200]
+            return False, f"{type(error).__name__}: {error}"[:200]
         finally:
             watch.cancel()
             made.close()
-        return "" if 200 <= status < 300 else f"status {status}"
+        return 200 <= status < 300, f"status {status}"
 
 
 class AlertWatch:

@@ -25,6 +25,7 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
+from mapserver.store.usage import DiskSpace, StoreUsage
 
 __all__ = [
     "NOBODY",
@@ -32,6 +33,7 @@ __all__ = [
     "AuditLine",
     "CanaryRow",
     "CounterKey",
+    "DiskSpace",
     "DraftContent",
     "DraftDetails",
     "Event",
@@ -49,6 +51,7 @@ __all__ = [
     "PictureRow",
     "Retention",
     "SiteInfo",
+    "StoreUsage",
     "TokenRow",
     "TraceRow",
     "VerdictRow",

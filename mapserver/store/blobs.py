@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
@@ -64,6 +65,14 @@ class BlobFolder:
     def unreferenced(self) -> list[Path]:
         """Return files that are not blobs, such as remains of a killed process."""
         return sorted(path for path in self._files() if not _is_address(path))
+
+    def total_bytes(self) -> int:
+        """Return the size of all files; one that is removed meanwhile counts nothing."""
+        found = 0
+        for path in self._files():
+            with suppress(FileNotFoundError):
+                found += path.stat().st_size
+        return found
 
     def remove_file(self, path: Path) -> int:
         """Remove a file and return its size; raises StoreError on a disk error."""

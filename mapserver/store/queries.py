@@ -34,6 +34,7 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
+from mapserver.store.usage import DiskSpace, StoreUsage, UsageMeter, disk_space
 from mapserver.store.version_rows import canaries, site_releases
 
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
@@ -52,10 +53,18 @@ class StoreQueries:
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
         self.operators = OperatorQueries(self._transactions)
+        self._usage = UsageMeter(root, self._transactions, self._blobs)
 
     @property
     def folder(self) -> Path:
         return self._root
+
+    def disk_space(self) -> DiskSpace:
+        return disk_space(self._root)
+
+    def usage(self) -> StoreUsage | None:
+        """Return the size of the store, at most ten minutes old; None while it is measured for the first time."""
+        return self._usage.look()
 
     def now_ns(self) -> int:
         return self._clock_ns()

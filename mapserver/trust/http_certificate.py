@@ -28,8 +28,7 @@ class HttpCertificate:
         """Log reasons why clients will refuse it, soon or now. names: names of the server for clients."""
         from cryptography.x509.oid import ExtensionOID
 
-        chain = self._chain()
-        left = (chain[0].not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86_400
+        chain, left = self._chain(), self.days_left()
         if left < ENDS_SOON_DAYS:
             ends = f"{chain[0].not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
             _log.warning("%s expires at %s, in %.1f days; replace it by a renewed one", self.certificate, ends, left)
@@ -49,6 +48,10 @@ class HttpCertificate:
             is_open = self.key.stat().st_mode & 0o007
         if is_open:
             _log.warning("every account of this machine can use the key %s; `chmod o= %s`", self.key, self.key)
+
+    def days_left(self) -> float:
+        """Return the days until the present file expires; UsageError if it cannot be read."""
+        return (self._chain()[0].not_valid_after_utc - datetime.now(UTC)).total_seconds() / 86_400
 
     def names(self) -> frozenset[str]:
         """Return the DNS names of the certificate, without wildcards."""

@@ -28,11 +28,23 @@ class RoleStatus:
     fault: str = ""
 
 
+@dataclass(frozen=True)
+class CertificateStatus:
+    """One certificate of the bus, by its file."""
+
+    file: str
+    days_left: float
+    fault: str = ""
+
+
 @dataclass
 class TrustStatus:
-    """All roles. faults: reasons why robots cannot get new maps, now or soon; risks: actions possible for a thief of this machine."""
+    """All roles and certificates. faults: reasons why robots cannot get new maps, now or soon; risks: actions possible for a
+    thief of this machine.
+    """
 
     roles: list[RoleStatus] = field(default_factory=list)
+    certificates: list[CertificateStatus] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     risks: list[str] = field(default_factory=list)
 
@@ -74,9 +86,12 @@ def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
     if not authorities.are_there:
         return
     for file, left in authorities.days_left().items():
+        fault = ""
         if left < _CERTIFICATE_ENDS_SOON:
             step = "`mapserver trust rotate server`" if file == "server.pem" else "make it again"
-            found.faults.append(f"{file}: expires in {left:.1f} days, then robots cannot connect; {step}")
+            fault = f"expires in {left:.1f} days, then robots cannot connect; {step}"
+            found.faults.append(f"{file}: {fault}")
+        found.certificates.append(CertificateStatus(file, round(left, 2), fault))
     if (authorities.folder / "servers-ca.pem").is_file():
         found.risks.append(f"{authorities.folder}/servers-ca.pem: a thief of this machine can act as the server")
 

@@ -6,15 +6,18 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from fleetmap.errors import StoreError
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
-from fleetmap.messages import RobotAck, RobotHealth
+from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
 from mapserver.api import app as app_module
 from mapserver.api import request_limits
 from mapserver.quality.figures import Evidence, RigEvidence
 from mapserver.store import DraftContent
+from mapserver.trust import init_here
+from mapserver.trust.enrolment import RobotRegister
 from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
@@ -161,6 +164,50 @@ def test_service_endpoints(server: Server) -> None:
     assert server.client.get("/version").json()["tile_format"] == TILE_FORMAT
     server.bus.close()
     check_problem(server.client.get("/readyz"), 503, "bus")
+
+
+def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    init_here(server.store)
+    RobotRegister(server.store).authorities.init(["localhost"], None, None)
+    jpeg = b"\xff\xd8" + bytes(3000) + b"\xff\xd9"
+    failure = FailureReport(
+        site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
+        version=1, thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=jpeg),),
+    )  # fmt: skip
+    assert not server.fleet.take_failure("lab", "r1", failure).refused
+    found = server.client.get("/v1/server").json()
+    used = found["store"]
+    assert used["maps_bytes"] == sum(
+        path.stat().st_size for path in (server.folder / "blobs").rglob("*") if path.is_file()
+    )
+    assert (used["pictures_bytes"], used["recordings_bytes"]) == (len(jpeg), 0)
+    database = sum(path.stat().st_size for path in server.folder.glob("store.sqlite3*"))
+    assert used["database_bytes"] == database - len(jpeg)
+    assert 0 < found["disk"]["free_bytes"] < found["disk"]["total_bytes"]
+    assert abs(found["memory_bytes"] / psutil.Process().memory_info().rss - 1) < 0.2
+    days = {each["name"]: round(each["days_left"]) for each in found["endings"]}
+    assert days == {
+        "servers-ca.crt": 3650, "robots-ca.crt": 1825, "server.pem": 397, "root": 730, "targets": 365, "snapshot": 7,
+        "timestamp": 1, "site-lab": 14,
+    }  # fmt: skip
+    assert found["retention"]["failure_days"] == 400.0
+    server.fleet.storage_fault = "no space left on device"
+    monkeypatch.setattr(server.store._blobs, "total_bytes", lambda: 1 / 0)
+    again = server.client.get("/v1/server").json()
+    assert (again["storage_fault"], again["store"]) == ("no space left on device", used), (
+        "files are counted now and then"
+    )
+
+
+def test_alerts_come_in_pages(server: Server) -> None:
+    save_sample_draft(server.store, site="hall")
+    for site in ("lab", "hall"):
+        server.store.update_job(server.store.begin_job(site, "nightly"), "failed", "the disk is full", {})
+    first = server.client.get("/v1/alerts?limit=1").json()
+    rest = server.client.get(f"/v1/alerts?cursor={first['next']}").json()
+    assert [alert["site"] for page in (first, rest) for alert in page["alerts"] if alert["site"]] == ["hall", "lab"]
+    assert rest["next"] is None
+    assert "the night of hall failed" in first["alerts"][0]["words"] + rest["alerts"][0]["words"]
 
 
 def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -91,7 +92,8 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
         asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
-        settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})))
+        receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
+        settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver)
         app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app)
         asked = {

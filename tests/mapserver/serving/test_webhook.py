@@ -1,59 +1,41 @@
 """Alerts at a webhook: told once and once more when they are over, and no answer of a hostile or dead one harms anything."""
 
 import json
+import re
 import shutil
 import socket
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from contextlib import suppress
 from pathlib import Path
 
+import httpx
+import msgspec
 import pytest
 import yaml
+from fastapi.testclient import TestClient
 
 from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport, RobotHealth
 from mapserver import releases
+from mapserver.api.app import create_app
+from mapserver.api.metrics import Metrics
+from mapserver.api.version_routes import ApiSettings
 from mapserver.fleet.alerts import Alert, AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving import webhook
 from mapserver.serving.webhook import AlertWatch, Webhook, check_address
-from mapserver.store import MapStore
+from mapserver.store import DiskSpace, MapStore
+from mapserver.store.queries import StoreQueries
 from support.fleet.contracts_documents import REPOSITORY
+from support.fleet.webhook_receiver import receiver
 from support.storage.clock import Clock
 from support.storage.map_samples import save_sample_draft
 
 HOUR_NS = 3_600_000_000_000
 RULES = REPOSITORY / "deploy" / "prometheus-alerts.yml"
-
-
-@contextmanager
-def receiver(status: int = 200, location: str = "") -> Iterator[tuple[str, list[tuple[dict[str, str], bytes]]]]:
-    got: list[tuple[dict[str, str], bytes]] = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            got.append((dict(self.headers), self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(status)
-            if location:
-                self.send_header("Location", location)
-            self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/told?by=fleet", got
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
 def wait_for(what: object, seconds: float = 15.0) -> None:
@@ -69,7 +51,8 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
+def store(tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Iterator[MapStore]:
+    monkeypatch.setattr(StoreQueries, "disk_space", lambda _: DiskSpace(10**12, 10**12))  # whatever this machine has
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
         for seed in range(2):
             save_sample_draft(opened, seed=seed)
@@ -196,7 +179,7 @@ def test_a_hostile_receiver_is_left_after_its_time(
         thread.start()
         sender = Webhook(AlertSettings(webhook=f"http://127.0.0.1:{listener.getsockname()[1]}/"))
         begun_s = time.monotonic()
-        assert (sender._attempt(b"{}") == "") == is_taken
+        assert sender._attempt(b"{}")[0] == is_taken
         assert time.monotonic() - begun_s < 3.0
         sender.close()
         ended.set()
@@ -246,5 +229,70 @@ def test_the_rules_of_prometheus_are_those_of_the_webhook() -> None:
         assert checked.returncode == 0, checked.stdout + checked.stderr
     (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
     told = {rule["alert"] for rule in group["rules"]}
-    expected = {"FailureRate", "RobotLost", "RobotCopied", "NightFailed", "CanaryRolledBack", "TrustFault"}
+    expected = {"FailureRate", "RobotLost", "RobotCopied", "NightFailed", "CanaryRolledBack", "DiskFills", "TrustFault"}
+    # A server cannot tell that it is down; days left are in the sentence of FleetmapTrustFault.
+    expected |= {"ServerDown", "CertificateEnds", "ListEnds"}
     assert told == {f"Fleetmap{name}" for name in expected}
+
+
+def lost(clock: Clock, fleet: Fleet, names: list[str], minutes: int) -> None:
+    """Robots that report every half minute that they are lost."""
+    for number in range(2 * minutes + 1):
+        for name in names:
+            fleet.take_health("lab", name, msgspec.structs.replace(health("LOST", number), robot=name))
+        clock.now_ns += 30 * 10**9 if number < 2 * minutes else 0
+
+
+def test_metrics_name_the_robots_that_are_lost_for_longest(store: MapStore, clock: Clock) -> None:
+    fleet = Fleet(store, clock_ns=clock)
+
+    def named() -> dict[str, float]:
+        text = Metrics(store, fleet).text().decode()
+        return {
+            name: float(s) for name, s in re.findall(r'fleetmap_site_robot_lost_seconds{.*robot="(.*?)".*} (.*)', text)
+        }
+
+    lost(clock, fleet, ["r1"], 4)
+    assert named() == {}, "for less than five minutes"
+    lost(clock, fleet, ["r1"], 4)
+    assert named() == {"r1": 480.0}
+    others = [f"r{number}" for number in range(2, 60)]
+    lost(clock, fleet, ["r1", *others], 6)
+    assert len(named()) == 20, "robots cannot make any number of series"
+    assert max(named().items(), key=lambda item: item[1])[0] == "r1"
+    assert 'fleetmap_site_robots_lost{site="lab"} 59.0' in Metrics(store, fleet).text().decode()
+    fleet.take_health("lab", "r1", health("TRACKING", 99))
+    assert "r1" not in named()
+
+
+def test_a_disk_that_fills_is_told(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    for total_gb, free_gb, is_told in ((500, 60, False), (500, 49, True), (20_000, 60, False), (20_000, 49, True)):
+        space = DiskSpace(total_gb * 10**9, free_gb * 10**9)
+        monkeypatch.setattr(store, "disk_space", lambda space=space: space)
+        found = active_alerts(store, Fleet(store), AlertSettings(), clock())
+        assert [alert.name for alert in found] == ["FleetmapDiskFills"] * is_told, (total_gb, free_gb)
+
+
+def ask(store: MapStore, sender: Webhook | None) -> httpx.Response:
+    """The answer to a request for a test alert."""
+    fleet = Fleet(store)
+    app = create_app(store, fleet, Metrics(store, fleet), None, None, ApiSettings(webhook=sender))
+    with TestClient(app, "http://127.0.0.1") as client:
+        return client.post("/v1/alerts/test", json={"actor": "ada", "reason": "new address"})
+
+
+def test_a_test_alert_says_what_the_receiver_answered(store: MapStore) -> None:
+    for status, answered in ((204, 200), (403, 502)):
+        with receiver(status) as (address, got):
+            sender = Webhook(AlertSettings(webhook=address))
+            answer = ask(store, sender)
+            sender.close()
+        assert (answer.status_code, len(got)) == (answered, 1), "tried once"
+        assert f"status {status}" in answer.json()["detail"]
+        (alert,) = json.loads(got[0][1])["alerts"]
+        assert alert["labels"]["alertname"] == "FleetmapTest"
+        line = store.audit_lines()[-1]
+        assert (line.kind, line.actor, line.reason) == ("alert_test", "ada", "new address")
+    refused = ask(store, None)
+    assert refused.status_code == 409
+    assert "`webhook` in [alerts]" in refused.json()["detail"]
