@@ -19,8 +19,9 @@ from markupsafe import Markup
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, UsageError
-from mapserver.api.guard import SIGN_IN, SIGN_OUT, GuardSettings
+from mapserver.api.guard import SIGN_IN, SIGN_OUT
 from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
+from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
@@ -33,7 +34,15 @@ from mapserver.serving.live_surveys import LiveSurveys
 T = TypeVar("T")
 
 PATH = "/dashboard"
-PAGES = {"": "Overview", "trends": "Trends", "map": "Map", "failures": "Failures", "surveys": "Surveys", "live": "Live"}
+PAGES = {
+    "": "Overview",
+    "trends": "Trends",
+    "map": "Map",
+    "failures": "Failures",
+    "surveys": "Surveys",
+    "live": "Live",
+    "administration": "Administration",
+}
 _UNDER = {"space": "map", "robots": ""}  # which of those leads to other pages
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 _WEEK_NS = 7 * 24 * HOUR_NS
@@ -43,12 +52,12 @@ _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, who is let in, surveys under way."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, settings of the API, surveys under way."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
-    guard: GuardSettings
+    settings: ApiSettings
     surveys: LiveSurveys
 
 
@@ -162,7 +171,7 @@ class Console:
             chosen = site if site in await load(under_way) else await load(self.services.maps.chosen_site, site)
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(_root(request), chosen, zone, request.query_params)
-            guard, ended = self.services.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
+            guard, ended = self.services.settings.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
 
             def event() -> bytes:
                 is_signed_in = getattr(request.state, "operator", None) is not None
@@ -224,7 +233,7 @@ class Console:
             "person": who,
             "sign_out": SIGN_OUT,
             "may_change": who is None or Scope.CHANGE in who.scopes,
-            "warning": self.services.guard.warning,
+            "warning": self.services.settings.guard.warning,
         }
         return HTMLResponse(
             TEMPLATES.get_template(template).render(frame | found), status, {"Cache-Control": "no-store"}

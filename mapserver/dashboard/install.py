@@ -11,6 +11,7 @@ from fleetmap.errors import FleetmapError, StateError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.version_routes import ApiSettings
 from mapserver.dashboard import (
+    administration,
     failure,
     failures,
     live_page,
@@ -36,14 +37,14 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         MapData(store, settings.gate, settings.canary.share),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
-        settings.guard,
+        settings,
         surveys,
     )
     pages = FastAPI(openapi_url=None)
     pages.add_middleware(GZipMiddleware, compresslevel=5)
     console = Console(pages, services)
     console.files()
-    for module in (overview, map_page, failures, failure, space_page, live_page, robot, survey_jobs):
+    for module in (overview, map_page, failures, failure, space_page, live_page, robot, survey_jobs, administration):
         module.install(console)
     console.nothing_else()
     _install_files(pages, services)

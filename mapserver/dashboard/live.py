@@ -101,7 +101,7 @@ class LiveRobots:
     """Reads the fleet at most about once a second, for any number of pages."""
 
     def __init__(self, fleet: Fleet, clock_s: Callable[[], float]) -> None:
-        self._fleet = fleet
+        self.fleet = fleet
         self._clock_s = clock_s
         self._lock = threading.Lock()
         self._cached: dict[str, tuple[float, LiveSite]] = {}
@@ -112,7 +112,7 @@ class LiveRobots:
             cached = self._cached.get(site)
             if cached is not None and self._clock_s() - cached[0] < _CACHED_S:
                 return cached[1]
-            robots = [live_robot(status) for status in self._fleet.robots(site)]
+            robots = [live_robot(status) for status in self.fleet.robots(site)]
             robots.sort(key=lambda robot: (ORDER.get(robot.tone, 1), robot.name))
             found = LiveSite(tuple(robots))
             self._cached[site] = (self._clock_s(), found)

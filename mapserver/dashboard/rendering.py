@@ -25,7 +25,7 @@ def size(number: int | None) -> str | None:
         if value < 1000:
             return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
         value /= 1000
-    return f"{value:.2f} GB"
+    return f"{value:.2f} GB" if value < 1000 else f"{value / 1000:.2f} TB"
 
 
 def share(value: float | None) -> str | None:
@@ -53,4 +53,11 @@ def _counted(found: Rate) -> str:
 
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")
 TEMPLATES = Environment(loader=_LOADER, autoescape=True, undefined=StrictUndefined)
-TEMPLATES.filters |= {"script_json": script_json, "age": age, "share": share, "rate": format_rate, "counted": _counted}
+TEMPLATES.filters |= {
+    "script_json": script_json,
+    "age": age,
+    "size": size,
+    "share": share,
+    "rate": format_rate,
+    "counted": _counted,
+}

@@ -1,5 +1,6 @@
 // Acts: a button names a request to the HTTP API; a dialog explains it and asks for the reason and, without sign-in, the name.
 // data-act: the address; data-body: more of the request's body, which a page may set; data-explains: what would change.
+// data-tells: the answer is shown in the dialog, where the page shows nothing of it.
 // data-needs-reason: without a reason nothing is sent. data-lacks: set by a page while something is missing; the dialog then says that instead.
 const dialog = document.createElement("dialog");
 dialog.className = "ask-box";
@@ -10,12 +11,12 @@ dialog.innerHTML = `<form><h2></h2><p></p>
 <div class="actions"><button class="plain confirm"></button> <button class="plain" type="button">No, change nothing</button></div></form>`;
 document.body.append(dialog);
 const form = dialog.querySelector("form");
-const [title, explanation, refusal] = ["h2", "p", ".notice"].map((found) => form.querySelector(found));
+const [title, explanation, notice] = ["h2", "p", ".notice"].map((found) => form.querySelector(found));
 const [confirm, refuse] = form.querySelectorAll("button");
 const isNamed = document.body.dataset.named === "true";
 let asked;
 
-const refused = (words) => ((refusal.textContent = words), (refusal.hidden = !words));
+const say = (words, tone) => ((notice.textContent = words), (notice.hidden = !words), (notice.className = `notice ${tone}`));
 
 document.addEventListener("click", ({ target }) => {
   const button = target.closest("[data-act]");
@@ -26,10 +27,11 @@ document.addEventListener("click", ({ target }) => {
   [title.textContent, explanation.textContent] = [`${words}?`, lacks || button.dataset.explains];
   confirm.textContent = `Yes: ${words}`;
   confirm.hidden = confirm.disabled = Boolean(lacks);
+  refuse.textContent = "No, change nothing";
   form.reason.value = "";
   form.reason.required = needsReason !== undefined;
   form.actor.parentElement.hidden = form.actor.disabled = isNamed;
-  refused("");
+  say("", "bad");
   dialog.showModal();
 });
 refuse.addEventListener("click", () => dialog.close());
@@ -42,8 +44,12 @@ form.addEventListener("submit", async (event) => {
   confirm.disabled = refuse.disabled = true;
   const answer = await fetch(act.dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body }).catch(() => undefined);
   confirm.disabled = refuse.disabled = false;
-  if (answer?.ok) return location.reload();
+  const tells = answer?.ok && act.dataset.tells !== undefined;
+  if (answer?.ok && !tells) return location.reload();
   const told = await answer?.json().catch(() => undefined);
   if (asked !== act) return; // a browser may close the dialog all the same
-  refused(told?.detail ?? "The server does not answer; try again.");
+  say(told?.detail ?? "The server does not answer; try again.", tells ? "good" : "bad");
+  if (!tells) return;
+  confirm.hidden = true;
+  refuse.textContent = "Close";
 });

@@ -13,6 +13,7 @@ from mapserver import releases
 from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.store import Actor, DraftContent, MapStore
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
+from support.fleet.webhook_receiver import receiver
 from support.storage.map_samples import draft_details
 
 
@@ -70,6 +71,24 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     opened(page, served, "map")
     change(page, page.get_by_role("button", name=re.compile("^Survey .* is done")).inner_text())
     expect(asked).to_have_count(0)
+    assert seen.faults == []
+
+
+def test_a_test_alert_is_sent_and_its_answer_told(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    MapStore.open(tmp_path / "store", create=True).close()
+    with receiver(204) as (address, got):
+        (tmp_path / "mapserver.toml").write_text(f'[alerts]\nwebhook = "{address}"\n')
+        with serving(tmp_path / "store", "--config", str(tmp_path / "mapserver.toml")) as served:
+            seen = opened(page, served, "administration", site="nowhere")
+            expect(page.get_by_role("list", name="Active alerts")).to_be_visible()
+            change(page, "Send a test alert")
+            dialog = page.get_by_role("dialog")
+            expect(dialog.get_by_role("alert")).to_have_text("127.0.0.1 accepted the test alert: status 204")
+            expect(dialog.get_by_role("button")).to_have_text(["Close"])
+            dialog.get_by_role("button", name="Close").click()
+            expect(dialog).to_have_count(0)
+    assert len(got) == 1
     assert seen.faults == []
 
 

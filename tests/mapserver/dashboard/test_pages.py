@@ -35,6 +35,7 @@ PAGES = {
     "robots/tug-7": "tug-7",
     "surveys": "Surveys of hall",
     "live": "Survey of hall",
+    "administration": "Administration",
 }
 
 

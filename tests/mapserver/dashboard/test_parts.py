@@ -18,6 +18,7 @@ from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers
+from mapserver.dashboard.administration import ending_row
 from mapserver.dashboard.console import PageContext
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData, trend_words
@@ -35,6 +36,7 @@ from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
+from mapserver.serving.server_health import Ending
 from mapserver.store import MapStore, TraceRow
 from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
 
@@ -70,6 +72,19 @@ def store(tmp_path: Path):
     fill_store(tmp_path)
     with MapStore.open(tmp_path) as opened:
         yield opened
+
+
+@pytest.mark.parametrize(
+    ("days", "fault", "shown"),
+    [
+        (40.0, "", ("Maps of hall", "good", "40 days", "renewed by the server itself")),
+        (0.2, "ends in 0.2 days: sign it again", ("Maps of hall", "warn", "5 h", "ends in 0.2 days: sign it again")),
+        (-1.0, "expired", ("Maps of hall", "bad", "ended", "expired")),
+        (None, "nothing was signed yet", ("Maps of hall", "bad", "unknown", "nothing was signed yet")),
+    ],
+)
+def test_what_ends_is_told_in_time(days: float | None, fault: str, shown: tuple[str, ...]) -> None:
+    assert ending_row(Ending("signed list", "site-hall", days, fault)) == shown
 
 
 def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:

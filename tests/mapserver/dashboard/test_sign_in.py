@@ -115,7 +115,18 @@ def test_the_sign_in_page_leads_nowhere_else(page: Page, served: Served) -> None
 def test_every_page_and_every_act_runs_under_the_policy(page: Page, served: Served) -> None:
     sign_in(page, served, "olga")
     seen = watch(page)
-    for path in ("", "trends", "failures", "failures/1", "live", "space", "robots/tug-7", "surveys", "map"):
+    for path in (
+        "",
+        "trends",
+        "failures",
+        "failures/1",
+        "live",
+        "space",
+        "robots/tug-7",
+        "surveys",
+        "administration",
+        "map",
+    ):
         answer = page.goto(f"{served.http}/dashboard/{path}")
         assert "unsafe" not in answer.headers["content-security-policy"]
         assert answer.headers["cache-control"] == "no-store", "the way back shows nothing to whoever comes after"

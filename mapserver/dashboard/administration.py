@@ -1,0 +1,87 @@
+"""The page of the server: is it well? Alerts, disk, what expires, for how long reports are kept."""
+
+import time
+from typing import NamedTuple
+
+from mapserver.dashboard.console import Console, Services
+from mapserver.dashboard.rendering import size
+from mapserver.fleet.alerts import active_alerts
+from mapserver.serving.server_health import Ending, ServerHealth, server_health
+
+_NAMES = {
+    "http": "Certificate of these pages",
+    "server.pem": "Certificate of the server for robots",
+    "servers-ca.crt": "Authority of servers",
+    "robots-ca.crt": "Authority of robots",
+    "root": "List of keys",
+    "targets": "List of sites",
+    "snapshot": "List of lists",
+    "timestamp": "Proof that lists are fresh",
+    "all": "Signed lists",
+}
+_RENEWED = "renewed by the server itself"
+_BY_SERVER = ("snapshot", "timestamp", "site-")
+
+
+class Row(NamedTuple):
+    """What expires, in words."""
+
+    name: str
+    tone: str
+    left: str
+    remark: str
+
+
+def install(console: Console) -> None:
+    """Adds the page."""
+    services = console.services
+    console.page("administration", "administration.html", lambda _: _page(services), of_site=False)
+
+
+def _page(services: Services) -> dict[str, object]:
+    store, settings, now_ns = services.maps.store, services.settings, time.time_ns()
+    found = server_health(store, services.robots.fleet, settings.ingest, settings.certificate)
+    kept = found.retention
+    return {
+        "alerts": active_alerts(store, services.robots.fleet, settings.alerts, now_ns),
+        "now_ns": now_ns,
+        "webhook": settings.webhook,
+        "found": found,
+        "facts_of_server": [("Version", found.fleetmap), ("Memory", size(found.memory_bytes))],
+        "disk": _disk(found),
+        "endings": [ending_row(ending) for ending in found.endings],
+        "retention": [
+            ("Figures by the hour", f"{kept.tally_days:g} days"),
+            ("Failures", f"{kept.failure_days:g} days, {kept.failures_per_robot} of a robot"),
+            ("Their pictures", f"the newest {size(kept.picture_bytes)}"),
+            ("Their recordings", f"the newest {size(found.replay_bytes)}"),
+            ("Ways of robots", f"{kept.trace_days:g} days"),
+            ("Versions of maps", "until somebody runs mapserver gc"),
+        ],
+    }
+
+
+def _disk(found: ServerHealth) -> list[tuple[str, str, int]]:
+    """Shades, names and bytes of the disk's parts, the free one last."""
+    used, own = found.store, list[tuple[str, str, int]]()
+    if used is not None:
+        own = [
+            ("shade-0", "Maps", used.maps_bytes),
+            ("shade-1", "Pictures of failures", used.pictures_bytes),
+            ("shade-2", "Recordings of failures", used.recordings_bytes),
+            ("shade-3", "Rest of the database", used.database_bytes),
+        ]
+    others = found.disk.total_bytes - found.disk.free_bytes - sum(part for _, _, part in own)
+    named = "Everything else on this disk" if own else "Used"
+    return [*own, ("shade-5", named, max(0, others)), ("free", "Free", found.disk.free_bytes)]
+
+
+def ending_row(ending: Ending) -> Row:
+    """Name, tone, time left and remark; who only has to wait for the server is told so."""
+    name = _NAMES.get(ending.name) or f"Maps of {ending.name.removeprefix('site-')}"
+    remark = ending.fault or (_RENEWED if ending.name.startswith(_BY_SERVER) else "")
+    days = ending.days_left
+    if days is None:
+        return Row(name, "bad", "unknown", remark)
+    left = "ended" if days <= 0 else f"{24 * days:.0f} h" if days < 2 else f"{days:.0f} days"
+    return Row(name, "good" if not ending.fault else "warn" if days > 0 else "bad", left, remark)
