@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Screenshots of a running dashboard: fleet.png and map.png.
+# Screenshots of pages of a running console: OUT/dashboard-PAGE.png.
 #
-#   deploy/dashboard_pictures.sh HTTP OUT SITE
+#   deploy/dashboard_pictures.sh HTTP OUT SITE PAGE...
 #
-# HTTP: address of the server. Without Chromium or Chrome it prints a note and exits with status 0.
+# HTTP: address of the server. PAGE: overview, map, failures, ... Without Chromium or Chrome it prints a note and exits with status 0.
 set -euo pipefail
 http=$1 out=$2 site=$3
+shift 3
 WITHIN_S=30
 
 browser=
@@ -19,12 +20,12 @@ fi
 
 profile=$(mktemp -d)
 trap 'rm -rf "$profile"' EXIT
-options=(--headless=new --hide-scrollbars --window-size=1280,1400 --user-data-dir="$profile" --timeout=4000)
+options=(--headless=new --hide-scrollbars --window-size=1440,900 --user-data-dir="$profile" --timeout=4000)
 # The browser's sandbox is not available to root; it opens only the server of this demo.
 ((EUID != 0)) || options+=(--no-sandbox)
-for page in fleet map; do
+for page in "$@"; do
   path=$page
-  [[ $page != fleet ]] || path=
+  [[ $page != overview ]] || path=
   picture=$out/dashboard-$page.png
   if timeout "$WITHIN_S" "$browser" "${options[@]}" --screenshot="$picture" "$http/dashboard/$path?site=$site" >"$profile/log" 2>&1 \
     && [[ -s $picture ]]; then

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# The whole workflow. Without a recording: a simulated warehouse is surveyed, mapped and served, and two robots of the next day, after
-# stock has moved, drive in it: their daemons (`locclient run`) play the recordings in real time as sensors, while the console is up, and
-# replays of the same recordings give the figures. With one: half of its frames become the map, the other half is localized in it.
+# The whole workflow, with the console up from the beginning. Without a recording: a simulated warehouse is surveyed and mapped, and two
+# robots of the next day, after stock has moved, drive in it, and a third is carried away: their daemons (`locclient run`) play the
+# recordings in real time as sensors, and replays of the same recordings give the figures. With one: half of its frames become the map,
+# the other half is localized in it.
 #
 #   deploy/demo.sh [--check] [RECORDING]      (run by `make demo`; --check only checks RECORDING)
 #
@@ -43,7 +44,7 @@ stop_server() {
 }
 
 start_server() {
-  "$BIN/mapserver" serve --store "$OUT/store" --http 127.0.0.1:0 --zenoh tcp/127.0.0.1:0 >"$OUT/server.log" 2>&1 &
+  "$BIN/mapserver" serve --create --store "$OUT/store" --http 127.0.0.1:0 --zenoh tcp/127.0.0.1:0 >"$OUT/server.log" 2>&1 &
   server_pid=$!
   local deadline=$((SECONDS + READY_WITHIN_S))
   until grep -qx ready "$OUT/server.log"; do
@@ -53,6 +54,10 @@ start_server() {
   done
   http=$(sed -n 's/^http: //p' "$OUT/server.log")
   zenoh=$(sed -n 's/^zenoh: //p' "$OUT/server.log")
+  printf '\nThe console, to watch all of it: %s/dashboard/?site=demo\n' "$http"
+  if [[ -t 1 && -n ${DISPLAY:-}${WAYLAND_DISPLAY:-} ]] && command -v xdg-open >/dev/null; then
+    xdg-open "$http/dashboard/?site=demo" >/dev/null 2>&1 || true
+  fi
 }
 
 if [[ ${1:-} == --check ]]; then
@@ -73,10 +78,11 @@ build() {
     --picture "$OUT/build.png"
   say "publishing it"
   "$BIN/mapserver" publish --site demo --store "$OUT/store" ${publish_options[@]+"${publish_options[@]}"}
-  say "serving it"
-  start_server
-  printf 'http %s, zenoh %s\n' "$http" "$zenoh"
 }
+
+# A person at a terminal looks at the console; everybody else gets pictures.
+is_watched() { [[ -t 0 && -t 1 ]]; }
+pictures() { deploy/dashboard_pictures.sh "$http" "$OUT" demo "$@"; }
 
 # Runs a robot's daemon on a recording instead of sensors; speed: 1 in real time, 0 as fast as possible.
 drive() {
@@ -111,8 +117,8 @@ replay() {
 }
 
 record() {
-  local robot=$1 day=$2
-  "$BIN/fleetsim" record small-loop --out "$OUT/$robot.mcap" --seed "$SEED" --day "$day" --robot "$robot"
+  local scenario=$1 robot=$2 day=$3
+  "$BIN/fleetsim" record "$scenario" --out "$OUT/$robot.mcap" --seed "$SEED" --day "$day" --robot "$robot"
 }
 
 half_of() {
@@ -126,22 +132,23 @@ half_of() {
   drive demo-robot "$1" 0
   replay demo-robot "$1" --frames 1::2
   drives_ended
+  is_watched || pictures overview map
   reports=("$OUT/demo-robot.json")
 }
 
 warehouse() {
   local robot number
   say "a survey robot drives through a simulated warehouse"
-  record survey 0
+  record small-loop survey 0
   say "building a map of the survey; meanwhile it is the next day and two robots drive, stock has moved"
-  (for robot in "${ROBOTS[@]}"; do record "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
+  (for robot in "${ROBOTS[@]}"; do record small-loop "$robot" 1; done && record clip carried 1) >"$OUT/robots.log" 2>&1 &
   robots_pid=$!
   build "$OUT/survey.mcap" --frame-from-ground-truth
   say "the robots come home with their recordings"
   wait "$robots_pid" || { cat "$OUT/robots.log" >&2; fail "recording the robots failed"; }
-  say "${ROBOTS[*]} drive in yesterday's map, in real time; meanwhile their recordings are replayed for the figures"
+  say "${ROBOTS[*]} drive in yesterday's map, in real time, and one is carried away; meanwhile the recordings are replayed for the figures"
   reports=()
-  for robot in "${ROBOTS[@]}"; do
+  for robot in "${ROBOTS[@]}" carried; do
     drive "$robot" "$OUT/$robot.mcap" 1
   done
   for robot in "${ROBOTS[@]}"; do
@@ -149,7 +156,12 @@ warehouse() {
     replay_pids+=("$!")
     reports+=("$OUT/$robot.json")
   done
+  if ! is_watched; then
+    "$BIN/python" deploy/demo_report.py driving "$http/v1/robots"
+    pictures overview map
+  fi
   drives_ended
+  is_watched || pictures failures
   for number in "${!ROBOTS[@]}"; do
     robot=${ROBOTS[$number]}
     wait "${replay_pids[$number]}" || { cat "$OUT/$robot.log" >&2; fail "$robot could not be localized"; }
@@ -157,17 +169,15 @@ warehouse() {
   done
 }
 
+start_server
 if [[ -n $recording ]]; then half_of "$recording"; else warehouse; fi
 
 say "the result"
 "$BIN/python" deploy/demo_report.py table "$OUT/build.json" "${reports[@]}"
 
-dashboard=$http/dashboard/?site=demo
-if [[ -t 0 && -t 1 ]]; then
-  printf '\nAll of it took %d s. The dashboard is at %s until you press Enter. ' "$SECONDS" "$dashboard"
+if is_watched; then
+  printf '\nAll of it took %d s. The console is at %s/dashboard/?site=demo until you press Enter. ' "$SECONDS" "$http"
   read -r || true
-else
-  deploy/dashboard_pictures.sh "$http" "$OUT" demo
 fi
 stop_server || fail "the server did not end cleanly; see $OUT/server.log"
 printf '\nPictures, reports and trajectories are in %s; all of it took %d s.\n' "$OUT" "$SECONDS"

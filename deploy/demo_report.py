@@ -1,7 +1,8 @@
-"""Output of the demo: ground truth of a recording (yes or no), robots of the server, table of results."""
+"""Output of the demo: ground truth of a recording (yes or no), robots of the server, when they drive, table of results."""
 
 import json
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 Report = dict[str, Any]
+_WAIT_S = 60
 
 # Title, path of the key in the report, factor, format of the value with its unit.
 BUILD_ROWS = (
@@ -78,10 +80,24 @@ def has_truth(recording: Path) -> bool:
         return source.ground_truth is not None
 
 
+def robots_at(url: str) -> list[Report]:
+    """Return what the server tells of its robots."""
+    with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
+        return json.load(answer)["robots"]
+
+
+def wait_for_drive(url: str) -> None:
+    """Wait until a robot knows its place; SystemExit if none does."""
+    for _ in range(_WAIT_S):
+        if any((robot["last_health"] or {}).get("status") == "TRACKING" for robot in robots_at(url)):
+            return
+        time.sleep(1.0)
+    raise SystemExit(f"demo: no robot at {url} knew its place within {_WAIT_S} s; see the logs of the robots")
+
+
 def show_robots(console: Console, url: str) -> None:
     """Print one line for each robot; SystemExit without any, because one has just reported."""
-    with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
-        robots = json.load(answer)["robots"]
+    robots = robots_at(url)
     if not robots:
         raise SystemExit(f"demo: {url} shows no robot, though one has just run; see the server's log")
     for robot in robots:
@@ -96,7 +112,7 @@ def show_robots(console: Console, url: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Run one of: has-truth RECORDING, robots URL, table BUILD.json REPLAY.json...."""
+    """Run one of: has-truth RECORDING, driving URL, robots URL, table BUILD.json REPLAY.json...."""
     console = Console(width=78)
     match arguments:
         case ["has-truth", recording]:
@@ -107,6 +123,8 @@ def main(arguments: list[str]) -> None:
             except FleetmapError as error:
                 print(f"demo: {error}", file=sys.stderr)
                 sys.exit(error.exit_status)
+        case ["driving", url]:
+            wait_for_drive(url)
         case ["robots", url]:
             show_robots(console, url)
         case ["table", build, *replays]:
@@ -114,7 +132,9 @@ def main(arguments: list[str]) -> None:
             robots = [json.loads(Path(replay).read_text("utf-8")) for replay in replays]
             console.print(table_of([Path(replay).stem for replay in replays], robots, REPLAY_ROWS))
         case _:
-            sys.exit("usage: demo_report.py has-truth RECORDING | robots URL | table BUILD.json REPLAY.json...")
+            sys.exit(
+                "usage: demo_report.py has-truth RECORDING | driving URL | robots URL | table BUILD.json REPLAY.json..."
+            )
 
 
 if __name__ == "__main__":

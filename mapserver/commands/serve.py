@@ -131,6 +131,7 @@ def serve(
         str,
         typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
     ] = "tcp/127.0.0.1:7447",
+    create: Annotated[bool, typer.Option("--create", help="Make the store if the folder holds none.")] = False,
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, exits with status 0 on SIGTERM or SIGINT."""
@@ -148,7 +149,7 @@ def serve(
     certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
     # The sockets are opened before the store is read, so an invalid address is reported at once.
     proxies = (_LOOPBACK if at.http_name else frozenset()) | (proxy.addresses if proxy else frozenset())
-    with _listening(host, port, proxies) as listener, open_store(store) as maps:
+    with _listening(host, port, proxies) as listener, open_store(store, create=create) as maps:
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)

@@ -18,12 +18,16 @@ def test_pictures_show_the_pages(tmp_path: Path) -> None:
     fill_store(tmp_path)
     with serving(tmp_path) as served:
         done = subprocess.run(
-            [SCRIPT, served.http, tmp_path, "hall"], check=False, capture_output=True, text=True, timeout=90
+            [SCRIPT, served.http, tmp_path, "hall", "overview", "map"],
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=90,
         )
     assert (done.returncode, done.stdout.count("picture of the dashboard")) == (0, 2), done
-    for page in ("fleet", "map"):
+    for page in ("overview", "map"):
         picture = cv2.imread(str(tmp_path / f"dashboard-{page}.png"), cv2.IMREAD_GRAYSCALE)
-        assert picture.shape == (1400, 1280)
+        assert picture.shape == (900, 1440)
         rows = (picture.std(axis=1) > 1).mean()
         assert rows > 0.3, "a page that is empty or broken has few rows with anything in them"
 
@@ -32,7 +36,7 @@ def test_without_a_browser_it_says_so(tmp_path: Path) -> None:
     for tool in ("bash", "env"):
         (tmp_path / tool).symlink_to(f"/usr/bin/{tool}")
     done = subprocess.run(
-        [SCRIPT, "http://127.0.0.1:9", tmp_path, "hall"],
+        [SCRIPT, "http://127.0.0.1:9", tmp_path, "hall", "map"],
         check=False,
         capture_output=True,
         text=True,
