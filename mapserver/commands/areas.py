@@ -17,31 +17,25 @@ def import_(
     by: ActorOptions,
 ) -> None:
     """Replace the areas of the site by those of FILE; reports, pages and metrics then use them."""
-    from fleetmap.mapformat.building import AREAS
-    from mapserver.floor_plan.areas import MAX_AREAS_BYTES, read_areas
-    from mapserver.grid.masks import check_masks_on_map
+    from mapserver.fleet.building import keep_areas
+    from mapserver.floor_plan.areas import MAX_AREAS_BYTES
 
     with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
         data = opened.read(MAX_AREAS_BYTES + 1)
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
     with open_store(where.store) as maps:
-        alignment, current = maps.alignment(where.site), maps.current(where.site)
-        if current is not None:
-            areas = read_areas(data, None if alignment is None else alignment.frame)
-            check_masks_on_map(areas, maps.manifest(where.site, current.version))
-        maps.keep_site_files(where.site, {AREAS: data}, f"areas of {file.name}", actor=by.named())
-        names = maps.areas(where.site).names
+        names = keep_areas(maps, where.site, data, f"areas of {file.name}", by.named()).names
     typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
 
 
 @expand_options
 def remove(where: SiteOptions, by: ActorOptions) -> None:
     """Delete the areas of a site; their past counts stay."""
-    from fleetmap.mapformat.building import AREAS
+    from mapserver.fleet.building import keep_areas
 
     with open_store(where.store) as maps:
-        maps.keep_site_files(where.site, {AREAS: None}, "no areas", actor=by.named())
+        keep_areas(maps, where.site, None, "no areas", by.named())
     typer.echo(f"site {where.site} has no areas")
 
 

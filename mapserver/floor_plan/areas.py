@@ -24,6 +24,7 @@ MAX_AREAS_BYTES = 8 << 20
 _MAX_AREAS, _MAX_CORNERS, _MAX_RING = 2000, 50_000, 2000
 _MAX_NAME = 64
 _MAX_M = 1e6
+_EDGES_AT_ONCE = 64
 _SAMPLES = 16  # sample points of a tile each way
 _LEAST_SHARE = 0.1  # smallest share of a tile for an area to name it
 _NAMED = 3
@@ -88,18 +89,19 @@ class Area:
 
 @dataclass(frozen=True, slots=True)
 class Areas:
-    """Areas, the smallest first: the smallest one that contains a position gives its name."""
+    """Areas, the smallest first: the smallest one that contains a position gives its name. frame: in which they were drawn."""
 
     areas: tuple[Area, ...] = ()
+    frame: Literal["map", "building"] = "map"
     _boxes_m: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     @classmethod
-    def of(cls, areas: Sequence[Area]) -> "Areas":
+    def of(cls, areas: Sequence[Area], frame: Literal["map", "building"] = "map") -> "Areas":
         """Sort the areas."""
         ordered = tuple(sorted(areas, key=lambda area: (area.size_m2, area.name)))
         corners = [np.concatenate(area.rings) for area in ordered]
         boxes = [(*points.min(axis=0), *points.max(axis=0)) for points in corners]
-        return cls(ordered, np.array(boxes, float).reshape(-1, 4))
+        return cls(ordered, frame, np.array(boxes, float).reshape(-1, 4))
 
     def __bool__(self) -> bool:
         return bool(self.areas)
@@ -141,18 +143,24 @@ class Areas:
             return text
         return _TILE.sub(lambda found: self.tile_words((int(found[1]), int(found[2])), size_m), text)
 
-    def geojson(self, site: str) -> dict[str, Any]:
-        """Return all areas in `map`; a polygon for each ring, holes included."""
+    def geojson(self, site: str, building: BuildingFrame | None = None) -> dict[str, Any]:
+        """Return all areas, in `map` or in the building; each one's rings are one polygon, holes included."""
+        frame, target_from_map = "map", np.eye(4)
+        if building is not None:
+            frame, target_from_map = "building", building.building_from_map
         features = [
             {
                 "type": "Feature",
-                "geometry": {"type": "Polygon", "coordinates": [_closed(ring) for ring in area.rings]},
+                "geometry": {
+                    "type": "Polygon",
+                    "coordinates": [_closed(_moved(ring, target_from_map)) for ring in area.rings],
+                },
                 "properties": {"name": area.name}
                 | ({} if area.mask is None else {"mask": area.mask, "percent": area.percent}),
             }
             for area in self.areas
         ]
-        return {"type": "FeatureCollection", "site": site, "frame": "map", "units": "metres", "features": features}
+        return {"type": "FeatureCollection", "site": site, "frame": frame, "units": "metres", "features": features}
 
     def _near(self, box_m: tuple[float, ...]) -> list[Area]:
         """Return the areas whose boxes meet a box (low x, low y, high x, high y)."""
@@ -200,7 +208,7 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
         if corners > _MAX_CORNERS:
             raise UsageError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
         areas[area.name] = area
-    return Areas.of(list(areas.values()))
+    return Areas.of(list(areas.values()), collection.frame)
 
 
 def _area(feature: _Feature, map_from_building: Array | None) -> Area:
@@ -218,7 +226,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
     if not rings:
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     if map_from_building is not None:
-        rings = [transform_points(map_from_building, np.c_[ring, np.zeros(len(ring))])[:, :2] for ring in rings]
+        rings = [_moved(ring, map_from_building) for ring in rings]
     return Area(name, tuple(rings), mask, percent)
 
 
@@ -251,28 +259,35 @@ def _doubled_area(ring: Array) -> float:
 
 def _crossing(ring: Array) -> int | None:
     """Return a corner whose edge meets another edge that is not its neighbour, None in a simple ring."""
-    following = np.roll(ring, -1, axis=0)
+    following, count = np.roll(ring, -1, axis=0), len(ring)
+    low, high = np.minimum(ring, following), np.maximum(ring, following)
 
     def side(start: Array, end: Array, point: Array) -> Array:
         along, to = end - start, point - start
         return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
 
-    count = len(ring)
-    for n in range(count - 1):
-        others = np.arange(n + 1, count)
-        a, b = ring[n], following[n]
-        c, d = ring[others], following[others]
+    for begin in range(0, count, _EDGES_AT_ONCE):
+        block = np.s_[begin : begin + _EDGES_AT_ONCE]
+        near_x, near_y = (
+            (low[block, axis, None] <= high[:, axis]) & (high[block, axis, None] >= low[:, axis]) for axis in (0, 1)
+        )
+        n, others = np.nonzero(np.triu(near_x & near_y, begin + 1))
+        n += begin
+        a, b, c, d = ring[n], following[n], ring[others], following[others]
         sides = [np.sign(side(a, b, c)), np.sign(side(a, b, d)), np.sign(side(c, d, a)), np.sign(side(c, d, b))]
         apart = (sides[0] * sides[1] > 0) | (sides[2] * sides[3] > 0)
-        in_line = np.all([values == 0 for values in sides], axis=0)
-        low, high = np.minimum(a, b), np.maximum(a, b)
-        apart |= in_line & ((np.maximum(c, d) < low) | (np.minimum(c, d) > high)).any(axis=1)
         # Neighbours share a corner; they meet elsewhere only if one runs back along the other.
+        in_line = np.all([values == 0 for values in sides], axis=0)
         shares = (others == n + 1) | ((n == 0) & (others == count - 1))
         runs_back = in_line & (((b - a) * (d - c)).sum(axis=1) < 0)
-        if (np.where(shares, runs_back, ~apart)).any():
-            return n
+        crossing = np.where(shares, runs_back, ~apart)
+        if crossing.any():
+            return int(n[crossing][0])
     return None
+
+
+def _moved(ring: Array, target_from_source: Array) -> Array:
+    return transform_points(target_from_source, np.c_[ring, np.zeros(len(ring))])[:, :2]
 
 
 def _closed(ring: Array) -> list[list[float]]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import MapFormatError, NewerFormatError, StateError, StoreError, disk_errors
+from fleetmap.errors import ChangedError, MapFormatError, NewerFormatError, StateError, StoreError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import (
     BlobEntry,
@@ -166,17 +166,28 @@ class MapStore(StoreQueries):
         return draft
 
     def keep_site_files(
-        self, site: str, files: Mapping[str, bytes | None], detail: str, *, actor: Actor = NOBODY
+        self,
+        site: str,
+        files: Mapping[str, bytes | None],
+        detail: str,
+        *,
+        actor: Actor = NOBODY,
+        areas_tag: str | None = None,
     ) -> None:
         """Store files of a site beside its versions, by kind, in one transaction; None deletes a kind. detail: for the log.
 
         Failures get the area names valid then. Raises UsageError for an unknown site, for invalid areas and for areas
-        without the alignment that they need, StoreError on a disk error.
+        without the alignment that they need, ChangedError if the areas have another tag than areas_tag (None: any), StoreError
+        on a disk error.
         """
         self._check_site(site)
         with self._locked(shared=True):
             addresses = {kind: self._blobs.put(data) for kind, data in files.items() if data is not None}
             with self._transactions.write() as connection:
+                if areas_tag not in (None, self.areas_tag(site)):
+                    raise ChangedError(
+                        f"the areas of site {site} were changed meanwhile; load them anew, and make the change again"
+                    )
                 connection.executemany("DELETE FROM site_files WHERE site = ? AND kind = ?", [(site, k) for k in files])
                 rows = [(site, kind, sha256) for kind, sha256 in addresses.items()]
                 connection.executemany("INSERT INTO site_files (site, kind, sha256) VALUES (?, ?, ?)", rows)

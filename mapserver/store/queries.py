@@ -10,7 +10,7 @@ import msgspec
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StoreError, UsageError
-from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest
+from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest, sha256_hex
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
@@ -174,14 +174,20 @@ class StoreQueries:
 
     def areas(self, site: str) -> Areas:
         """Return the named areas of a site, in `map` by the present alignment; empty if absent. UsageError if an alignment is missing."""
-        query = "SELECT sha256 FROM site_files WHERE site = ? AND kind IN (?, ?) ORDER BY kind"
-        key = tuple(row["sha256"] for row in self._transactions.query(query, (site, AREAS, ALIGNMENT)))
-        known = self._areas.get(site)
+        key, known = self._area_files(site), self._areas.get(site)
         if known is None or known[0] != key:
             data, alignment = self.site_file(site, AREAS), self.alignment(site)
             frame = None if alignment is None else alignment.frame
             known = self._areas[site] = (key, Areas() if data is None else read_areas(data, frame))
         return known[1]
+
+    def areas_tag(self, site: str) -> str:
+        """Return a hash that changes with the areas of a site and with their place in `map`."""
+        return sha256_hex(" ".join(self._area_files(site)).encode())
+
+    def _area_files(self, site: str) -> tuple[str, ...]:
+        query = "SELECT sha256 FROM site_files WHERE site = ? AND kind IN (?, ?) ORDER BY kind"
+        return tuple(row["sha256"] for row in self._transactions.query(query, (site, AREAS, ALIGNMENT)))
 
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
         """Return the gate's verdicts on a version, oldest first; raises UsageError if it does not exist."""

@@ -3,6 +3,7 @@
 FleetmapError                      exit status 3
 ├── UsageError                     exit status 2: an invalid command line or setting
 │   └── StateError                 a request that does not fit the current state
+│       └── ChangedError           a change of what somebody else changed since it was looked at
 ├── RecordingError                 a recording that cannot be read or contradicts itself
 │   └── CalibrationError           missing or impossible calibration
 ├── SurveyError                    a recording from which no correct map can be made
@@ -38,6 +39,10 @@ class UsageError(FleetmapError):
 
 class StateError(UsageError):
     """A request that does not fit the current state, such as promoting a draft."""
+
+
+class ChangedError(StateError):
+    """A change of what somebody else changed since it was looked at."""
 
 
 class RecordingError(FleetmapError):

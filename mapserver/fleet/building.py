@@ -1,0 +1,92 @@
+"""Operators' knowledge of a site's building: its named areas, and the pose of the map in its floor plan. Both are kept with the site."""
+
+from collections.abc import Sequence
+from math import degrees
+from typing import Any
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import StateError
+from fleetmap.geometry import Array
+from fleetmap.mapformat.building import ALIGNMENT, AREAS
+from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
+from mapserver.floor_plan.areas import Areas, read_areas
+from mapserver.floor_plan.pins import Fit, Pin, fit_pins
+from mapserver.floor_plan.plan_file import PlanFile, upwards
+from mapserver.grid.masks import check_masks_on_map
+from mapserver.store import Actor, MapStore
+
+
+def keep_areas(
+    store: MapStore, site: str, data: bytes | None, detail: str, actor: Actor, *, tag: str | None = None
+) -> Areas:
+    """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log.
+
+    tag: `areas_tag` of the areas that were looked at, None for any. UsageError for an unknown site, for invalid areas and for a mask
+    outside of the map, ChangedError if somebody changed them since.
+    """
+    current, alignment = store.current(site), store.alignment(site)
+    if data is not None and current is not None:
+        areas = read_areas(data, None if alignment is None else alignment.frame)
+        check_masks_on_map(areas, store.manifest(site, current.version))
+    store.keep_site_files(site, {AREAS: data}, detail, actor=actor, areas_tag=tag)
+    return store.areas(site)
+
+
+def change_areas(store: MapStore, site: str, geojson: dict[str, Any], actor: Actor, *, tag: str | None) -> Areas:
+    """Replace the areas of a site by those of a request, which removes them if it has no features; errors as of `keep_areas`.
+
+    Where the areas are drawn in the building, those of `map` are kept there, too: they move with the alignment.
+    """
+    alignment, before, data = store.alignment(site), store.areas(site), None
+    frame, after = None if alignment is None else alignment.frame, Areas()
+    if geojson.get("features") != []:
+        data = to_json(geojson)
+        after = read_areas(data, frame)
+        if before.frame == "building" and after.frame == "map":
+            data = to_json(after.geojson(site, frame))
+    named = [("added", after, before), ("removed", before, after)]
+    words = [f"{done} {', '.join(sorted({*these.names} - {*others.names}))}" for done, these, others in named]
+    detail = "; ".join(word for word in words if not word.endswith(" ")) or "changed"
+    return keep_areas(store, site, data, detail[:2000], actor, tag=tag)
+
+
+def align(
+    store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None, actor: Actor
+) -> tuple[Alignment, Fit]:
+    """Estimate the pose of a site's map in the drawing of its building from pins, and keep it with the drawing (None: pins alone).
+
+    metres_per_pixel: of the drawing, None to estimate it. StateError without a current version, UsageError for pins that give no pose.
+    """
+    drawn = upwards(list(pins)) if plan is None else plan.drawn(list(pins))
+    fit = fit_pins(drawn, metres_per_pixel, current_corners_m(store, site))
+    found = Alignment(
+        frame=fit.frame,
+        metres_per_unit=fit.metres_per_unit,
+        method="pins",
+        plan=None if plan is None else plan.name,
+        off_m=fit.off_m,
+    )
+    files = {ALIGNMENT: encode_alignment(found), PLAN: None if plan is None else plan.data}
+    store.keep_site_files(site, files, alignment_words(found), actor=actor)
+    return found, fit
+
+
+def forget_alignment(store: MapStore, site: str, actor: Actor) -> None:
+    """Remove the alignment and the drawing of a site; robots use the alignment of their version. UsageError while areas need it."""
+    store.keep_site_files(site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=actor)
+
+
+def current_corners_m(store: MapStore, site: str) -> Array:
+    """Return the corners (4, 2) of the current version. Its frame is that of the pins; a first draft has its own frame."""
+    current = store.current(site)
+    if current is None:
+        raise StateError(f"site {site} has no current version to align; publish one first")
+    return map_corners_m(store.manifest(site, current.version))
+
+
+def alignment_words(found: Alignment) -> str:
+    """Return an alignment as a sentence."""
+    frame = found.frame
+    turned = f"turned by {degrees(frame.yaw_rad):.3f} degrees +- {degrees(frame.sigma_rad):.3f}"
+    at = f"the map's origin at {frame.x_m:.3f}, {frame.y_m:.3f} m of the building"
+    return f"by {found.method}: {at}, {turned}, {found.metres_per_unit:.6g} m per unit of the plan"
