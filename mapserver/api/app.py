@@ -18,6 +18,7 @@ from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
 from mapserver.api import describe, problems, views
 from mapserver.api import parameters as p
+from mapserver.api.building_routes import install_building_routes
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
@@ -68,6 +69,7 @@ def create_app(
     install_version_routes(app, store, settings)
     install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
     install_server_routes(app, store, fleet, settings)
+    install_building_routes(app, store)
     describe.install(app)
     return app
 

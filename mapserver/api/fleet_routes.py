@@ -113,12 +113,6 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
         response.headers["Content-Disposition"] = f'attachment; filename="failure-{number}.mcap"'
         return response
 
-    @app.get("/v1/sites/{site}/areas")
-    def areas(site: p.Site) -> dict[str, Any]:
-        """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
-        store.current(site)  # raises for an unknown site
-        return store.areas(site).geojson(site)
-
     @app.get("/v1/sites/{site}/resurvey")
     def resurvey(site: p.Site) -> ResurveyList:
         """Tiles to resurvey, the most urgent first, each with its reasons, and a route through them."""

@@ -9,11 +9,20 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from fleetmap.errors import FleetmapError, GateRefusedError, MapFormatError, StateError, StoreError, UsageError
+from fleetmap.errors import (
+    ChangedError,
+    FleetmapError,
+    GateRefusedError,
+    MapFormatError,
+    StateError,
+    StoreError,
+    UsageError,
+)
 
 _log = logging.getLogger(__name__)
 
 _STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
+    (ChangedError, HTTPStatus.PRECONDITION_FAILED),
     (StateError, HTTPStatus.CONFLICT),
     (UsageError, HTTPStatus.NOT_FOUND),  # the path names an unknown site or version
     (GateRefusedError, HTTPStatus.CONFLICT),

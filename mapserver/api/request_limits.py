@@ -1,6 +1,7 @@
 """Limits on requests, checked first: before the body is stored or a token is read."""
 
 import asyncio
+import re
 from contextlib import suppress
 
 from starlette.requests import ClientDisconnect
@@ -8,9 +9,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapserver.api.guard import SIGN_IN
 from mapserver.api.problems import problem
+from mapserver.floor_plan.areas import MAX_AREAS_BYTES
+from mapserver.floor_plan.plan_file import MAX_PLAN_BYTES
 from mapserver.serving.http_connections import MAX_HEAD_BYTES
 
 MAX_BODY_BYTES = 1 << 20  # an action has about 100 bytes
+_FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES}
+_FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment)")
 SIGN_IN_BYTES = 4 << 10  # accepted without authentication
 BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
 
@@ -34,6 +39,8 @@ class RequestLimits:
         head_bytes += sum(len(name) + len(value) + 4 for name, value in scope["headers"])
         is_sign_in = scope["path"] == SIGN_IN
         most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if is_sign_in else (MAX_BODY_BYTES, BODY_S)
+        if scope["method"] == "PUT" and (file := _FILE.fullmatch(scope["path"])):
+            most_bytes = _FILE_BYTES[file[1]]
         too_large = 413, f"the body has more than {most_bytes} bytes"
         stated = dict(scope["headers"]).get(b"content-length", b"0")
         if head_bytes > MAX_HEAD_BYTES:

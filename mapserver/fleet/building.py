@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from math import degrees
-from typing import Any
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError
@@ -32,22 +31,16 @@ def keep_areas(
     return store.areas(site)
 
 
-def change_areas(store: MapStore, site: str, geojson: dict[str, Any], actor: Actor, *, tag: str | None) -> Areas:
-    """Replace the areas of a site by those of a request, which removes them if it has no features; errors as of `keep_areas`.
-
-    Where the areas are drawn in the building, those of `map` are kept there, too: they move with the alignment.
-    """
-    alignment, before, data = store.alignment(site), store.areas(site), None
-    frame, after = None if alignment is None else alignment.frame, Areas()
-    if geojson.get("features") != []:
-        data = to_json(geojson)
-        after = read_areas(data, frame)
-        if before.frame == "building" and after.frame == "map":
-            data = to_json(after.geojson(site, frame))
-    named = [("added", after, before), ("removed", before, after)]
-    words = [f"{done} {', '.join(sorted({*these.names} - {*others.names}))}" for done, these, others in named]
-    detail = "; ".join(word for word in words if not word.endswith(" ")) or "changed"
-    return keep_areas(store, site, data, detail[:2000], actor, tag=tag)
+def replace_areas(store: MapStore, site: str, data: bytes, actor: Actor, *, tag: str | None) -> Areas:
+    """As `keep_areas`, with the names in the log. Areas that were drawn in the building stay in its frame: they move with the alignment."""
+    alignment, before = store.alignment(site), store.areas(site)
+    frame = None if alignment is None else alignment.frame
+    after = read_areas(data, frame)
+    if before.frame == "building" and after.frame == "map":
+        data = to_json(after.geojson(site, frame))
+    added, removed = (sorted({*these.names} - {*others.names}) for these, others in ((after, before), (before, after)))
+    words = [f"{done} {', '.join(names)}" for done, names in (("added", added), ("removed", removed)) if names]
+    return keep_areas(store, site, data, "; ".join(words)[:2000] or "changed", actor, tag=tag)
 
 
 def align(

@@ -54,7 +54,7 @@ def parse_pin(text: str) -> Pin:
     """Parse NAME=px,py:mx,my. UsageError for invalid text."""
     match = _PIN.fullmatch(text)
     if match is None or not match[1].isprintable() or not all(isfinite(float(value)) for value in match.groups()[1:]):
-        raise UsageError(f"--pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map")
+        raise UsageError(f"pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map")
     px, py, mx, my = (float(value) for value in match.groups()[1:])
     return Pin(match[1].strip(), (px, py), (mx, my))
 
@@ -135,7 +135,7 @@ def _contradiction(names: list[str], drawn: _Complex, points: _Complex, metres_p
         return "the plan is mirrored: its points fit the map only mirrored; flip the picture, or check the order of x and y"
     if metres_per_unit is not None and _fits(drawn, points, None, everything):
         fitting = 1 / abs(_fitted(drawn, points, None)[0])
-        return f"the pins fit at {fitting:.5g} metres per unit of the plan, not at {metres_per_unit:.5g}; correct --metres-per-pixel"
+        return f"the pins fit at {fitting:.5g} metres per unit of the plan, not at {metres_per_unit:.5g}; correct the metres per pixel"
     agreeing = _largest_agreeing(drawn, points, metres_per_unit)
     if len(agreeing) >= max(3, len(names) // 2 + 1):
         wrong = [n for n in everything if n not in agreeing]

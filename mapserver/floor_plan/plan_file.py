@@ -30,7 +30,7 @@ class PlanFile:
             if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
                 x, y = pin.drawing
                 raise UsageError(
-                    f"--pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
+                    f"pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
                 )
         return upwards(pins)
 
@@ -53,20 +53,18 @@ def read_plan(path: Path) -> PlanFile:
 def decode_plan(name: str, data: bytes) -> PlanFile:
     """Decode the plan in a file's bytes. UsageError for an unknown format, a too large or a damaged file."""
     if len(data) > MAX_PLAN_BYTES:
-        raise UsageError(f"--plan {name} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
+        raise UsageError(f"plan {name} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
     if name.lower().endswith(".dxf"):
-        raise UsageError(f"--plan {name}: DXF is not supported; save the drawing as PNG and align it by --pin")
+        raise UsageError(f"plan {name}: DXF is not supported; save the drawing as PNG and align it by pins")
     size = image_size(data)
     if size is None:
-        raise UsageError(f"--plan {name} is not a PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
+        raise UsageError(f"plan {name} is not a PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
     if not 0 < size[0] * size[1] <= MAX_PLAN_PIXELS:
-        raise UsageError(
-            f"--plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller"
-        )
+        raise UsageError(f"plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller")
     try:
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         grey = None
     if grey is None or grey.shape != (size[1], size[0]):
-        raise UsageError(f"--plan {name} cannot be decoded; it is damaged, save it again")
+        raise UsageError(f"plan {name} cannot be decoded; it is damaged, save it again")
     return PlanFile(name, data, np.asarray(grey, np.uint8))

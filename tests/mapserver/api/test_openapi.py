@@ -21,14 +21,21 @@ from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
+from mapserver.fleet.building import align
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.survey_requests import ask_for_survey
+from mapserver.floor_plan.pins import parse_pin
 from mapserver.store import Actor, FailureReplay, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
 
+PINS = ["a=200,400:0,0", "b=200,0:20,0"]
+AREAS = (
+    b'{"type":"FeatureCollection","frame":"map","features":[{"type":"Feature","properties":{"name":"a"},'
+    b'"geometry":{"type":"Polygon","coordinates":[[[0,0],[1,0],[1,1],[0,0]]]}}]}'
+)
 POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
 FAILURE = FailureReport(
     site="hall", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
@@ -69,6 +76,11 @@ def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[in
             if operation.label.endswith("/publish") and number % 4 == 1:  # the gate refuses the draft otherwise
                 where |= {"force": True, "reason": "a test"}
             case.body = case.body | {"actor": "ada"} | where  # nobody signs in here
+        if number % 2 and operation.label.startswith(("PUT", "DELETE")):
+            case.query, case.headers = {"actor": "ada"}, {}
+            if operation.label.startswith("PUT"):
+                case.body = AREAS if operation.label.endswith("/areas") else b""
+                case.query |= {} if operation.label.endswith("/areas") else {"pin": PINS}
         response = case.call(base_url="http://127.0.0.1")
         case.validate_response(response, checks=list(CHECKS))
         statuses.append(response.status_code)
@@ -91,6 +103,7 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         store.fleet.add_replay(1, FailureReplay(b"summary", b"recording", []), keep_bytes=100)
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
+        align(store, "hall", [parse_pin(pin) for pin in PINS], None, None, Actor("ada"))
         asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
         receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
         settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver)

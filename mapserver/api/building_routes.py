@@ -1,0 +1,127 @@
+"""Endpoints of a site's building: its named areas, and the pose of the map in its floor plan.
+
+A file is sent as the body; author and reason are then in the query.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from starlette.exceptions import HTTPException
+
+from fleetmap.encoding import to_plain
+from fleetmap.errors import StateError, UsageError
+from mapserver.api import parameters as p
+from mapserver.api import views
+from mapserver.api.guard import actor_of
+from mapserver.fleet.building import align, forget_alignment, keep_areas, replace_areas
+from mapserver.floor_plan.pins import MAX_PINS, parse_pin
+from mapserver.floor_plan.plan_file import decode_plan
+from mapserver.store import Actor, MapStore
+
+
+def _acting(
+    request: Request,
+    actor: Annotated[str | None, Query(min_length=1, max_length=200, examples=["ada"])] = None,
+    reason: Annotated[str, Query(max_length=2000, examples=["racks were moved"])] = "",
+) -> Actor:
+    return actor_of(request, actor, reason)
+
+
+async def _body(request: Request) -> bytes:
+    return await request.body()
+
+
+By = Annotated[Actor, Depends(_acting)]
+File = Annotated[bytes, Depends(_body)]
+_WHAT = "the ETag of the areas that are changed: 412 if somebody changed them since"
+IfMatch = Annotated[str | None, Header(pattern=r'^(\*|(W/)?"[0-9a-f]{64}")$', description=_WHAT, examples=["*"])]
+_PIN = "NAME=PX,PY:X,Y: pixels right and down in the plan, and metres in `map`; at least two"
+Pins = Annotated[list[str], Query(max_length=MAX_PINS, description=_PIN, examples=[["dock=120,2310:0.4,-1.2"]])]
+PlanName = Annotated[
+    str | None,
+    Query(min_length=1, max_length=200, description="name of the picture in the body", examples=["hall.png"]),
+]
+Scale = Annotated[
+    float | None, Query(ge=1e-6, le=1e3, description="of the plan; without it estimated from the pins", examples=[None])
+]
+
+
+def install_building_routes(app: FastAPI, store: MapStore) -> None:
+    """Add the endpoints."""
+
+    @app.get("/v1/sites/{site}/areas")
+    def areas(response: Response, site: p.Site) -> dict[str, Any]:
+        """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
+        store.current(site)  # raises for an unknown site
+        _tag(response, site)  # read first: a change in between makes the tag too old, not the areas
+        return store.areas(site).geojson(site)
+
+    @app.put("/v1/sites/{site}/areas", openapi_extra=_file("application/geo+json"))
+    def replace(response: Response, site: p.Site, by: By, data: File, if_match: IfMatch = None) -> dict[str, Any]:
+        """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
+        store.current(site)
+        with _refused_with(422):
+            kept = replace_areas(store, site, data, by, tag=_given(if_match))
+        _tag(response, site)
+        return kept.geojson(site)
+
+    @app.delete("/v1/sites/{site}/areas")
+    def remove(site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
+        """Remove the areas of a site; their past counts stay."""
+        keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
+        return views.ServiceState("ok")
+
+    @app.get("/v1/sites/{site}/alignment")
+    def alignment(site: p.Site) -> dict[str, Any]:
+        """The pose of the map in the drawing of its building, with what is left at each pin."""
+        store.current(site)
+        found = store.alignment(site)
+        if found is None:
+            raise HTTPException(404, f"site {site} is not aligned; PUT pins and the picture of a floor plan here")
+        return dict(to_plain(found))
+
+    @app.put("/v1/sites/{site}/alignment", openapi_extra=_file("application/octet-stream"))
+    def set_alignment(
+        site: p.Site, by: By, data: File, pin: Pins, plan: PlanName = None, metres_per_pixel: Scale = None
+    ) -> dict[str, Any]:
+        """Align the map with the picture of a floor plan (PNG, JPEG, TIFF, BMP or PGM), or with pins alone, as `mapserver align`."""
+        store.current(site)
+        if bool(data) != (plan is not None):
+            raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
+        with _refused_with(422):
+            drawing = None if plan is None else decode_plan(plan, data)
+            found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
+        return dict(to_plain(found))
+
+    @app.delete("/v1/sites/{site}/alignment")
+    def forget(site: p.Site, by: By) -> views.ServiceState:
+        """Remove the alignment of a site and its floor plan; 409 while areas are drawn in the building."""
+        store.current(site)
+        with _refused_with(409):
+            forget_alignment(store, site, by)
+        return views.ServiceState("ok")
+
+    def _tag(response: Response, site: str) -> None:
+        response.headers.update({"ETag": f'"{store.areas_tag(site)}"', "Cache-Control": "no-cache"})
+
+
+def _given(if_match: str | None) -> str | None:
+    return None if if_match in (None, "*") else if_match.removeprefix("W/").strip('"')
+
+
+def _file(media_type: str) -> dict[str, Any]:
+    """The OpenAPI description of a body that is a file."""
+    return {"requestBody": {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}}}
+
+
+@contextmanager
+def _refused_with(status: int) -> Iterator[None]:
+    """Answer a UsageError of the block with this status: it is not about the path."""
+    try:
+        yield
+    except StateError:
+        raise
+    except UsageError as error:
+        raise HTTPException(status, str(error)) from error

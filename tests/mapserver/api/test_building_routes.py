@@ -1,0 +1,145 @@
+"""Areas and alignment over HTTP, with the commands as the other side."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mapserver.cli import app
+from mapserver.operators.operators import Operators
+from mapserver.store import Actor
+from support.fleet.served_api import Server, check_problem, served_api
+
+AREAS, ALIGNMENT = "/v1/sites/lab/areas", "/v1/sites/lab/alignment"
+ADA = {"actor": "ada", "reason": "racks were moved"}
+# The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
+PINS = ["a=200,400:0,0", "b=200,0:20,0", "c=0,400:0,10"]
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with served_api(tmp_path) as made:
+        yield made
+
+
+def drawn(*names: str, frame: str = "map", **properties: object) -> bytes:
+    ring = [[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]
+    shape = {"type": "Polygon", "coordinates": [ring]}
+    features = [{"type": "Feature", "geometry": shape, "properties": {"name": name} | properties} for name in names]
+    return json.dumps({"type": "FeatureCollection", "frame": frame, "features": features}).encode()
+
+
+def put(server: Server, content: bytes, **headers: str) -> httpx.Response:
+    return server.client.put(AREAS, params=ADA, content=content, headers=headers)
+
+
+def listed(server: Server) -> str:
+    found = CliRunner().invoke(app, ["areas", "list", "--site", "lab", "--store", str(server.folder)])
+    return found.output
+
+
+def test_areas_are_replaced_and_removed_as_by_the_command(server: Server) -> None:
+    kept = put(server, drawn("aisle 5", "gate", mask="speed", percent=30))
+    assert kept.json() == server.client.get(AREAS).json()
+    assert listed(server) == "aisle 5: 12.0 m2, speed 30 %\ngate: 12.0 m2, speed 30 %\n2 areas\n"
+    assert put(server, json.dumps(kept.json()).encode()).json() == kept.json(), "an answer is a file"
+    put(server, drawn("aisle 6", "gate"))
+    assert server.client.request("DELETE", AREAS, params=ADA).json() == {"status": "ok"}
+    assert listed(server) == "0 areas\n"
+    told = [(event.detail, event.actor, event.reason) for event in server.store.events("lab") if event.kind == "areas"]
+    done = ("added aisle 5, gate", "changed", "added aisle 6; removed aisle 5", "no areas")
+    assert told == [(words, "ada", "racks were moved") for words in done]
+
+
+def test_a_change_of_what_somebody_else_changed_is_refused(server: Server) -> None:
+    looked_at = server.client.get(AREAS).headers["etag"]
+    changed = put(server, drawn("aisle 5"), **{"If-Match": looked_at})
+    assert changed.headers["etag"] == server.client.get(AREAS).headers["etag"] != looked_at
+    check_problem(put(server, drawn("gate"), **{"If-Match": looked_at}), 412, "load them anew")
+    gone = server.client.request("DELETE", AREAS, params=ADA, headers={"If-Match": looked_at})
+    check_problem(gone, 412, "changed meanwhile")
+    assert listed(server) == "aisle 5: 12.0 m2\n1 areas\n"
+    assert put(server, drawn("gate"), **{"If-Match": "*"}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("content", "status", "words"),
+    [
+        (b"[" * 100_000, 422, "give a GeoJSON FeatureCollection"),
+        (drawn(), 422, "0 features"),
+        (drawn("a", "a"), 422, "occurs twice"),
+        (drawn("a", frame="wgs84"), 422, "frame"),
+        (drawn("a", frame="building"), 422, "need the map's pose"),
+        (drawn("a", mask="speed"), 422, "percent"),
+        (drawn("a").replace(b"[4, 3]", b"[0, 3.5]").replace(b"[0, 3]", b"[4, 4]"), 422, "crosses itself"),
+        (drawn("a", mask="keep-out").replace(b"4", b"904").replace(b"[0", b"[900"), 422, "outside of version 1"),
+        (b" " * (8 << 20) + b"x", 413, "more than 8388608 bytes"),
+    ],
+)
+def test_what_is_no_area_changes_nothing(server: Server, content: bytes, status: int, words: str) -> None:
+    put(server, drawn("aisle 5"))
+    check_problem(put(server, content), status, words)
+    assert listed(server) == "aisle 5: 12.0 m2\n1 areas\n"
+
+
+def test_areas_of_the_building_stay_there(server: Server) -> None:
+    """They move with the map when it is aligned anew, also after they were changed in `map`."""
+
+    def align(pins: list[str]) -> None:
+        assert server.client.put(ALIGNMENT, params=ADA | {"pin": pins}).status_code == 200
+
+    align(PINS)
+    put(server, drawn("hall", frame="building"))
+    found = server.client.get(AREAS).json()
+    found["features"][0]["properties"]["name"] = "north hall"
+    assert put(server, json.dumps(found).encode()).json() == found
+    before = np.array(found["features"][0]["geometry"]["coordinates"][0])
+    align(["a=200,400:50,0", "b=200,0:70,0", "c=0,400:50,10"])  # 50 m along x of the map
+    after = server.client.get(AREAS).json()["features"][0]
+    assert after["properties"] == {"name": "north hall"}
+    np.testing.assert_allclose(np.array(after["geometry"]["coordinates"][0]) - before, [[50.0, 0.0]] * 5, atol=1e-3)
+    check_problem(server.client.request("DELETE", ALIGNMENT, params=ADA), 409, "need the map's pose")
+
+
+def test_a_map_is_aligned_with_a_plan_as_by_the_command(server: Server) -> None:
+    picture = cv2.imencode(".png", np.full((500, 600), 255, np.uint8))[1].tobytes()
+    check_problem(server.client.get(ALIGNMENT), 404, "is not aligned")
+    asked = ADA | {"pin": PINS, "plan": "plan.png"}
+    kept = server.client.put(ALIGNMENT, params=asked, content=picture)
+    assert kept.json() == server.client.get(ALIGNMENT).json()
+    shown = CliRunner().invoke(
+        app, ["align", "--show", "--json", "--site", "lab", "--store", str(server.folder)], catch_exceptions=False
+    )
+    assert json.loads(shown.output) == kept.json()
+    assert kept.json()["metres_per_unit"] == pytest.approx(0.05)
+    assert server.store.site_file("lab", "plan") == picture
+    for change, content, status, words in (
+        ({}, b"no picture", 422, "is not a PNG"),
+        ({}, b"", 422, "send a picture as the body"),
+        ({"pin": ["a=200,400:0,0"]}, picture, 422, "1 pins: give 2 to 100"),
+        ({"pin": ["a"]}, picture, 422, "write NAME=px,py:mx,my"),
+        ({"pin": [*PINS, "d=700,0:9,9"]}, picture, 422, "is not in plan.png, which has 600x500"),
+        ({"plan": "plan.dxf"}, picture, 422, "DXF"),
+    ):
+        check_problem(server.client.put(ALIGNMENT, params=asked | change, content=content), status, words)
+    assert server.client.get(ALIGNMENT).json() == kept.json()
+    assert server.client.request("DELETE", ALIGNMENT, params=ADA).json() == {"status": "ok"}
+    assert server.store.site_file("lab", "plan") is None
+    for path, query in ((AREAS, ADA), (ALIGNMENT, ADA | {"pin": PINS})):
+        check_problem(server.client.request("DELETE", path), 422, "name the person who acts")
+        elsewhere = server.client.put(path.replace("lab", "yard"), params=query, content=b"x")
+        check_problem(elsewhere, 404, "no site yard")
+
+
+def test_changes_need_the_right_to_change(server: Server) -> None:
+    operators = Operators(server.store)
+    reader = {"Authorization": f"Bearer {operators.make_token('watch', ['read'], 1, Actor('root'))}"}
+    for method, path in (("PUT", AREAS), ("DELETE", AREAS), ("PUT", ALIGNMENT), ("DELETE", ALIGNMENT)):
+        for headers, status, words in ((reader, 403, "the right to 'change'"), ({}, 401, "sign in")):
+            check_problem(server.client.request(method, path, content=drawn("a"), headers=headers), status, words)
+    assert server.client.get(AREAS, headers=reader).json()["features"] == []
