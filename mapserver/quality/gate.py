@@ -11,6 +11,18 @@ from fleetmap.encoding import to_plain
 from fleetmap.mapformat import Manifest
 from mapserver.quality.figures import Aliasing, Compared, Evidence, TrajectoryBreaks, trusted_calibrations
 
+CHECKS = {
+    "joining": "recordings that belong to the site",
+    "held_out_frames": "frames that the build left out",
+    "yesterdays_recordings": "earlier recordings",
+    "last_versions_places": "places of the version before",
+    "aliasing_probes": "places that look alike",
+    "calibration": "calibration",
+    "motion": "trajectory in one piece",
+    "size_against_last_version": "size against the current version",
+}
+"""Words for the names in a report's `passed` and `not_judged`."""
+
 _JOINED = "joined"  # the verdict of survey.merge.membership on a recording that belongs to the site
 Share = Annotated[float, msgspec.Meta(ge=0)]
 
@@ -74,7 +86,7 @@ def judge(
             not_judged.append(name)
         else:
             over = f"over {compared.draft.frames} frames"
-            checked[name] = [f"{name}: {words}, {over}" for words in _frame_reasons(compared, settings)]
+            checked[name] = [f"{CHECKS[name]}: {words}, {over}" for words in _frame_reasons(compared, settings)]
     if examined.aliasing is None or examined.aliasing.offered < settings.min_frames:
         not_judged.append("aliasing_probes")
     else:
@@ -104,32 +116,34 @@ def _motion_reasons(motion: TrajectoryBreaks, settings: GateSettings) -> list[st
         return []
     return [
         f"its trajectory is torn in {motion.breaks} places, by up to {motion.worst_m:.2f} m against "
-        f"odometry; max_breaks is {settings.max_breaks}"
+        f"odometry; the limit is {settings.max_breaks}"
     ]
 
 
 def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
     """Yield reasons from one kind of frames: figures on the wrong side of their limit; the limit itself is allowed."""
     draft, before = compared.draft, compared.before
-    least = [("localised_share", draft.localised_share, settings.min_localised_share, "min_localised_share")]
+    localised, error = "share of localised frames", "median error in metres"
+    least = [(localised, draft.localised_share, settings.min_localised_share, "the limit")]
     most = [
-        ("wrong_share", draft.wrong_share, settings.max_wrong_share, "max_wrong_share"),
-        ("median_error_m", draft.median_error_m, settings.max_median_error_m, "max_median_error_m"),
-        ("residual_px", draft.residual_px, settings.max_residual_px, "max_residual_px"),
+        ("share of frames in a wrong place", draft.wrong_share, settings.max_wrong_share, "the limit"),
+        (error, draft.median_error_m, settings.max_median_error_m, "the limit"),
+        ("residual in pixels", draft.residual_px, settings.max_residual_px, "the limit"),
     ]
     if before is not None:
         limit = before.localised_share - settings.margin_localised_share
-        least.append(("localised_share", draft.localised_share, limit, "the current version's less its margin"))
+        least.append((localised, draft.localised_share, limit, "the current version's less its margin"))
         if before.median_error_m is not None:
             limit = before.median_error_m + settings.margin_error_m
-            most.append(("median_error_m", draft.median_error_m, limit, "the current version's and its margin"))
+            most.append((error, draft.median_error_m, limit, "the current version's and its margin"))
     for sign, word, checks in ((-1, "below", least), (1, "above", most)):
         for figure, value, limit, name in checks:
             if value is not None and sign * (value - limit) > 0:
-                yield f"{figure} {value:.3f} is {word} {name} ({limit:.3f})"
+                yield f"{figure}, {value:.3f}, is {word} {name} ({limit:.3f})"
     share = compared.inliers_share
     if before is not None and share is not None and share < settings.min_inliers_share:
-        yield f"inliers_share {share:.3f} of the current version's is below min_inliers_share ({settings.min_inliers_share:.3f})"
+        limit = settings.min_inliers_share
+        yield f"matches per frame, {share:.3f} of the current version's, are below the limit ({limit:.3f})"
 
 
 def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: GateSettings) -> list[str]:
@@ -137,8 +151,8 @@ def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: Gat
     if aliasing.accepted_share <= max(settings.max_aliased_share, usual):
         return []
     return [
-        f"aliasing_probes: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are localised at another, similar "
-        f"place, max_aliased_share is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
+        f"{CHECKS['aliasing_probes']}: {aliasing.accepted_share:.3f} of {aliasing.offered} frames are localised at another, "
+        f"similar place, the limit is {settings.max_aliased_share:g}; if the site really looks alike there, raise it"
     ]
 
 
@@ -177,14 +191,15 @@ def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
 
 
 def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> Iterator[str]:
-    for name, limit in (
-        ("landmarks_share", settings.min_landmarks_share),
-        ("coverage_share", settings.min_coverage_share),
+    for name, words, limit in (
+        ("landmarks_share", "the number of landmarks", settings.min_landmarks_share),
+        ("coverage_share", "the covered area", settings.min_coverage_share),
     ):
         if shares[name] < limit:
-            yield f"{name} {shares[name]:.2f} of version {version} is below {limit:g}"
+            yield f"{words} is {shares[name]:.2f} of version {version}'s, below the limit of {limit:g}"
     if shares["bytes_share"] > settings.max_bytes_share:
-        yield f"bytes_share {shares['bytes_share']:.2f} of version {version} is above {settings.max_bytes_share:g}"
+        limit = settings.max_bytes_share
+        yield f"the size in bytes is {shares['bytes_share']:.2f} of version {version}'s, above the limit of {limit:g}"
 
 
 def _strangers(draft: Manifest) -> list[str] | None:

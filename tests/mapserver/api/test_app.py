@@ -307,7 +307,7 @@ def test_a_refused_draft_stays_with_its_reasons_and_can_be_forced(server: Server
     thin = random_tile(np.random.default_rng(5), landmarks=10, cell=(0, 0))
     server.store.save("lab", DraftContent(tiles=[thin], vocabulary=b"words" * 50, details=draft_details(path_m=9.0)))
     url = "/v1/sites/lab/versions/3"
-    check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "landmarks_share")
+    check_problem(server.client.post(f"{url}/publish", json=ADA), 409, "number of landmarks")
     quality = server.client.get(f"{url}/quality").json()
     assert (quality["state"], quality["report"]) == ("draft", {"path_m": 9.0})
     (verdict,) = quality["verdicts"]

@@ -73,6 +73,8 @@ def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:
     strict = tmp_path / "strict.toml"
     strict.write_text("[gate]\nmin_landmarks_share = 1.5\n")
     where = ("--site", "lab", "--store", tmp_path / "store")
-    assert "landmarks_share 1.00 of version 1 is below 1.5" in run("publish", *where, "--config", strict, status=4)
+    assert "number of landmarks is 1.00 of version 1's, below the limit of 1.5" in run(
+        "publish", *where, "--config", strict, status=4
+    )
     assert "refused" in run("inspect", *where, "--version", 2)
     assert "version 2 is current" in run("publish", *where)

@@ -197,14 +197,14 @@ def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
     spend(hall)
     record(hall / "inbox", "wednesday", 3)
     monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10))
-    with pytest.raises(GateRefusedError, match="landmarks_share"):
+    with pytest.raises(GateRefusedError, match="number of landmarks"):
         spend(hall)
     assert states(hall) == [("current", ["monday", "tuesday"]), ("draft", ["wednesday"])]
     assert names(hall / "inbox/held") == ["wednesday", "wednesday.reason.txt"]
     report = last_report(hall / "store", "hall")
     assert report is not None
     assert report["state"] == "failed"
-    assert "landmarks_share" in report["message"]
+    assert "number of landmarks" in report["message"]
     assert "version 1 stays current" in report["message"]
     assert spend(hall) == "site hall: nothing new"
     monkeypatch.setattr(night, "build_draft", built)
@@ -575,7 +575,7 @@ def test_the_command_says_how_it_ended(
     monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10))
     assert run("--report", str(hall / "night.json")) == 4
     assert json.loads((hall / "night.json").read_text())["state"] == "failed"
-    assert "landmarks_share" in capsys.readouterr().err
+    assert "number of landmarks" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_told(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:

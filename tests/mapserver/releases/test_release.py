@@ -67,7 +67,7 @@ def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
     publish_samples(store, 1)
     small = [random_tile(np.random.default_rng(3), landmarks=70, cell=(0, 0))]
     store.save("lab", DraftContent(tiles=small, vocabulary=b"words" * 50, details=draft_details()))
-    with pytest.raises(GateRefusedError, match=r"coverage_share 0\.50 of version 1"):
+    with pytest.raises(GateRefusedError, match=r"covered area is 0\.50 of version 1's"):
         releases.publish(store, "lab", actor=ADA)
     with pytest.raises(UsageError, match="--reason"):
         releases.publish(store, "lab", actor=Actor("ada"), force=True)
