@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypeVar
 
 from fastapi import Path, Query
 from fastapi.dependencies.utils import get_flat_params
+from fastapi.params import Header
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
@@ -80,7 +81,8 @@ async def known_parameters(request: HTTPConnection) -> None:
     route = request.scope.get("route")
     if not request.query_params or not isinstance(route, APIRoute) or not route.include_in_schema:
         return
-    known = {asked.alias for asked in get_flat_params(route.dependant)} - route.param_convertors.keys()
+    asked = [each for each in get_flat_params(route.dependant) if not isinstance(each.field_info, Header)]
+    known = {each.alias for each in asked} - route.param_convertors.keys()
     unknown = [name for name in request.query_params if name not in known]
     if unknown:
         words = f"this address knows {', '.join(sorted(known))}" if known else "this address has none"

@@ -12,13 +12,14 @@ from datetime import UTC, tzinfo
 from pathlib import Path
 from typing import TypeVar
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.mapformat import sha256_hex
 from mapserver.api.guard import SIGN_IN, SIGN_OUT
 from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
 from mapserver.api.version_routes import ApiSettings
@@ -126,7 +127,7 @@ class Console:
             raise UsageError("There is no such page here.")
 
         @self.app.exception_handler(404)
-        async def missing(request: Request, _: Exception) -> HTMLResponse:
+        async def missing(request: Request, _: Exception) -> Response:
             """Within the frame, with a way back."""
             return await self._shown(request, "none", "", no_page, tuple(request.query_params))
 
@@ -147,7 +148,7 @@ class Console:
         """
 
         @self.app.get(f"/{path}", include_in_schema=False)
-        async def shown(request: Request) -> HTMLResponse:
+        async def shown(request: Request) -> Response:
             """A page."""
             page = path.partition("/")[0]
             page = _UNDER.get(page, page)
@@ -199,7 +200,7 @@ class Console:
         under_way: Callable[[], list[str]] = list,
         *,
         of_site: bool = True,
-    ) -> HTMLResponse:
+    ) -> Response:
         root, site, found, status = _root(request), request.query_params.get("site"), {}, 200
         sites: list[str] = []
         try:
@@ -235,9 +236,11 @@ class Console:
             "may_change": who is None or Scope.CHANGE in who.scopes,
             "warning": self.services.settings.guard.warning,
         }
-        return HTMLResponse(
-            TEMPLATES.get_template(template).render(frame | found), status, {"Cache-Control": "no-store"}
-        )
+        text = TEMPLATES.get_template(template).render(frame | found)
+        headers = {"Cache-Control": "no-store", "ETag": f'"{sha256_hex(text.encode())}"'}
+        if request.headers.get("if-none-match") == headers["ETag"]:  # renew.js has it
+            return Response(status_code=304, headers=headers)
+        return HTMLResponse(text, status, headers)
 
 
 async def load(function: Callable[..., T], *arguments: object) -> T:

@@ -60,7 +60,7 @@ class MapData:
         self.store = store
         self._gate, self.trial_share = gate, trial_share
         self._plans, self._underlays = _Kept[Plan](), _Kept[tuple[bytes, Box] | None]()
-        self._differences = _Kept[Difference]()
+        self._differences, self._foretold = _Kept[Difference](), _Kept[VerdictRow]()
 
     def sites(self) -> list[str]:
         """Names of all sites."""
@@ -89,15 +89,14 @@ class MapData:
         return any(info.version == version for info in self.store.versions(site))
 
     def foretold(self, draft: VersionInfo) -> VerdictRow:
-        """What the gate would say now."""
-        said = releases.judge_draft(self.store, draft, self._gate)
-        reasons = (*said.hard_reasons, *said.reasons)
-        return VerdictRow(self.store.now_ns(), said.accepted, False, reasons, said.report)
+        """What the gate would say now; kept, since it follows from the draft and the current version."""
 
-    def last_verdict(self, site: str, version: int) -> VerdictRow | None:
-        """What the gate said last about a version, None before it did."""
-        found = self.store.verdicts(site, version)
-        return found[-1] if found else None
+        def said() -> VerdictRow:
+            said = releases.judge_draft(self.store, draft, self._gate)
+            reasons = (*said.hard_reasons, *said.reasons)
+            return VerdictRow(self.store.now_ns(), said.accepted, False, reasons, said.report)
+
+        return self._foretold.get((draft.manifest_sha256, self.current_version(draft.site)), said)
 
     def plan(self, site: str, version: int) -> Plan:
         """The plan of a version; the last ones are kept, since versions do not change."""

@@ -1,6 +1,5 @@
 """The page of maps: what runs where (versions with state, the gate's word and robots), and what another version would change."""
 
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,12 +7,13 @@ from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import UsageError
 from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
-from mapserver.dashboard.map_layers import Layer, Outline, box_of, heat, squares
+from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import share, size
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
+from mapserver.quality.gate import CHECKS
 from mapserver.releases import Difference
 from mapserver.store import Event, VerdictRow, VersionInfo
 from mapserver.store.rows import SiteReleases
@@ -44,29 +44,18 @@ _FIGURES = {
     "ate_rmse_m": ("Error against ground truth", "{:.3f} m"),
     "seconds": ("Time to build", "{:.0f} s"),
 }
-# What the gate judges, and why it does not.
-_CHECKS = {
-    "joining": ("Recordings belong to the site", "the build does not say how they were joined"),
-    "held_out_frames": ("Frames that the build left out", "too few of them"),
-    "yesterdays_recordings": ("Earlier recordings", "too few frames of them were played against it"),
-    "last_versions_places": ("Places of the version before", "too few of them could be tried"),
-    "aliasing_probes": ("Places that look alike", "too few frames could be tried"),
-    "calibration": ("Calibration", "no recording was examined for it"),
-    "motion": ("Trajectory in one piece", "nothing to compare it with"),
-    "size_against_last_version": ("Size against the current version", "there was none"),
+# Why the gate does not judge something.
+_UNKNOWN = {
+    "joining": "the build does not say how they were joined",
+    "held_out_frames": "too few of them",
+    "yesterdays_recordings": "too few frames of them were played against it",
+    "last_versions_places": "too few of them could be tried",
+    "aliasing_probes": "too few frames could be tried",
+    "calibration": "no recording was examined for it",
+    "motion": "nothing to compare it with",
+    "size_against_last_version": "there was none",
 }
 _FRAMES = {"held_out_frames": "held_out", "yesterdays_recordings": "replayed", "last_versions_places": "last_version"}
-_KEY = re.compile(r"[a-z]+(_[a-z]+)+")
-_KEYS = {name: words for name, (words, _) in _CHECKS.items()} | {
-    "localised_share": "share of frames localised",
-    "wrong_share": "share of frames put in a wrong place",
-    "median_error_m": "median error in metres",
-    "residual_px": "residual in pixels",
-    "inliers_share": "share of the matches",
-    "landmarks_share": "share of the landmarks",
-    "coverage_share": "share of the area",
-    "bytes_share": "share of the size",
-}
 
 
 def install(console: Console) -> None:
@@ -79,6 +68,7 @@ def install(console: Console) -> None:
 def _page(services: Services, context: PageContext) -> dict[str, object]:
     maps, site, span_ns = services.maps, context.site, context.time_range()
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
+    verdicts = maps.store.last_verdicts(site)
     robots = [robot.version for robot in services.robots.look(site).robots]
     asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
     known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
@@ -86,23 +76,27 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     if shown is None:
         raise UsageError(f"site {site} has no version yet; `mapserver build` makes one from a recording")
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
-    changes, compares = _changes(maps, rows, before, after or shown), "after" in context.query
+    changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in requests]
     over = [
         Layer("Failures", heat(services.health.places(site, *span_ns), box_of(plan)), shown=False),
         Layer("Changed tiles", squares(plan, changes["tiles"]), shown=compares),
-        Layer("Surveys asked for", asked_for),
-        Layer("Survey that you draw"),
+        Layer("Requested surveys", asked_for),
+        Layer("Outline that you draw"),
     ]
     return {
         "used": _used(services, rows),
-        "versions": [_card(maps, rows, events, info, robots, shown) for info in reversed(rows.versions.values())],
+        "versions": [
+            _card(maps, rows, events, verdicts.get(info.version), info, robots, shown)
+            for info in reversed(rows.versions.values())
+        ],
         "shown": shown,
         "scene": scene_of(services, context, shown, over, shows_coverage=not compares),
-        "gate": _gate(maps, info),
+        "gate": _gate(maps, info, verdicts.get(shown)),
         "version_facts": _facts(maps, info, plan),
         "one_way": one_way(plan, maps.areas(site)),
         "changes": changes,
+        "areas": sorted(maps.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
@@ -122,10 +116,16 @@ def _used(services: Services, rows: SiteReleases) -> str:
 
 
 def _card(
-    maps: MapData, rows: SiteReleases, events: list[Event], info: VersionInfo, robots: list[int | None], shown: int
+    maps: MapData,
+    rows: SiteReleases,
+    events: list[Event],
+    verdict: VerdictRow | None,
+    info: VersionInfo,
+    robots: list[int | None],
+    shown: int,
 ) -> dict[str, object]:
     """A version in the list. Acts on old ones are there once they are chosen: the list stays short."""
-    version, trial, verdict = info.version, rows.canary, maps.last_verdict(info.site, info.version)
+    version, trial = info.version, rows.canary
     on_trial = trial is not None and trial.version == version
     tone, state = _STATES[info.state]
     if trial is not None and on_trial:
@@ -205,26 +205,16 @@ def verdict_words(verdict: VerdictRow | None, is_draft: bool) -> tuple[str, str]
         return "good", "The gate accepted it."
     tone, said = ("warn", "Published by force, although") if verdict.forced else ("bad", "The gate refused it")
     more = f", and {len(verdict.reasons) - 1} more" if len(verdict.reasons) > 1 else ""
-    return tone, f"{said}: {_plain(verdict.reasons[0])}{more}."
+    return tone, f"{said}: {verdict.reasons[0]}{more}."
 
 
 def _begun(words: str) -> str:
     return f"{words[:1].upper()}{words[1:]}"
 
 
-def _plain(words: str) -> str:
-    """Words of the gate without keys of the code."""
-
-    def named(found: re.Match[str]) -> str:
-        key = found.group()
-        return "the limit" if key.startswith(("min_", "max_")) else _KEYS.get(key, key.replace("_", " "))
-
-    return _KEY.sub(named, words)
-
-
-def _gate(maps: MapData, info: VersionInfo) -> dict[str, object] | None:
+def _gate(maps: MapData, info: VersionInfo, verdict: VerdictRow | None) -> dict[str, object] | None:
     """What the gate found, or would find in a draft; None where it never looked."""
-    answers, verdict = ("accepted", "refused"), maps.last_verdict(info.site, info.version)
+    answers = ("accepted", "refused")
     if verdict is None and info.state == "draft":
         answers, verdict = ("would accept", "would refuse"), maps.foretold(info)
     if verdict is None:
@@ -234,12 +224,13 @@ def _gate(maps: MapData, info: VersionInfo) -> dict[str, object] | None:
     for name in report.get("passed", ()):
         tried = (evidence.get(_FRAMES.get(name)) or {}).get("draft")
         told = f": {tried['localised_share']:.0%} of {tried['frames']} localised" if tried else ""
-        passed.append(f"{_CHECKS[name][0]}{told}")
-    unknown = [": ".join(_CHECKS[name]) if name in _CHECKS else name for name in report.get("not_judged", ())]
+        passed.append(f"{_begun(CHECKS[name])}{told}")
+    not_judged = report.get("not_judged", ())
+    unknown = [f"{_begun(CHECKS[name])}: {_UNKNOWN[name]}" if name in CHECKS else name for name in not_judged]
     return {
         "tone": "good" if verdict.accepted else "bad",
         "words": f"The gate {answers[not verdict.accepted]} it.",
-        "failed": [_begun(_plain(reason)) for reason in verdict.reasons],
+        "failed": [_begun(reason) for reason in verdict.reasons],
         "passed": passed,
         "not_judged": unknown,
     }
@@ -283,7 +274,7 @@ def one_way(plan: Plan, areas: Areas) -> list[str]:
     ]
 
 
-def _changes(maps: MapData, rows: SiteReleases, before: int | None, after: int) -> dict[str, Any]:
+def _changes(maps: MapData, context: PageContext, rows: SiteReleases, before: int | None, after: int) -> dict[str, Any]:
     """What version `after` changes; without `before`, from the current version, or from the one before where it is that."""
     site, current = rows.site, rows.current
     if before is None:
@@ -291,7 +282,22 @@ def _changes(maps: MapData, rows: SiteReleases, before: int | None, after: int) 
         before = current.version if current and current.version != after else rows.rollback_target or earlier
     found, tiles = maps.difference(site, before, after), maps.changed_tiles(site, before, after)
     lacks = filter(None, (maps.lacks_surfels(site, version) for version in (before, after)))
-    return {"before": before, "after": after, "tiles": tiles, "lack": next(lacks, ""), "facts": _changed(found)}
+    swipe = None if before == after else _swipe(maps, context, before, after)
+    facts, lack = _changed(found), next(lacks, "")
+    return {"before": before, "after": after, "tiles": tiles, "lack": lack, "facts": facts, "swipe": swipe}
+
+
+def _swipe(maps: MapData, context: PageContext, before: int, after: int) -> dict[str, object]:
+    """The pictures of two versions, and the box of them all."""
+
+    def pictures(version: int) -> list[Picture]:
+        layers = maps.underlays(context.site, version, context.root)
+        below = [item for layer in layers for item in layer.items if isinstance(item, Picture)]
+        return [*below, Picture(context.plan_picture(version), box_of(maps.plan(context.site, version)))]
+
+    left, right = pictures(before), pictures(after)
+    x0, y0, x1, y1 = zip(*(picture.box for picture in (*left, *right)), strict=True)
+    return {"before": left, "after": right, "box": (min(x0), min(y0), max(x1), max(y1))}
 
 
 def _changed(found: Difference) -> list[tuple[str, object]]:

@@ -192,17 +192,20 @@ class StoreQueries:
     def verdicts(self, site: str, version: int) -> list[VerdictRow]:
         """Return the gate's verdicts on a version, oldest first; raises UsageError if it does not exist."""
         self.version(site, version)
+        return [verdict for _, verdict in self._verdicts("site = ? AND version = ?", site, version)]
+
+    def last_verdicts(self, site: str) -> dict[int, VerdictRow]:
+        """Return the gate's last verdict on each version of a site that it judged."""
+        return dict(self._verdicts("id IN (SELECT max(id) FROM verdicts WHERE site = ? GROUP BY version)", site))
+
+    def _verdicts(self, condition: str, *values: object) -> list[tuple[int, VerdictRow]]:
+        """Return version and verdict, oldest first."""
         rows = self._transactions.query(
-            """SELECT stamp_ns, accepted, forced, reasons, report FROM verdicts
-               WHERE site = ? AND version = ? ORDER BY id""",
-            (site, version),
+            f"SELECT version, stamp_ns, accepted, forced, reasons, report FROM verdicts WHERE {condition} ORDER BY id",
+            values,
         )
-        return [
-            msgspec.convert(
-                row | {name: json.loads(row[name]) for name in ("reasons", "report")}, VerdictRow, strict=False
-            )
-            for row in rows
-        ]
+        parsed = (row | {name: json.loads(row[name]) for name in ("reasons", "report")} for row in rows)
+        return [(row["version"], msgspec.convert(row, VerdictRow, strict=False)) for row in parsed]
 
     def evidence(self, site: str, version: int) -> Evidence | None:
         """Return the measurements of a version from its build, None if absent; errors as of `manifest`.

@@ -7,6 +7,8 @@ const shown = new Map([...document.querySelectorAll("[data-renew]")].map((part) 
 
 const namesOf = ({ label, layers }) => JSON.stringify([label, ...layers.map(({ name }) => name)]);
 
+let tag; // of the page as it is shown
+
 function renewMap(element, scene) {
   const [before, after] = [element.dataset.scene, scene].map((text) => JSON.parse(text));
   if (namesOf(before) !== namesOf(after)) return location.reload(); // another map
@@ -17,15 +19,20 @@ function renewMap(element, scene) {
 }
 
 export async function renew() {
-  const answer = await loaded();
+  const answer = await loaded(tag);
   if (document.querySelector("dialog[open]")) return; // somebody acts
   if (isSignedOut(answer)) return location.reload();
   if (!answer?.ok) return;
+  tag = answer.headers.get("ETag");
   const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
   for (const [part, before] of shown) {
     const other = fresh.getElementById(part.id);
     const writes = part.contains(document.activeElement) && document.activeElement.matches("input, select, textarea");
-    if (!other || writes || other.innerHTML === before) continue;
+    if (!other || other.innerHTML === before) continue;
+    if (writes) {
+      tag = undefined;
+      continue;
+    }
     shown.set(part, other.innerHTML); // not as it stands on the page, where somebody opened a part of it
     part.replaceChildren(...other.childNodes);
   }

@@ -1,8 +1,8 @@
 // What the server says while a page is open. None of it is a use of the session, which ends an hour after somebody did something.
 const AGAIN_MS = 5000;
 
-// The page as it would be loaded now; nothing where nobody answers.
-export const loaded = () => fetch(location.href, { headers: { "Fleetmap-Renewal": "1" } }).catch(() => undefined);
+// The page as it would be loaded now; without a body where it is that of `tag` still, nothing where nobody answers.
+export const loaded = (tag = "") => fetch(location.href, { headers: { "Fleetmap-Renewal": "1", "If-None-Match": tag } }).catch(() => undefined);
 export const isSignedOut = (answer) => answer?.redirected || answer?.status === 401;
 
 // Follows what the server says every second, until the session ends. Hidden pages do not: a browser has six connections for all of them.

@@ -65,6 +65,8 @@ def test_a_change_of_what_somebody_else_changed_is_refused(server: Server) -> No
     check_problem(gone, 412, "changed meanwhile")
     assert listed(server) == "aisle 5: 12.0 m2\n1 areas\n"
     assert put(server, drawn("gate"), **{"If-Match": "*"}).status_code == 200
+    check_problem(put(server, drawn("gate"), **{"If-Match": "new"}), 422, "if-match")
+    check_problem(server.client.put(f"{AREAS}?if-match=*", content=drawn("gate")), 422, "knows actor, reason")
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,14 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
+from typer.testing import CliRunner
 
 from fleetmap.bus import Bus
+from fleetmap.encoding import to_json
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from mapserver import releases
+from mapserver.cli import app
+from mapserver.fleet.building import replace_areas
 from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.store import Actor, DraftContent, MapStore
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
@@ -44,12 +48,13 @@ def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
 
 def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Served) -> None:
     seen = opened(page, served, "map")
-    page.get_by_role("button", name="Ask for a survey of it").click()
+    page.get_by_text("Draw an area or a survey on the map").click()
+    page.get_by_role("button", name="Request a survey here").click()
     dialog = page.get_by_role("dialog")
-    expect(dialog).to_contain_text("click at least three corners into the map first")
+    expect(dialog).to_contain_text("Draw at least three corners first")
     dialog.get_by_role("button", name="No, change nothing").click()
     drawing = page.locator(".site-map")
-    page.get_by_label("Draw on the map").check()
+    page.get_by_label("Draw: each click").check()
     for place in ((250, 200), (300, 200), (300, 260), (100, 100)):
         drawing.click(position=dict(zip("xy", place, strict=True)))
     assert len(marks(page, 4)) == 4
@@ -63,7 +68,7 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
         assert len(marks(page, 3)) == 3
         end_request(store, SITE, other.id, Actor("bob"))
         expect(asked).to_have_count(0)
-    change(page, "Ask for a survey of it")
+    change(page, "Request a survey here")
     expect(asked).to_contain_text(re.compile("asked by ada at .*robots lose themselves in aisle 3"))
     expect(page.locator(".site-map path.area")).to_have_count(1)
     opened(page, served, "trends")
@@ -72,6 +77,77 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     change(page, page.get_by_role("button", name=re.compile("^Survey .* is done")).inner_text())
     expect(asked).to_have_count(0)
     assert seen.faults == []
+
+
+def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    listing = ["areas", "list", "--site", SITE, "--store", str(tmp_path)]
+
+    def listed() -> str:
+        return CliRunner().invoke(app, listing).output
+
+    with serving(tmp_path) as served, MapStore.open(tmp_path) as store:
+        seen = opened(page, served, "map")
+        drawing, corners = page.locator(".site-map"), page.get_by_label("Corners, x and y in metres")
+        page.get_by_text("Draw an area or a survey on the map").click()
+        page.get_by_label("Draw: each click").check()
+        for place in ((250, 200), (300, 200), (300, 260), (250, 200)):
+            drawing.click(position=dict(zip("xy", place, strict=True)))
+        expect(page.get_by_label("Draw: each click")).not_to_be_checked()  # the first corner closed it
+        written = corners.input_value()
+        releases.publish(store, SITE)  # the page shows another version, and what was drawn stays
+        expect(page.get_by_role("status")).to_have_text("Robots should use version 3.")
+        expect(page.locator("#gate h2")).to_have_text("Version 3: the gate")
+        expect(corners).to_have_value(written)
+        assert len(marks(page, 3)) == 3
+
+        corners.fill("8, 8; 24, 8; 24 16; 8")
+        page.get_by_role("button", name="Name an area").click()
+        dialog = page.get_by_role("dialog")
+        expect(dialog).to_contain_text('"8" is not a corner')
+        dialog.get_by_role("button", name="No, change nothing").click()
+        corners.fill("8, 8; 24, 8; 24 16; 8, 16")
+        page.get_by_role("button", name="Name an area").click()
+        dialog.get_by_label("Name of the area").fill("aisle <5>")
+        dialog.get_by_label("For planners").select_option("drive slower")
+        dialog.get_by_label("Percent").fill("30")
+        dialog.get_by_label("Your name").fill("ada")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        areas = page.get_by_role("list", name="Areas")
+        expect(areas).to_contain_text("aisle <5>: 128 m², at most 30 % of the speed")
+        expect(corners).to_have_value("")
+        assert listed() == "aisle <5>: 128.0 m2, speed 30 %\n1 areas\n"
+        opened(page, served, "")
+        expect(page.locator(".area-name")).to_have_text("aisle <5>")
+
+        # Somebody else changes the areas while the dialog is open: nothing of it is lost.
+        opened(page, served, "map")
+        with page.expect_response("**/areas"):
+            page.get_by_role("button", name="Change aisle <5>").click()
+        expect(dialog.get_by_label("Name of the area")).to_have_value("aisle <5>")
+        dialog.get_by_label("Name of the area").fill("aisle 5")
+        dialog.get_by_label("For planners").select_option("no effect")
+        dialog.get_by_label("Your name").fill("ada")
+        found = store.areas(SITE).geojson(SITE)
+        shape = {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]}
+        found["features"].append({"type": "Feature", "geometry": shape, "properties": {"name": "gate"}})
+        replace_areas(store, SITE, to_json(found), Actor("bob"), tag=None)
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(dialog.get_by_role("alert")).to_contain_text("were changed meanwhile; load them anew")
+        dialog.get_by_role("button", name="No, change nothing").click()
+        assert [area.name for area in store.areas(SITE).areas] == ["gate", "aisle <5>"]
+        page.get_by_role("button", name="Change aisle <5>").click()
+        dialog.get_by_label("Name of the area").fill("aisle 5")
+        dialog.get_by_label("For planners").select_option("no effect")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(areas).to_contain_text("aisle 5: 128 m²")
+        assert listed() == "aisle 5: 128.0 m2\ngate: 6.0 m2\n2 areas\n"
+        for name in ("aisle 5", "gate"):
+            change(page, f"Remove {name}")
+            expect(areas).not_to_contain_text(name)
+        assert listed() == "0 areas\n"
+        refused = [fault for fault in seen.faults if "412" not in fault]
+        assert refused == []
 
 
 def test_a_test_alert_is_sent_and_its_answer_told(page: Page, tmp_path: Path) -> None:
@@ -131,17 +207,17 @@ def test_what_the_gate_refuses_is_told_and_can_be_forced(page: Page, tmp_path: P
         opened(page, served, "map", version=4)
         gate, card = page.locator("#gate"), page.locator("#versions li", has_text="Version 4")
         expect(gate).to_contain_text("The gate would refuse it.")
-        expect(gate).to_contain_text("Share of the landmarks 0.")
+        expect(gate).to_contain_text("The number of landmarks is 0.")
         expect(gate.locator(".not_judged")).to_contain_text("Frames that the build left out: too few of them")
         assert "_" not in gate.inner_text(), "no key of the code"
         change(page, "Publish draft 4")
         dialog = page.get_by_role("dialog")
         expect(dialog.get_by_role("alert")).to_contain_text("draft 4 of hall is refused")
         dialog.get_by_role("button", name="No, change nothing").click()
-        expect(card).to_contain_text("The gate refused it: share of the landmarks")
+        expect(card).to_contain_text("The gate refused it: the number of landmarks")
         change(page, "Publish draft 4 by force")
         expect(page.get_by_role("status")).to_have_text("Robots should use version 4.")
-        expect(card).to_contain_text("Published by force, although: share of the landmarks")
+        expect(card).to_contain_text("Published by force, although: the number of landmarks")
 
 
 def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, served: Served) -> None:

@@ -208,7 +208,22 @@ def test_versions_are_compared(page: Page, served: Served) -> None:
     content = page.locator("main")
     for words in ("2 added, 6 changed, 0 removed", "211.0 m before, 213.0 m after", "The gate would accept it."):
         expect(content).to_contain_text(words)
+    swipe = page.locator(".swipe")
+    swipe.get_by_role("slider").fill("0.25")
+    assert swipe.locator("rect").evaluate_all("all => all.map(r => [r.x.baseVal.value, r.width.baseVal.value])") == [
+        [0.0, 16.0],
+        [16.0, 64.0],
+        [16.0, 0.16],
+    ]
+    assert swipe.locator("image").evaluate_all("all => all.map(i => i.width.baseVal.value)") == [48.0, 64.0]
     assert seen.faults == []
+
+
+def test_a_page_that_stays_as_it_is_is_not_sent_again(served: Served) -> None:
+    first = httpx.get(f"{served.http}/dashboard/space", timeout=60)
+    for tag, status in ((first.headers["etag"], 304), ('"0"', 200), ("", 200)):
+        again = httpx.get(f"{served.http}/dashboard/space", headers={"If-None-Match": tag}, timeout=60)
+        assert (again.status_code, bool(again.content)) == (status, status == 200)
 
 
 def test_wrong_addresses_are_answered_in_words(served: Served) -> None:

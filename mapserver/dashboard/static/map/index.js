@@ -27,7 +27,7 @@ const DRAWN = {
 };
 
 export class SiteMap {
-  // element: is filled by the map; scene: label, box and layers as of map_layers.py; onPick(x, y): a click beside the marks.
+  // element: is filled by the map; scene: label, box and layers as of map_layers.py; onPick(x, y, mark): a click, but on a mark that leads to a page.
   // fillsPage: the wheel zooms at once; else it scrolls the page until the map has the focus.
   constructor(element, scene, { onPick = () => {}, fillsPage = false } = {}) {
     this.element = element;
@@ -53,7 +53,8 @@ export class SiteMap {
     const marks = new Marks();
     map.addLayer(new Axes()).addLayer(marks);
     map.on("click", ({ containerPoint, latlng }) => {
-      if (!marks.nearest(containerPoint)) onPick(latlng.lng, latlng.lat);
+      const mark = marks.nearest(containerPoint)?.item;
+      if (!mark?.address) onPick(latlng.lng, latlng.lat, mark);
     });
     element.marks = () => marks.told(); // a canvas does not say what it shows
     this.layers = {};
