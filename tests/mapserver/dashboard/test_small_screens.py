@@ -77,12 +77,13 @@ def test_all_acts_on_a_phone(phone: Page, served: Served) -> None:
     expect(phone.get_by_role("dialog")).to_have_count(0)
 
     opened(phone, served, "map")
-    phone.get_by_text("Draw on the map").tap()
+    phone.get_by_text("Draw an area or a survey on the map").tap()
+    phone.get_by_label("Draw: each click").tap()
     drawing = phone.locator(".site-map").first
     for x, y in ((150, 150), (200, 150), (200, 200)):
         drawing.tap(position={"x": x, "y": y})
     assert len(marks(phone, 3)) == 3
-    change(phone, "Ask for a survey of it")
+    change(phone, "Request a survey here")
     expect(phone.get_by_text(re.compile("asked by ada at "))).to_have_count(1)
 
     for act, current in (("Publish draft 3", 3), ("Roll back to version 2", 2), ("Promote version 3", 3)):
