@@ -1,6 +1,6 @@
 """`mapserver operators`: accounts of operators and programs."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -8,9 +8,6 @@ from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
 from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
 from mapserver.operators.roles import Role, Scope
-
-if TYPE_CHECKING:
-    from mapserver.store import MapStore
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the operator.")]
 NewRole = Annotated[Role, typer.Option(help="viewer: reads; operator: changes versions too; admin: everything.")]
@@ -23,9 +20,9 @@ def add(name: Name, store: StoreFolder, by: ActorOptions, role: NewRole = Role.V
     from mapserver.operators.operators import Operators
 
     with open_store(store) as maps:
-        password, shown = _password(ask=ask)
-        Operators(maps).add(name, role.value, password, by.named())
-    typer.echo(f"operator {name} is a {role.value}{shown}")
+        chosen = _chosen(ask=ask)
+        made = Operators(maps).add(name, role.value, chosen, by.named())
+    typer.echo(f"operator {name} is a {role.value}{_shown(chosen, made)}")
 
 
 @expand_options
@@ -34,10 +31,9 @@ def password(name: Name, store: StoreFolder, by: ActorOptions, ask: Asked = Fals
     from mapserver.operators.operators import Operators
 
     with open_store(store) as maps:
-        _check_person(maps, name)
-        made, shown = _password(ask=ask)
-        Operators(maps).set_password(name, made, by.named())
-    typer.echo(f"operator {name} has another password{shown}")
+        chosen = _chosen(ask=ask)
+        made = Operators(maps).set_password(name, chosen, by.named())
+    typer.echo(f"operator {name} has another password{_shown(chosen, made)}")
 
 
 @expand_options
@@ -48,9 +44,10 @@ def role(
     by: ActorOptions,
 ) -> None:
     """Change the role of an operator, effective at once."""
+    from mapserver.operators.operators import Operators
+
     with open_store(store) as maps:
-        _check_person(maps, name)
-        maps.operators.set_role(name, role.value, by.named())
+        Operators(maps).set_role(name, role.value, by.named())
     typer.echo(f"operator {name} is a {role.value}")
 
 
@@ -86,9 +83,10 @@ def list_(store: StoreFolder, json: Json = False) -> None:
     from rich.table import Table
 
     from fleetmap.console import plain_console
+    from mapserver.operators.operators import Operators
 
     with open_store(store, read_only=True) as maps:
-        found = maps.operators.all(maps.now_ns())
+        found = Operators(maps).all()
     if json:
         shown = ("name", "role", "is_disabled", "sessions", "tokens")
         print_json([{name: getattr(row, name) for name in shown} for row in found])
@@ -99,24 +97,13 @@ def list_(store: StoreFolder, json: Json = False) -> None:
     plain_console().print(table)
 
 
-def _check_person(maps: "MapStore", name: str) -> None:
-    row = maps.operators.find(name)
-    if row is not None and row.role == "program":
-        raise UsageError(f"{name} is a program, which has tokens alone; choose another name for a person")
+def _chosen(*, ask: bool) -> str | None:
+    """Ask for a password; None to have one generated."""
+    return typer.prompt("password", hide_input=True, confirmation_prompt=True) if ask else None
 
 
-def _password(*, ask: bool) -> tuple[str, str]:
-    """Return a password, and text that shows a generated one."""
-    from mapserver.operators.operators import MAX_PASSWORD, MIN_PASSWORD
-    from mapserver.trust.keys import make_passphrase
-
-    if not ask:
-        made = make_passphrase()
-        return made, f"; password (shown once): {made}"
-    chosen: str = typer.prompt("password", hide_input=True, confirmation_prompt=True)
-    if not MIN_PASSWORD <= len(chosen) <= MAX_PASSWORD:
-        raise UsageError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters; leave --ask out to generate one")
-    return chosen, ""
+def _shown(chosen: str | None, made: str) -> str:
+    return f"; password (shown once): {made}" if chosen is None else ""
 
 
 OPERATORS = Group(

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
+from fleetmap.errors import StateError, UsageError
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.operators.roles import SCOPES, Identity, check_operator_name
-from mapserver.store import Actor, MapStore, TokenRow
+from mapserver.store import Actor, MapStore, OperatorRow, TokenRow
+from mapserver.trust.keys import make_passphrase
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -59,16 +61,37 @@ class Operators:
             self._looked_ns, self._are_there = self._now_ns(), self._store.operators.are_there()
         return self._are_there
 
-    def add(self, name: str, role: str, password: str, actor: Actor) -> None:
-        """Add an operator; UsageError for a taken or invalid name."""
-        self._store.operators.add(check_operator_name(name), role, _hasher().hash(password), actor)
+    def all(self) -> list[OperatorRow]:
+        """Return operators and programs by name, with the numbers of their valid sessions and tokens."""
+        now_ns = self._now_ns()
+        return self._store.operators.all(now_ns, now_ns - LIFE_S * 10**9, now_ns - IDLE_S * 10**9)
 
-    def set_password(self, name: str, password: str, actor: Actor) -> None:
-        """Set a new password, which ends all sessions; UsageError for an unknown name."""
-        self._store.operators.set_password(name, _hasher().hash(password), actor)
+    def add(self, name: str, role: str, password: str | None, actor: Actor) -> str:
+        """Add an operator and return the password, a generated one for None. UsageError for a taken or invalid name, or such a password."""
+        password, hashed = self._hashed(check_operator_name(name), password)
+        self._store.operators.add(name, role, hashed, actor)
+        self._are_there = True
+        return password
+
+    def set_password(self, name: str, password: str | None, actor: Actor) -> str:
+        """Set and return a password, as `add`; ends all sessions. UsageError for an unknown name and a program."""
+        password, hashed = self._hashed(name, password)
+        self._store.operators.set_password(name, hashed, actor)
+        return password
+
+    def set_role(self, name: str, role: str, actor: Actor, *, keeps_an_admin: bool = False) -> None:
+        """Set a role, from the next request on. Errors as of `set_password`; keeps_an_admin: StateError for the last admin."""
+        self._check_person(name)
+        self._store.operators.set_role(name, role, actor, keeps_an_admin=keeps_an_admin)
 
     def make_token(self, name: str, scopes: "Iterable[str]", days: float, actor: Actor) -> str:
-        """Create a token, shown once; without an operator of that name it is a program's. UsageError for an invalid name."""
+        """Create a token, shown once; without an operator of that name it is a program's.
+
+        UsageError for an invalid name, StateError for a disabled one.
+        """
+        known = self._store.operators.find(name)
+        if known is not None and known.is_disabled:
+            raise StateError(f"{name} is disabled, so that its tokens are refused; choose another name")
         token, ends_ns = secrets.token_urlsafe(32), self._now_ns() + int(days * 86_400e9)
         row = TokenRow(check_operator_name(name), "", " ".join(sorted(set(scopes))), ends_ns)
         self._store.operators.add_token(_digest(token), row, actor)
@@ -134,6 +157,22 @@ class Operators:
             return
         more, self._unnoted = self._unnoted, 0
         self._store.audit(kind, f"{detail} (and {more} lines left out)" if more else detail, actor=actor)
+
+    def _hashed(self, name: str, password: str | None) -> tuple[str, str]:
+        """Return a password for this name, and its hash."""
+        self._check_person(name)
+        password = make_passphrase() if password is None else password
+        if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
+            raise UsageError(
+                f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters, not {len(password)}; a generated one has them"
+            )
+        with self._verifying:
+            return password, _hasher().hash(password)
+
+    def _check_person(self, name: str) -> None:
+        row = self._store.operators.find(name)
+        if row is not None and row.role == "program":
+            raise StateError(f"{name} is a program, which has tokens alone; choose another name for a person")
 
     def _by_token(self, token: str, address: str) -> Identity | None:
         row = self._store.operators.token(_digest(token))

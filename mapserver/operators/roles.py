@@ -10,7 +10,8 @@ from fleetmap.errors import UsageError
 if TYPE_CHECKING:
     from mapserver.store import Actor
 
-_NAME = re.compile(r"[a-z0-9][a-z0-9._@+-]{0,63}")
+OPERATOR_PATTERN = r"^[a-z0-9][a-z0-9._@+-]{0,63}$"
+_NAME = re.compile(OPERATOR_PATTERN)
 
 
 class Scope(StrEnum):

@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from fleetmap.access import Access, Holder, Purpose
 from fleetmap.bus import TlsFiles
 from fleetmap.encoding import to_json
-from fleetmap.errors import LinkError, StateError, StoreError, UsageError, disk_errors
+from fleetmap.errors import LinkError, StateError, StoreError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat import check_name
 from fleetmap.messages import encode_message
@@ -80,8 +81,8 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         """Name in the certificate of its bundle."""
         return f"{self.certificate}.enrol"
 
-    def row(self, now_ns: int) -> dict[str, str | int | float]:
-        """Return the row of `robots list`. certificate: the name in it; days_left: of it, or of the unused bundle."""
+    def row(self, now_ns: int) -> dict[str, Any]:
+        """Return the row of `robots list`. certificate: the name in it; days_left: of it, or of the bundle while `is_used` is false."""
         since_ns = self.enrolled_ns if self.renewed_ns is None else self.renewed_ns
         left = DAYS["enrol" if self.renewed_ns is None else "robot"] - (now_ns - since_ns) / _DAY_NS
         if self.renewed_ns is None:
@@ -89,7 +90,8 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         else:
             state = f"certificate for {left:.0f} days" if left > 0 else "certificate expired: revoke and enrol again"
         named = {"site": self.site, "robot": self.robot, "certificate": self.certificate}
-        return {**named, "enrolled_ns": self.enrolled_ns, "days_left": round(left, 2), "state": state}
+        used = {"enrolled_ns": self.enrolled_ns, "is_used": self.renewed_ns is not None}
+        return {**named, **used, "days_left": round(left, 2), "state": state}
 
 
 class RobotRegister:
@@ -149,7 +151,7 @@ class RobotRegister:
     def enrol(self, site: str, robots: Sequence[str], endpoint: str, *, actor: Actor = NOBODY) -> dict[str, bytes]:
         """Return the bundle of each robot. An unused earlier bundle is replaced and becomes invalid.
 
-        Raises StateError for enrolled robots, UsageError for invalid names and an endpoint that is not in the server's certificate.
+        Raises StateError for enrolled robots and an endpoint that is not in the server's certificate, UsageError for invalid names.
         """
         check_name(site, "site")
         self._check_endpoint(endpoint)
@@ -245,7 +247,8 @@ class RobotRegister:
         return TlsFiles(self._keys / "servers-ca.crt", own)
 
     def default_endpoint(self, listening: str) -> str:
-        """Return the robots' endpoint of a server that listens here: with the first name in its certificate."""
+        """Return the robots' endpoint of a server that listens here: with the first name in its certificate. StateError without one."""
+        _ = self.tls
         host = self.authorities.hosts[0]
         return f"{listening.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{listening.rpartition(':')[2]}"
 
@@ -254,7 +257,7 @@ class RobotRegister:
         host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         hosts = self.authorities.hosts
         if host not in hosts:
-            raise UsageError(
+            raise StateError(
                 f"robots would refuse the server at {endpoint}: its certificate names {', '.join(hosts)}; name one of them, or "
                 "make another certificate: `mapserver trust rotate server --host ...`"
             )

@@ -1,9 +1,11 @@
 """Operators, their sessions and tokens. Secrets are stored as hashes only; every change is logged."""
 
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import StateError, UsageError
 from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry
 
@@ -62,32 +64,43 @@ class OperatorQueries:
             OperatorRow, "SELECT name, role, password, is_disabled FROM operators WHERE name = ?", (name,)
         )
 
-    def all(self, now_ns: int) -> list[OperatorRow]:
+    def all(self, now_ns: int, begun_after_ns: int, used_after_ns: int) -> list[OperatorRow]:
+        """Return operators and programs by name, with the numbers of their tokens that are valid now, and of sessions this young."""
         return self._transactions.rows(
             OperatorRow,
             """SELECT name, role, password, is_disabled,
-               (SELECT count(*) FROM tokens t WHERE t.name = o.name AND ends_ns > ?) tokens,
-               (SELECT count(*) FROM sessions s WHERE s.name = o.name) sessions FROM operators o ORDER BY name""",
+               (SELECT count(*) FROM tokens t WHERE t.name = o.name AND ends_ns > ?1) tokens,
+               (SELECT count(*) FROM sessions s WHERE s.name = o.name AND begun_ns > ?2 AND used_ns > ?3) sessions
+               FROM operators o ORDER BY name""",
+            (now_ns, begun_after_ns, used_after_ns),
+        )
+
+    def tokens(self, now_ns: int) -> list[TokenRow]:
+        """Return the tokens that are valid now, by name and end."""
+        return self._transactions.rows(
+            TokenRow,
+            """SELECT name, role, scopes, ends_ns FROM tokens JOIN operators USING (name)
+               WHERE ends_ns > ? ORDER BY name, ends_ns""",
             (now_ns,),
         )
 
     def add(self, name: str, role: str, password: str | None, actor: Actor) -> None:
-        """Add an operator; UsageError if the name is taken."""
+        """Add an operator; StateError if the name is taken."""
         with self._transactions.write() as connection:
             values = (name, role, password)
             done = connection.execute(
                 "INSERT OR IGNORE INTO operators (name, role, password, is_disabled) VALUES (?, ?, ?, 0)", values
             )
             if not done.rowcount:
-                raise UsageError(
+                raise StateError(
                     f"operator {name} exists; `mapserver operators role {name} ROLE` or "
                     f"`mapserver operators password {name}` changes it"
                 )
             self._transactions.log(connection, "", LogEntry("operator added", f"{name}, {role}", None, actor))
 
-    def set_role(self, name: str, role: str, actor: Actor) -> None:
-        """Set a role, from the next request on. UsageError for an unknown name."""
-        with self._transactions.write() as connection:
+    def set_role(self, name: str, role: str, actor: Actor, *, keeps_an_admin: bool = False) -> None:
+        """Set a role, from the next request on. UsageError for an unknown name; keeps_an_admin: StateError for the last admin."""
+        with self._transactions.write() as connection, self._keeping_an_admin(name, keeps_an_admin):
             _change(connection, "UPDATE operators SET role = ? WHERE name = ?", role, name)
             self._transactions.log(connection, "", LogEntry("operator's role", f"{name}, {role}", None, actor))
 
@@ -98,13 +111,24 @@ class OperatorQueries:
             connection.execute("DELETE FROM sessions WHERE name = ?", (name,))
             self._transactions.log(connection, "", LogEntry("operator's password", name, None, actor))
 
-    def disable(self, name: str, actor: Actor) -> None:
-        """End sessions and tokens of a name at once, and refuse its sign-in. UsageError for an unknown name."""
-        with self._transactions.write() as connection:
+    def disable(self, name: str, actor: Actor, *, keeps_an_admin: bool = False) -> None:
+        """End sessions and tokens of a name at once, and refuse its sign-in. Errors as of `set_role`."""
+        with self._transactions.write() as connection, self._keeping_an_admin(name, keeps_an_admin):
             _change(connection, "UPDATE operators SET is_disabled = 1 WHERE name = ?", name)
             for table in ("sessions", "tokens"):
                 connection.execute(f"DELETE FROM {table} WHERE name = ?", (name,))
             self._transactions.log(connection, "", LogEntry("operator disabled", name, None, actor))
+
+    @contextmanager
+    def _keeping_an_admin(self, name: str, is_wanted: bool) -> Iterator[None]:
+        """Raise StateError, which takes the change of the block back, if it leaves no admin who can sign in."""
+        before = self.find(name)
+        yield
+        admins = "SELECT 1 FROM operators WHERE role = 'admin' AND password IS NOT NULL AND is_disabled = 0 LIMIT 1"
+        if is_wanted and before is not None and before.role == "admin" and not self._transactions.query(admins):
+            raise StateError(
+                f"{name} is the last admin; add another one first, or use the command line of the server, which always can"
+            )
 
     def begin_session(self, sha256: str, name: str, actor: Actor) -> None:
         now_ns = self._transactions.now_ns()

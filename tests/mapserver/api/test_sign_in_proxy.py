@@ -146,4 +146,4 @@ def test_serve_believes_the_named_address_alone(tmp_path: Path) -> None:
                 assert ("proxy:ada@example.com (operator)" in page.text) == (address == "127.0.0.2")
         assert found == {"127.0.0.1": 401, "127.0.0.2": 200}
     with MapStore.open(tmp_path) as store:
-        assert store.operators.all(0) == [], "the proxy's people are nobody of the store"
+        assert not store.operators.are_there(), "the proxy's people are nobody of the store"
