@@ -24,6 +24,7 @@ from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
+from mapserver.api.people_routes import install_people_routes
 from mapserver.api.request_limits import RequestLimits
 from mapserver.api.server_routes import install_server_routes
 from mapserver.api.version_routes import ApiSettings, install_version_routes
@@ -58,8 +59,8 @@ def create_app(
         default_response_class=describe.ExactJson,
     )
     problems.install(app)
-    guard = settings.guard
-    app.add_middleware(Guard, settings=guard if guard.operators else replace(guard, operators=Operators(store)))
+    operators = settings.guard.operators or Operators(store)
+    app.add_middleware(Guard, settings=replace(settings.guard, operators=operators))
     app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
     _install_service_routes(app, store, fleet, metrics, bus)
@@ -70,6 +71,7 @@ def create_app(
     install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
     install_server_routes(app, store, fleet, settings)
     install_building_routes(app, store)
+    install_people_routes(app, store, operators, bus)
     describe.install(app)
     return app
 

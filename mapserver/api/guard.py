@@ -3,7 +3,9 @@
 With sign-in on, every request except those in `_OPEN` needs a scope; an unlisted path needs the strongest scope of its method.
 """
 
+import re
 from dataclasses import dataclass
+from html import escape
 from ipaddress import ip_address
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -12,7 +14,7 @@ from anyio import to_thread
 from fastapi import Request
 from starlette.exceptions import HTTPException
 from starlette.requests import cookie_parser
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapserver.api.problems import problem
@@ -20,10 +22,22 @@ from mapserver.api.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.operators.operators import LIFE_S, Operators
 from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
+from mapserver.serving.http_connections import is_loopback_name
 from mapserver.store import Actor
 
 SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
+_RIGHTS = (  # needed for reading, too
+    (re.compile(r"/metrics$"), Right.METRICS),
+    (re.compile(r"/v1/(operators|tokens)(/|$)|/dashboard/administration/people(/|$)"), Right.OPERATORS),
+    (re.compile(r"/v1/sites/[^/]+/(enrolled(/|$)|robots/[^/]+/remove(/|$))"), Right.ROBOTS),
+)
+_FORBIDDEN = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Not allowed – fleetmap</title><link rel="icon" href="data:,"><link rel="stylesheet" href="{style}"></head>
+<body class="print"><main class="sign-in"><h1>Not allowed</h1><p class="notice bad" role="alert">{words}</p>
+<p><a href="/">To the Overview</a></p></main></body></html>
+"""
 _POLICY = (
     b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
     b"form-action 'self'; frame-ancestors 'none'"
@@ -150,7 +164,11 @@ class Guard:
     def _refused_person(self, scope: Scope) -> Response | None:
         """Refuse requests without a session or token, or with insufficient rights."""
         right = _needed(scope)
-        if right is None or not self._settings.is_sign_in_on:
+        if not self._settings.is_sign_in_on:
+            is_open = right not in {Right.OPERATORS, Right.ROBOTS} or is_loopback_name(address_of(scope))
+            words = "without operators only the server's own machine may do this; `mapserver operators add NAME --role admin` there"
+            return None if is_open else _refuse(scope, 403, words)
+        if right is None:
             return None
         who = self._settings.identify(scope, uses=_is_somebodys(scope))
         if who is None and (name := proxied_name(scope)):
@@ -158,7 +176,7 @@ class Guard:
                 scope, 403, f"none of the groups of {name} has a role here; --sign-in-group gives one a role"
             )
         if who is None:
-            if scope["method"] == "GET" and "text/html" in _headers(scope).get("accept", ""):
+            if _is_for_a_page(scope):
                 asked = scope["path"] + (f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else "")
                 return RedirectResponse(f"{SIGN_IN}?next={quote(asked, safe='')}", 303)
             return _refuse(scope, 401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
@@ -166,6 +184,9 @@ class Guard:
             words = f"this needs the right to {right.value!r}, which {who.name} ({who.role}) does not have"
             if self._settings.operators is not None:
                 self._settings.operators.note("refused", f"{scope['method']} {scope['path'][:200]!r}", who.actor())
+            if _is_for_a_page(scope):
+                words = f"{who.name} ({who.role}) may not open this page; an admin may."
+                return HTMLResponse(_FORBIDDEN.format(style=STYLE, words=escape(words)), 403)
             return _refuse(scope, 403, words)
         scope.setdefault("state", {})["operator"] = who
         return None
@@ -187,8 +208,9 @@ def _needed(scope: Scope) -> Right | None:
     path = scope["path"]
     if path in _OPEN:
         return None
-    if path == "/metrics":
-        return Right.METRICS
+    for pattern, right in _RIGHTS:
+        if pattern.match(path):
+            return right
     return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
 
 
@@ -196,6 +218,11 @@ def _is_somebodys(scope: Scope) -> bool:
     """True if a user sends the request, not an open page by itself."""
     headers = _headers(scope)
     return "fleetmap-renewal" not in headers and headers.get("accept") != "text/event-stream"
+
+
+def _is_for_a_page(scope: Scope) -> bool:
+    """True if a browser opens an address."""
+    return scope["method"] == "GET" and "text/html" in _headers(scope).get("accept", "")
 
 
 def _refuse(scope: Scope, status: int, words: str, headers: dict[str, str] | None = None) -> Response:

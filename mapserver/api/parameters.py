@@ -15,12 +15,14 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 from fleetmap.version_grid import FLOOR_M, TOP_M
 from mapserver.api.moments import read_range
+from mapserver.operators.roles import OPERATOR_PATTERN
 from mapserver.store import FailureFilter
 
 Item = TypeVar("Item")
 
 Site = Annotated[str, Path(pattern=NAME_PATTERN, examples=["hall"])]
 Robot = Annotated[str, Path(pattern=NAME_PATTERN, examples=["tug-7"])]
+Operator = Annotated[str, Path(pattern=OPERATOR_PATTERN, examples=["ada"])]
 RequestId = Annotated[str, Path(pattern="^[0-9a-f]{8}$", examples=["3fa9c1d2"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]

@@ -5,11 +5,14 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
+from fleetmap.mapformat.names import NAME_PATTERN
 from mapserver.fleet.alerts import Alert
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.operators.operators import MAX_TOKEN_DAYS
+from mapserver.operators.roles import OPERATOR_PATTERN, Role, Scope
 from mapserver.quality.figures import TrustedCalibration
 from mapserver.serving.robot_placing import MOST_SIGMA_M
 from mapserver.store import (
@@ -163,6 +166,62 @@ class CanaryView:
     robots: list[str]
 
 
+@dataclass(frozen=True, slots=True)
+class TokenView:
+    """A valid token: its scopes and its end. The token itself is not stored."""
+
+    scopes: list[str]
+    ends_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorView:
+    """An operator, or with the role `program` a name that has tokens alone. sessions: number of the open ones."""
+
+    name: str
+    role: str
+    is_disabled: bool
+    sessions: int
+    tokens: list[TokenView]
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorList:
+    """Operators and programs by name."""
+
+    operators: list[OperatorView]
+    next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Secret:
+    """A new password or token; no other answer has it."""
+
+    name: str
+    secret: str
+
+
+@dataclass(frozen=True, slots=True)
+class EnrolledRobot:
+    """A robot that is admitted to the bus. certificate: the name in it; days_left: of it, or of the bundle while that is not used."""
+
+    site: str
+    robot: str
+    certificate: str
+    enrolled_ns: int
+    is_used: bool
+    days_left: float
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class EnrolledList:
+    """Enrolled robots of a site, by name."""
+
+    robots: list[EnrolledRobot]
+    next: str | None
+
+
 Metres = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -231,6 +290,37 @@ class SurveyAct(Act):
         list[tuple[Metres, Metres]],
         Field(min_length=3, max_length=MOST_CORNERS),
     ]
+
+
+class RoleAct(Act):
+    """Author and reason of another role."""
+
+    model_config = _body(actor="ada", reason="she leads the shift", role="operator")
+    role: Role
+
+
+class OperatorAct(RoleAct):
+    """Author and reason of a new operator, with name and role."""
+
+    model_config = _body(actor="ada", reason="a new colleague", name="bob", role="operator")
+    name: Annotated[str, Field(pattern=OPERATOR_PATTERN)]
+
+
+class TokenAct(Act):
+    """Author and reason of a token, its scopes and days. A name without an operator becomes a program's."""
+
+    model_config = _body(actor="ada", reason="metrics", name="prometheus", scopes=["metrics"], days=90)
+    name: Annotated[str, Field(pattern=OPERATOR_PATTERN)]
+    scopes: Annotated[list[Scope], Field(min_length=1, max_length=len(Scope))]
+    days: Annotated[float, Field(gt=0, le=MAX_TOKEN_DAYS)] = 90
+
+
+class EnrolAct(Act):
+    """Author and reason of an enrolment. endpoint: of the server as robots reach it, by default with the first name of its certificate."""
+
+    model_config = _body(actor="ada", reason="a new robot", robot="tug-7")
+    robot: Annotated[str, Field(pattern=NAME_PATTERN)]
+    endpoint: Annotated[str | None, Field(max_length=300, pattern=r"^(tls|quic)/\S+:[0-9]{1,5}$")] = None
 
 
 _NOT_FOUND: dict[str, JsonValue] = {

@@ -111,6 +111,7 @@ def paths_of(client: TestClient) -> list[tuple[str, str]]:
         "sha256": "5e" * 32,
         "job": "1",
         "robot": "r1",
+        "operator": "olga",
         "asked": "00000000",
         "number": "1",
     }

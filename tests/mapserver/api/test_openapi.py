@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import msgspec
 import numpy as np
+import pytest
 import schemathesis
 from hypothesis import HealthCheck, given, settings
 from schemathesis.checks import not_a_server_error
@@ -15,7 +16,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from fleetmap.messages import CameraNote, FailureReport, Placement, Thumbnail
+from fleetmap.messages import CameraNote, FailureReport, Placement, RobotHealth, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
@@ -25,8 +26,13 @@ from mapserver.fleet.building import align
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.pins import parse_pin
+from mapserver.operators.operators import Operators
+from mapserver.operators.roles import Scope
 from mapserver.store import Actor, FailureReplay, MapStore
+from mapserver.trust import init_here
+from mapserver.trust.enrolment import RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.quick_passwords import use_quick_passwords
 from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
 
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
@@ -49,7 +55,7 @@ LOOKED = msgspec.structs.replace(
 )  # fmt: skip
 
 
-def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[int]:
+def ask_operation(operation: schemathesis.APIOperation, request: str, headers: dict[str, str]) -> list[int]:
     """The statuses of the answers to questions made up after the document, some of them about what is there."""
     statuses: list[int] = []
 
@@ -63,6 +69,7 @@ def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[in
         path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
         path |= {"asked": request} if number % 2 and "asked" in path else {}
         path |= {"robot": "r1"} if number % 2 and "robot" in path else {}
+        path |= {"operator": "olga"} if number % 2 and "operator" in path else {}
         path |= {"place": 0} if number % 2 and "place" in path else {}
         if (
             number % 2 and "/changes." in operation.label
@@ -75,17 +82,15 @@ def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[in
             where |= {"corners_map_m": POLYGON} if "corners_map_m" in case.body else {}
             if operation.label.endswith("/publish") and number % 4 == 1:  # the gate refuses the draft otherwise
                 where |= {"force": True, "reason": "a test"}
-            if (
-                operation.label.endswith("/rollback") and number % 4 == 1
-            ):  # made-up versions are hardly ever the right ones
+            if operation.label.endswith("/rollback") and number % 4 == 1:  # made-up versions are hardly ever right
                 where |= {"to": None, "canary": None}
-            case.body = case.body | {"actor": "ada"} | where  # nobody signs in here
+            case.body = case.body | {"actor": "root"} | where
         if number % 2 and operation.label.startswith(("PUT", "DELETE")):
-            case.query, case.headers = {"actor": "ada"}, {}
+            case.query, case.headers = {"actor": "root"}, {}
             if operation.label.startswith("PUT"):
                 case.body = AREAS if operation.label.endswith("/areas") else b""
                 case.query |= {} if operation.label.endswith("/areas") else {"pin": PINS}
-        response = case.call(base_url="http://127.0.0.1")
+        response = case.call(base_url="http://127.0.0.1", headers=headers)
         case.validate_response(response, checks=list(CHECKS))
         statuses.append(response.status_code)
 
@@ -93,7 +98,8 @@ def ask_operation(operation: schemathesis.APIOperation, request: str) -> list[in
     return statuses
 
 
-def test_no_question_breaks_the_server(tmp_path: Path) -> None:
+def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_quick_passwords(monkeypatch)
     now_ns = time.time_ns()
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         for seed in range(2):
@@ -108,13 +114,22 @@ def test_no_question_breaks_the_server(tmp_path: Path) -> None:
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
         align(store, "hall", [parse_pin(pin) for pin in PINS], None, None, Actor("ada"))
+        fleet.take_health("hall", "r1", RobotHealth(site="hall", robot="r1", stamp_ns=5, version=1, status="LOST"))
+        fleet.flush()
+        init_here(store)
+        robots = RobotRegister(store)
+        robots.authorities.init(["127.0.0.1"], None, None)
+        robots.enrol("hall", ["r1"], "tls/127.0.0.1:7447")
+        operators = Operators(store)
+        operators.add("olga", "viewer", None, Actor("ada"))
+        headers = {"Authorization": f"Bearer {operators.make_token('root', Scope, 1, Actor('ada'))}"}
         asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
         receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
         settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver)
         app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
-        schema = schemathesis.openapi.from_asgi("/openapi.json", app)
+        schema = schemathesis.openapi.from_asgi("/openapi.json", app, headers=headers)
         asked = {
-            operation.ok().label: ask_operation(operation.ok(), asked_for.id)
+            operation.ok().label: ask_operation(operation.ok(), asked_for.id, headers)
             for operation in schema.get_all_operations()
         }
         assert sum(len(statuses) for statuses in asked.values()) >= 100

@@ -49,6 +49,8 @@ class MemoryBus(Bus):
     As on the network, denied messages are dropped silently: no error, no delivery.
     """
 
+    endpoint = "tls/0.0.0.0:7447"
+
     def __init__(self, hub: MemoryHub, certificate: str | None = None) -> None:
         """certificate: its common name; None for the server."""
         self._hub, self._certificate = hub, certificate

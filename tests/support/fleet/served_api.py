@@ -38,7 +38,7 @@ def served_api(folder: Path) -> Iterator[Server]:
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
         app = create_app(store, fleet, Metrics(store, fleet), bus)
-        with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as client:
+        with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False, client=("127.0.0.1", 9)) as client:
             yield Server(client, store, fleet, bus, folder)
 
 
