@@ -234,6 +234,7 @@ class Console:
             "person": who,
             "sign_out": SIGN_OUT,
             "may_change": who is None or Scope.CHANGE in who.scopes,
+            "may_administer": who is None or Scope.OPERATORS in who.scopes,
             "warning": self.services.settings.guard.warning,
         }
         text = TEMPLATES.get_template(template).render(frame | found)

@@ -17,6 +17,7 @@ from mapserver.dashboard import (
     live_page,
     map_page,
     overview,
+    people,
     robot,
     sign_in_page,
     space_page,
@@ -44,7 +45,18 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     pages.add_middleware(GZipMiddleware, compresslevel=5)
     console = Console(pages, services)
     console.files()
-    for module in (overview, map_page, failures, failure, space_page, live_page, robot, survey_jobs, administration):
+    for module in (
+        overview,
+        map_page,
+        failures,
+        failure,
+        space_page,
+        live_page,
+        robot,
+        survey_jobs,
+        administration,
+        people,
+    ):
         module.install(console)
     console.nothing_else()
     _install_files(pages, services)

@@ -1,29 +1,31 @@
 // Acts: a button names a request to the HTTP API; a dialog explains it and asks for the reason and, without sign-in, the name.
 // data-act: the address; data-body: more of the request's body, which a page may set; data-explains: what would change.
-// data-tells: the answer is shown in the dialog, where the page shows nothing of it.
+// A template, behind the button or of the id data-fields, has fields for more of the body, filled from the button's data.
+// data-tells: the answer is shown in the dialog, where the page shows nothing of it; its words explain a secret or a file.
 // data-needs-reason: without a reason nothing is sent. data-lacks: set by a page while something is missing; the dialog then says that instead.
-// data-fields: the template of further fields, filled from the button's data and sent with the body. Events: `asked` as the dialog
-// opens, where a page may set `send` of the button to make another request; `acted` once it is done.
+// Events: `asked` as the dialog opens, where a page may set `send` of the button to make another request; `acted` once it is done.
 const dialog = document.createElement("dialog");
 dialog.className = "ask-box";
-dialog.innerHTML = `<form><h2></h2><p></p><div></div>
+dialog.innerHTML = `<form><h2></h2><p></p>
+<fieldset><div></div>
 <label class="name">Your name <input name="actor" maxlength="200" required pattern=".*\\S.*" autocomplete="name"></label>
-<label>Reason (kept in the history) <input name="reason" maxlength="2000" pattern=".*\\S.*"></label>
+<label>Reason (kept in the history) <input name="reason" maxlength="2000" pattern=".*\\S.*"></label></fieldset>
+<output hidden></output>
 <p class="notice bad" role="alert" hidden></p>
 <div class="actions"><button class="plain confirm"></button> <button class="plain" type="button">No, change nothing</button></div></form>`;
 document.body.append(dialog);
 const form = dialog.querySelector("form");
-const [title, explanation, fields, notice] = ["h2", "p", "div", ".notice"].map((found) => form.querySelector(found));
+const [title, explanation, notice, asks, fields, output] = ["h2", "p", ".notice", "fieldset", "fieldset > div", "output"].map((found) => form.querySelector(found));
 const [confirm, refuse] = form.querySelectorAll("button");
 const isNamed = document.body.dataset.named === "true";
 let asked;
+
+const say = (words, tone) => ((notice.textContent = words), (notice.hidden = !words), (notice.className = `notice ${tone}`));
 
 function post({ dataset }, told) {
   const body = JSON.stringify({ ...JSON.parse(dataset.body || "{}"), ...told });
   return fetch(dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body });
 }
-
-const say = (words, tone) => ((notice.textContent = words), (notice.hidden = !words), (notice.className = `notice ${tone}`));
 
 document.addEventListener("click", ({ target }) => {
   const button = target.closest("[data-act]");
@@ -33,34 +35,58 @@ document.addEventListener("click", ({ target }) => {
   const { lacks, needsReason } = button.dataset;
   [title.textContent, explanation.textContent] = [`${words}?`, lacks || button.dataset.explains];
   confirm.textContent = `Yes: ${words}`;
-  confirm.hidden = confirm.disabled = Boolean(lacks);
   refuse.textContent = "No, change nothing";
+  confirm.hidden = confirm.disabled = Boolean(lacks);
+  const more = document.getElementById(button.dataset.fields) ?? button.nextElementSibling;
+  fields.replaceChildren((!lacks && more?.content?.cloneNode(true)) || "");
+  for (const field of fields.querySelectorAll("[name]")) field.value = button.dataset[field.name] ?? field.value;
+  [asks.hidden, output.hidden] = [false, true];
   form.reason.value = "";
   form.reason.required = needsReason !== undefined;
   form.actor.parentElement.hidden = form.actor.disabled = isNamed;
-  const more = !lacks && document.getElementById(button.dataset.fields)?.content.cloneNode(true);
-  fields.replaceChildren(...(more ? [more] : []));
-  for (const field of fields.querySelectorAll("input, select")) field.value = button.dataset[field.name] ?? "";
   say("", "bad");
   button.dispatchEvent(new Event("asked", { bubbles: true }));
   dialog.showModal();
 });
 refuse.addEventListener("click", () => dialog.close());
-dialog.addEventListener("cancel", (event) => refuse.disabled && event.preventDefault()); // an act that goes on
+dialog.addEventListener("cancel", (event) => (refuse.disabled || !output.hidden) && event.preventDefault()); // an act that goes on, or its answer
+dialog.addEventListener("close", () => output.hidden || location.reload());
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
   const act = asked;
-  const told = Object.fromEntries(new FormData(form));
+  const told = { ...given(), ...(isNamed ? {} : { actor: form.actor.value }), reason: form.reason.value };
   confirm.disabled = refuse.disabled = true;
   const answer = await (act.send ?? post)(act, told).catch(() => undefined);
   confirm.disabled = refuse.disabled = false;
-  if (answer?.ok) act.dispatchEvent(new Event("acted", { bubbles: true }));
-  const tells = answer?.ok && act.dataset.tells !== undefined;
-  if (answer?.ok && !tells) return location.reload();
+  if (answer?.ok) {
+    act.dispatchEvent(new Event("acted", { bubbles: true }));
+    return act.dataset.tells === undefined ? location.reload() : tell(act, answer);
+  }
   const found = await answer?.json().catch(() => undefined);
   if (asked !== act) return; // a browser may close the dialog all the same
-  say(found?.detail ?? "The server does not answer; try again.", tells ? "good" : "bad");
-  if (!tells) return;
-  confirm.hidden = true;
-  refuse.textContent = "Close";
+  say(found?.detail ?? "The server does not answer; try again.", "bad");
 });
+
+function given() {
+  const found = {};
+  for (const { name, type, value, valueAsNumber, checked } of fields.querySelectorAll("[name]")) {
+    if (type === "checkbox") found[name] = [...(found[name] ?? []), ...(checked ? [value] : [])];
+    else found[name] = type === "number" ? valueAsNumber : value;
+  }
+  return found;
+}
+
+async function tell(act, answer) {
+  const [, file] = answer.headers.get("Content-Disposition")?.match(/filename="(.+)"/) ?? [];
+  const { detail, name, secret } = file ? { name: file } : await answer.json();
+  say(detail ?? "", "good");
+  [confirm.hidden, asks.hidden, output.hidden, refuse.textContent] = [true, true, !name, "Close"];
+  if (name) [title.textContent, explanation.textContent] = [`${act.textContent.trim()}: ${name}`, act.dataset.tells];
+  output.textContent = secret ?? "";
+  if (file) {
+    const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(await answer.blob()), download: file, textContent: file });
+    output.append(link);
+    link.click();
+  }
+  if (!dialog.open) dialog.showModal();
+}

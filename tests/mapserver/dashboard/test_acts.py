@@ -4,6 +4,7 @@ import re
 import time
 from pathlib import Path
 
+import httpx
 import pytest
 from playwright.sync_api import Page, expect
 from typer.testing import CliRunner
@@ -11,11 +12,14 @@ from typer.testing import CliRunner
 from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
+from locclient.identity import RobotIdentity
 from mapserver import releases
 from mapserver.cli import app
 from mapserver.fleet.building import replace_areas
 from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.store import Actor, DraftContent, MapStore
+from mapserver.trust import init_here
+from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
 from support.fleet.webhook_receiver import receiver
 from support.storage.map_samples import draft_details
@@ -234,3 +238,91 @@ def test_a_version_taken_back_by_the_server_is_told_with_its_reason(page: Page, 
     expect(trial).to_contain_text("rolled back", timeout=10_000)
     expect(trial).to_contain_text("It fails more often than the margin allows")
     assert seen.faults == []
+
+
+def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        init_here(store)
+        RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
+
+    def ask(words: str, name: str | None = None, **fields: str) -> None:
+        page.get_by_role("button", name=words, exact=True).click()
+        for label, value in fields.items():
+            dialog.get_by_label(label, exact=True).fill(value)
+        if name is not None:
+            dialog.get_by_label("Your name").fill(name)
+        dialog.get_by_label("Reason").fill("a new shift")
+
+    def told() -> str:
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(dialog.get_by_role("button", name=re.compile("^Yes"))).to_be_hidden()
+        expect(dialog.locator("output")).not_to_be_empty()
+        return dialog.locator("output").inner_text()
+
+    with serving(tmp_path, "--zenoh", "tls/127.0.0.1:0") as served:
+        seen, dialog = opened(page, served, "administration/people"), page.get_by_role("dialog")
+        expect(page.get_by_text("Nobody signs in yet")).to_be_visible()
+        ask("Add an operator", name="carl", Name="bob")
+        assert dialog.get_by_label("Role").locator("option").all_inner_texts() == [
+            "admin: everything, people and robots, too"
+        ]
+        password = told()
+        page.keyboard.press("Escape")
+        expect(dialog).to_contain_text("is shown only now")
+        dialog.get_by_role("button", name="Close").click()
+        page.get_by_label("Name").fill("bob")
+        page.get_by_label("Password").fill(password)
+        page.get_by_role("button", name="Sign in").click()
+        people, robots = (
+            page.get_by_role("list", name="Operators and programs"),
+            page.get_by_role("list", name="Robots, problems first"),
+        )
+        expect(people.locator("li", has_text="bob")).to_contain_text("signed in")
+
+        ask("Disable bob")
+        dialog.get_by_role("button", name="Yes: Disable bob").click()
+        expect(dialog.get_by_role("alert")).to_contain_text("bob is the last admin")
+        dialog.get_by_role("button", name="No, change nothing").click()
+        assert seen.faults[1:] == ["Failed to load resource: the server responded with a status of 409 (Conflict)"]
+        seen.faults.clear()
+
+        ask("Make a token for a program", **{"Name of the program": "grafana"})
+        dialog.get_by_label("read maps, robots and failures").uncheck()
+        dialog.get_by_label("read the metrics").check()
+        with httpx.Client(base_url=served.http, headers={"Authorization": f"Bearer {told()}"}) as grafana:
+            assert [grafana.get(path).status_code for path in ("/metrics", "/v1/sites")] == [200, 403]
+            dialog.get_by_role("button", name="Close").click()
+            expect(people.locator("li", has_text="grafana")).to_contain_text(
+                "may read the metrics. It ends in 90 days."
+            )
+            ask("Disable grafana")
+            dialog.get_by_role("button", name="Yes: Disable grafana").click()
+            expect(people.locator("li", has_text="grafana")).to_contain_text("disabled program")
+            assert grafana.get("/metrics").status_code == 401
+
+        tug = robots.locator("li", has_text="tug-7")
+        expect(tug).to_contain_text("not enrolled")
+        ask("Enrol tug-7")
+        with page.expect_download() as download:
+            assert told() == "tug-7.fleetmap"
+        bundle = Path(download.value.path()).read_bytes()
+        dialog.get_by_role("button", name="Close").click()
+        expect(tug).to_contain_text("bundle unused, 24 h left")
+        identity = RobotIdentity.enrol(tmp_path / "robot", bundle)
+        assert (identity.who.site, identity.who.robot) == (SITE, "tug-7")
+        expect(tug).to_contain_text("certificate for 365 days")
+        ask("Revoke tug-7")
+        dialog.get_by_role("button", name="Yes: Revoke tug-7").click()
+        expect(tug).to_contain_text("not enrolled")
+        ask("Remove tug-7")
+        dialog.get_by_role("button", name="Yes: Remove tug-7").click()
+        expect(tug).to_have_count(0)
+        assert seen.faults == []
+
+        with MapStore.open(tmp_path) as store:
+            kinds = [line.kind for line in store.audit_lines() if line.actor == "bob" and line.reason == "a new shift"]
+            assert kinds == ["token made", "operator disabled", "robot enrolled", "robot revoked", "robot removed"]
+            store.operators.set_role("bob", "viewer", Actor("root"))
+        opened(page, served, "administration/people", site=SITE)
+        expect(page.get_by_role("alert")).to_have_text("bob (viewer) may not open this page; an admin may.")

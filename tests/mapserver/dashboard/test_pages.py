@@ -36,6 +36,7 @@ PAGES = {
     "surveys": "Surveys of hall",
     "live": "Survey of hall",
     "administration": "Administration",
+    "administration/people": "Administration",
 }
 
 

@@ -14,6 +14,7 @@ from support.pages.whole_page import SIZES, WEAKEST_CONTRAST
 ACTS = {
     "map": ("Publish draft 3", "Roll back to version 1", "Try version 3 on 5% of the robots"),
     "robots/tug-5": ("tug-5 is here",),
+    "administration/people": ("Add an operator",),
 }
 _LEAST_PX = 32  # of a thing to tap; WCAG 2.2 asks for 24
 
