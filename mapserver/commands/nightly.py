@@ -32,7 +32,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     options.check()
     from fleetmap.console import plain_console
     from fleetmap.recordings import FrameSelection
-    from mapserver.nightly import NightRequest, run_night
+    from mapserver.nightly.night import NightRequest, run_night
 
     FrameSelection.parse(options.frames)
     build = options.build_options(context, report=None)
@@ -51,7 +51,7 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
 
 def _write(options: NightlyOptions) -> None:
     from fleetmap.encoding import to_json
-    from mapserver.nightly import last_report
+    from mapserver.nightly.night import last_report
 
     report = options.report
     content = None if report is None else last_report(options.store, options.site)

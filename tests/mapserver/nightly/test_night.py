@@ -39,9 +39,10 @@ from mapserver import cli, releases
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
-from mapserver.nightly import NightRequest, last_report, night, run_night
 from mapserver.nightly import inbox as boxes
+from mapserver.nightly import night
 from mapserver.nightly.inbox import arrivals
+from mapserver.nightly.night import NightRequest, last_report, run_night
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
