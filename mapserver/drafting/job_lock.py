@@ -1,22 +1,27 @@
 """Running jobs and nights: their locks, which the operating system releases when a process dies, and their records in the store."""
 
 import fcntl
+import io
 import os
+import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
+from fleetmap.files import OWN_FILE
 from mapserver.store import JobInfo, MapStore
 
 INTERRUPTED = "interrupted"
 """Key in the report of a job that was ended as interrupted."""
 
 _TOLD_EVERY_S = 2.0
+_LOGS_KEPT, _LOG_BYTES = 200, 4 << 20
 _YOUNG_S = 60.0  # a job is recorded before it holds its lock
 
 
@@ -85,6 +90,65 @@ def _path(store: Path, job: int) -> Path:
 
 
 @contextmanager
+def logged(store: Path, job: int) -> Iterator[None]:
+    """Copy the block's output on stderr, and the traceback of an error, into the job's log; not from a terminal, whose user reads it.
+
+    The logs of the last 200 jobs are kept. A full disk ends the log, not the job.
+    """
+    if sys.stderr.isatty():
+        yield
+        return
+    with suppress(OSError):
+        for old in store.glob("job-*.log"):
+            if old.stem[4:].isdecimal() and int(old.stem[4:]) <= job - _LOGS_KEPT:
+                old.unlink()
+    try:
+        log_path(store, job).touch(OWN_FILE)
+        file = log_path(store, job).open("wb", 0)
+    except OSError:
+        yield
+        return
+    copied = _Copied(sys.stderr, file)
+    with file, redirect_stderr(copied):
+        try:
+            yield
+        except FleetmapError as error:
+            copied.log(f"{error}\n")
+            raise
+        except BaseException:
+            copied.log(traceback.format_exc())
+            raise
+
+
+def log_path(store: Path, job: int) -> Path:
+    """Return the path of a job's log; a job that ran in a terminal has none."""
+    return store / f"job-{job}.log"
+
+
+class _Copied(io.TextIOBase):
+    """A stream whose text is copied into a log, up to `_LOG_BYTES`."""
+
+    def __init__(self, stream: TextIO, file: io.RawIOBase) -> None:
+        self._stream, self._file, self._left = stream, file, _LOG_BYTES
+
+    def write(self, text: str) -> int:
+        self.log(text)
+        return self._stream.write(text)
+
+    def log(self, text: str) -> None:
+        data = text.encode("utf-8", "backslashreplace")[: self._left]
+        self._left -= len(data)
+        with suppress(OSError):
+            self._file.write(data)
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+
+@contextmanager
 def _opened(path: Path) -> Iterator[int]:
     with disk_errors(f"{path} cannot be made", "check the store's rights and space"):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
@@ -134,7 +198,7 @@ def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
     number = maps.begin_job(site, kind)
     job = Job(number=number)
     try:
-        with held(maps.folder, number):
+        with held(maps.folder, number), logged(maps.folder, number):
             yield job
     except BaseException as error:
         maps.update_job(number, "failed", str(error) or type(error).__name__, job.report)

@@ -19,7 +19,7 @@ from fleetmap.log_lines import printable
 from fleetmap.recordings import FILE_SUFFIXES
 from mapserver import releases
 from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
-from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, only_one
+from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logged, only_one
 from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import Recorded
@@ -77,7 +77,7 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
         _resume_killed(maps, site, report)
         end_interrupted(maps, time.time_ns())
         try:
-            with held(request.store, report.job):
+            with held(request.store, report.job), logged(request.store, report.job):
                 sentence = _Night(request, gate, console, maps, report).run()
         except KeyboardInterrupt:  # ended by a user, not by a recording
             maps.tell_progress(report.job, [], "looking_at")

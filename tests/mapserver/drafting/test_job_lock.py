@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fleetmap.errors import StoreError
-from mapserver.drafting.job_lock import INTERRUPTED, JobProgress, end_interrupted, recorded_job
+from fleetmap.console import plain_console
+from fleetmap.errors import StoreError, SurveyError
+from mapserver.drafting.job_lock import INTERRUPTED, JobProgress, end_interrupted, log_path, logged, recorded_job
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
 
@@ -88,6 +89,23 @@ def test_a_job_tells_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
         maps.tell_progress(1, {"stage": "late"})
         assert maps.job(1).report == {"version": 1}
         JobProgress(maps, None)("odometry", 1, 2)  # a build that no job stands for
+
+
+def test_a_job_keeps_its_log(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What it printed, and why it ended; of the last jobs alone."""
+    (tmp_path / "job-1.log").touch()
+    with MapStore.open(tmp_path, create=True) as maps:
+        with recorded_job(maps, "new", "build") as job:
+            plain_console(stderr=True).print("reading [red]monday")
+        with pytest.raises(SurveyError), recorded_job(maps, "new", "build"):
+            raise SurveyError("too dark")
+        assert log_path(tmp_path, job.number or 0).read_text() == "reading [red]monday\n"
+        assert log_path(tmp_path, 2).read_text() == "too dark\n"
+        with logged(tmp_path, 202), pytest.raises(ZeroDivisionError), logged(tmp_path, 201):
+            1 / 0  # noqa: B018
+    assert "ZeroDivisionError" in log_path(tmp_path, 201).read_text()
+    assert sorted(path.name for path in tmp_path.glob("job-*.log")) == ["job-201.log", "job-202.log"]
+    assert "reading [red]monday" in capfd.readouterr().err
 
 
 def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
