@@ -23,6 +23,7 @@ from mapserver.api.bytes_response import bytes_response
 from mapserver.api.file_routes import install_file_routes
 from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
+from mapserver.api.inbox_routes import install_inbox_routes
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.people_routes import install_people_routes
 from mapserver.api.request_limits import RequestLimits
@@ -67,6 +68,7 @@ def create_app(
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
     install_file_routes(app, store)
+    install_inbox_routes(app, store, settings.nights)
     install_version_routes(app, store, settings)
     install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
     install_server_routes(app, store, fleet, settings)

@@ -14,26 +14,17 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import actor_of
+from mapserver.api.guard import By
 from mapserver.fleet.building import align, forget_alignment, keep_areas, replace_areas
 from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
-from mapserver.store import Actor, MapStore
-
-
-def _acting(
-    request: Request,
-    actor: Annotated[str | None, Query(min_length=1, max_length=200, examples=["ada"])] = None,
-    reason: Annotated[str, Query(max_length=2000, examples=["racks were moved"])] = "",
-) -> Actor:
-    return actor_of(request, actor, reason)
+from mapserver.store import MapStore
 
 
 async def _body(request: Request) -> bytes:
     return await request.body()
 
 
-By = Annotated[Actor, Depends(_acting)]
 File = Annotated[bytes, Depends(_body)]
 _WHAT = "the ETag of the areas that are changed: 412 if somebody changed them since"
 IfMatch = Annotated[str | None, Header(pattern=r'^(\*|(W/)?"[0-9a-f]{64}")$', description=_WHAT, examples=["*"])]

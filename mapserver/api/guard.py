@@ -7,11 +7,11 @@ import re
 from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import quote, urlsplit
 
 from anyio import to_thread
-from fastapi import Request
+from fastapi import Depends, Query, Request
 from starlette.exceptions import HTTPException
 from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, RedirectResponse, Response
@@ -89,6 +89,18 @@ def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
     if typed and typed != who.name:
         raise HTTPException(403, f"the request comes from {who.name} and names {typed[:80]!r}; leave `actor` out")
     return who.actor(reason)
+
+
+def _acting(
+    request: Request,
+    actor: Annotated[str | None, Query(min_length=1, max_length=200, examples=["ada"])] = None,
+    reason: Annotated[str, Query(max_length=2000, examples=["racks were moved"])] = "",
+) -> Actor:
+    return actor_of(request, actor, reason)
+
+
+By = Annotated[Actor, Depends(_acting)]
+"""The actor of a request whose body is a file, with author and reason in the query."""
 
 
 def _typed(request: Request, name: str, reason: str) -> Actor:

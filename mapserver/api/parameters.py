@@ -31,6 +31,8 @@ RobotHeight = Annotated[
 ]
 Sha256 = Annotated[str, Path(pattern=SHA256_PATTERN, examples=["5e" * 32])]
 Number = Annotated[int, Path(ge=1, le=1 << 62, examples=[12])]
+RecordingName = Annotated[str, Path(max_length=220, examples=["monday.mcap"])]
+Box = Annotated[Literal["held", "bad"], Path(examples=["held"])]
 PictureNumber = Annotated[int, Path(ge=0, le=100, examples=[1])]
 Axis = Annotated[
     Literal["site", "robot", "version", "tile", "area", "cause"],

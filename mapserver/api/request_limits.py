@@ -11,13 +11,14 @@ from mapserver.api.guard import SIGN_IN
 from mapserver.api.problems import problem
 from mapserver.floor_plan.areas import MAX_AREAS_BYTES
 from mapserver.floor_plan.plan_file import MAX_PLAN_BYTES
+from mapserver.nightly.upload import MOST_BYTES as UPLOAD_BYTES
 from mapserver.serving.http_connections import MAX_HEAD_BYTES
 
 MAX_BODY_BYTES = 1 << 20  # an action has about 100 bytes
-_FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES}
-_FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment)")
+_FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES, "inbox": UPLOAD_BYTES}
+_FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment|inbox)(/[^/]+)?")
 SIGN_IN_BYTES = 4 << 10  # accepted without authentication
-BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
+BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete; of an upload until its next piece
 
 
 class RequestLimits:
@@ -37,10 +38,11 @@ class RequestLimits:
             scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
         head_bytes = len(scope["raw_path"]) + len(scope["query_string"])
         head_bytes += sum(len(name) + len(value) + 4 for name, value in scope["headers"])
-        is_sign_in = scope["path"] == SIGN_IN
-        most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if is_sign_in else (MAX_BODY_BYTES, BODY_S)
-        if scope["method"] == "PUT" and (file := _FILE.fullmatch(scope["path"])):
+        most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if scope["path"] == SIGN_IN else (MAX_BODY_BYTES, BODY_S)
+        file = _FILE.fullmatch(scope["path"]) if scope["method"] == "PUT" else None
+        if file is not None:
             most_bytes = _FILE_BYTES[file[1]]
+        is_upload = file is not None and file[1] == "inbox"
         too_large = 413, f"the body has more than {most_bytes} bytes"
         stated = dict(scope["headers"]).get(b"content-length", b"0")
         if head_bytes > MAX_HEAD_BYTES:
@@ -49,16 +51,18 @@ class RequestLimits:
         if not stated.isdigit() or len(stated) > 15 or int(stated) > most_bytes:
             return await _refuse(scope, receive, send, *too_large)
         taken, is_whole, is_refused, is_answered = 0, False, False, False
-        until_s = asyncio.get_running_loop().time() + within_s
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + within_s
 
         async def limited() -> Message:
             nonlocal taken, is_whole, is_refused
             if is_refused:
                 return {"type": "http.disconnect"}
             refusal = too_large
+            end_s = loop.time() + within_s if is_upload else until_s
             try:
                 # After the body this waits until the connection closes.
-                async with asyncio.timeout_at(None if is_whole or is_answered else until_s):
+                async with asyncio.timeout_at(None if is_whole or is_answered else end_s):
                     message = await receive()
             except TimeoutError:
                 refusal = 408, f"the body was not complete within {within_s:g} s"

@@ -18,13 +18,14 @@ from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
+from mapserver.serving.night_runs import NightRuns
 from mapserver.serving.webhook import Webhook
 from mapserver.store import CanaryRow, MapStore, VersionInfo
 from mapserver.trust.http_certificate import HttpCertificate
 
 
 class ApiSettings(NamedTuple):
-    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, and the webhook, None without one."""
+    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, webhook and inbox, None without one."""
 
     guard: GuardSettings = GuardSettings()
     gate: GateSettings = GateSettings()
@@ -34,6 +35,7 @@ class ApiSettings(NamedTuple):
     ingest: IngestSettings = IngestSettings()
     certificate: HttpCertificate | None = None
     webhook: Webhook | None = None
+    nights: NightRuns | None = None
 
 
 def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:

@@ -11,6 +11,7 @@ from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.nightly.inbox import InboxEntry
 from mapserver.operators.operators import MAX_TOKEN_DAYS
 from mapserver.operators.roles import OPERATOR_PATTERN, Role, Scope
 from mapserver.quality.figures import TrustedCalibration
@@ -92,6 +93,25 @@ class JobList:
 
     jobs: list[JobInfo]
     next: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Inbox:
+    """Recordings in the inbox of a site, at most 1000 of each kind; done: number of those in a version."""
+
+    site: str
+    waiting: list[InboxEntry]
+    held: list[InboxEntry]
+    bad: list[InboxEntry]
+    done: int
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """A recording that was uploaded."""
+
+    name: str
+    size_bytes: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import UsageError
+from fleetmap.cli_options import ConfigFile, config_path, expand_options, settings_of
+from fleetmap.errors import UsageError, disk_errors
 from fleetmap.log_lines import log_to_stderr
 from mapserver.commands.options import StoreFolder, open_store
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mapserver.fleet.fleet import Fleet
     from mapserver.serving.bus_access import BusGuard
     from mapserver.serving.http_connections import BoundedListener
+    from mapserver.serving.night_runs import NightRuns
     from mapserver.store import MapStore
     from mapserver.trust.http_certificate import HttpCertificate
 
@@ -132,6 +133,13 @@ def serve(
         typer.Option(help="zenoh endpoint to listen on; port 0 picks a free port. tls/ and quic/ need `trust init`."),
     ] = "tcp/127.0.0.1:7447",
     create: Annotated[bool, typer.Option("--create", help="Make the store if the folder holds none.")] = False,
+    inbox: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of inboxes, DIR/SITE, for uploads and builds of operators; created if it does not exist.",
+        ),
+    ] = None,
     config: ConfigFile = None,
 ) -> None:
     """Serve maps to robots and operators; prints the addresses when ready, exits with status 0 on SIGTERM or SIGINT."""
@@ -163,8 +171,20 @@ def serve(
                 guard=guard,
                 certificate=certificate,
                 proxies=proxies,
+                nights=None if inbox is None else _nights(maps, inbox, config_path(context)),
             )
     _end_process()
+
+
+def _nights(maps: "MapStore", inbox: Path, config: Path | None) -> "NightRuns":
+    from mapserver.nightly.upload import remove_unfinished
+    from mapserver.serving.night_runs import NightRuns
+    from mapserver.store.files import make_folder
+
+    with disk_errors(f"--inbox {inbox} cannot be made", "name a folder that this account can write", UsageError):
+        make_folder(inbox)
+    remove_unfinished(inbox)
+    return NightRuns(maps, inbox, config)
 
 
 def _end_process() -> None:
@@ -186,6 +206,7 @@ def _run(
     guard: "GuardSettings",
     certificate: "HttpCertificate | None",
     proxies: frozenset[str],
+    nights: "NightRuns | None",
 ) -> None:
     import uvicorn
     from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
@@ -245,6 +266,7 @@ def _run(
         settings.ingest,
         certificate,
         webhook,
+        nights,
     )
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.surveys)
@@ -284,6 +306,8 @@ def _run(
         with ended_by_threads(lambda: setattr(server, "should_exit", True)):
             server.run(sockets=[listener])
     finally:
+        if nights is not None:
+            nights.close()
         if webhook is not None:
             webhook.close()
         bus_service.close()

@@ -2,8 +2,8 @@
 
     INBOX/NAME             a recording: a folder, or a file with a suffix such as .mcap
     INBOX/done/HASH-NAME   it is in a version
-        INBOX/held/HASH-NAME   it is valid, but could not be joined, or its draft was refused; move it back to try again
-        INBOX/bad/NAME         it cannot be read, or `doctor` fails it
+    INBOX/held/HASH-NAME   it is valid, but could not be joined, or its draft was refused; move it back to try again
+    INBOX/bad/NAME         it cannot be read, or `doctor` fails it
 
 Beside a held or bad recording lies NAME.reason.txt. The inbox is untrusted: only regular files and folders are opened. Links, FIFOs,
 sockets and devices are bad, as is any entry with a read error. One entry never stops the processing of the others.
@@ -23,9 +23,10 @@ from itertools import chain, count
 from pathlib import Path
 from types import FrameType
 
-from fleetmap.errors import FleetmapError, RecordingError, UsageError, disk_errors
+from fleetmap.errors import FleetmapError, RecordingError, StateError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
+from fleetmap.mapformat.names import is_name
 from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, open_recording
 from mapserver.store.files import make_folder
 
@@ -34,6 +35,8 @@ _HASH_SIGNS = 12
 _MAX_NAME_BYTES = 200  # of 255: room for the hash and a number before the name, and `.reason.txt` after it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
+_REASON_BYTES = 2000
+_MOST_LISTED = 1000
 _MOST_ISSUES = 5
 _KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 # Limit of one recording: an hour of two cameras at 30 Hz has 216,000 files
@@ -70,11 +73,13 @@ class Recorded:
         return f"{reason}; when it was read: {self.found}" if self.found else reason
 
 
-def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
+def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = False) -> Arrivals:
     """Return the present contents of the inbox. Hidden names are ignored.
 
     A recording is complete if nothing in it changed for `settle_s`, no file in it has the name of a partial copy, and
     no process has one open for writing, as far as the system shows. Raises UsageError if the folder is missing.
+
+    is_brief: count every folder as complete. An hour in one has 200,000 files.
     """
     if not inbox.is_dir():
         raise UsageError(f"--inbox {inbox} is not a folder; create it, or name the folder of incoming recordings")
@@ -87,6 +92,8 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int) -> Arrivals:
         try:
             if stat.S_ISREG(path.lstat().st_mode) and path.suffix not in (*_UNFINISHED, *FILE_SUFFIXES, ".zip"):
                 others.append(path.name)
+            elif is_brief and path.is_dir() and not path.is_symlink():
+                complete.append(path)
             elif reason := _unfinished(path, settle_s, now_ns):
                 waiting.append((path, reason))
             else:
@@ -260,9 +267,114 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     return target
 
 
+@dataclass(frozen=True, slots=True)
+class InboxEntry:
+    """An entry of an inbox. size_bytes: of a file; reason: why it waits, is held or is bad; empty if the next night takes it."""
+
+    name: str
+    size_bytes: int | None
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class InboxContents:
+    """Entries of an inbox by name, at most 1000 of each kind; done: number of recordings that are in a version."""
+
+    waiting: list[InboxEntry]
+    held: list[InboxEntry]
+    bad: list[InboxEntry]
+    done: int
+
+
+def sites_of(folder: Path) -> list[str]:
+    """Return the sites that have an inbox in this folder."""
+    with suppress(OSError):
+        return sorted(path.name for path in folder.iterdir() if is_name(path.name) and path.is_dir())
+    return []
+
+
+def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
+    """Return what lies in an inbox, empty if it is missing, without a look into folders; names that cannot be shown are left out.
+
+    Raises UsageError if it cannot be listed.
+    """
+    if not inbox.is_dir():
+        return InboxContents([], [], [], 0)
+    here = arrivals(inbox, settle_s, now_ns, is_brief=True)
+    known = f"no recording; a recording is a folder, or a file that ends in {', '.join(FILE_SUFFIXES)}"
+    reasons = {path.name: "" for path in here.complete} | dict.fromkeys(here.others, known)
+    reasons |= {path.name: reason for path, reason in (*here.waiting, *here.bad)}
+    waiting = [_entry(inbox / name, reasons[name]) for name in sorted(reasons) if is_safe_name(name)]
+    held, bad = (
+        [
+            _entry(inbox / where / name, _kept_reason(inbox / where / name))
+            for name in _names(inbox / where)[:_MOST_LISTED]
+        ]
+        for where in (HELD, BAD)
+    )
+    return InboxContents(waiting[:_MOST_LISTED], held, bad, len(_names(inbox / DONE)))
+
+
+def _names(folder: Path) -> list[str]:
+    """Return the names of recordings that were put away."""
+    with suppress(FileNotFoundError):
+        return sorted(name for name in os.listdir(folder) if not name.endswith(_REASON) and is_safe_name(name))  # noqa: PTH208
+    return []
+
+
+def _entry(path: Path, reason: str) -> InboxEntry:
+    try:
+        status = path.lstat()
+    except OSError:
+        return InboxEntry(path.name, None, reason)
+    return InboxEntry(path.name, status.st_size if stat.S_ISREG(status.st_mode) else None, printable(reason))
+
+
+def _kept_reason(path: Path) -> str:
+    """Return the first 2000 bytes of the reason beside a held or bad recording; empty if there is none."""
+    with suppress(OSError):
+        descriptor = os.open(f"{path}{_REASON}", os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            reason = os.read(descriptor, _REASON_BYTES).decode("utf-8", "replace").strip()
+            return reason.replace(f"{path.parent.parent}/", "")
+        finally:
+            os.close(descriptor)
+    return ""
+
+
+def put_back(inbox: Path, where: str, name: str) -> None:
+    """Move a held or bad recording back into its inbox, for the next night, and remove its reason.
+
+    Raises UsageError for an unknown one, StateError if the inbox has one of this name, StoreError if the disk refuses.
+    """
+    path, target = inbox / where / name, inbox / name
+    if not is_safe_name(name) or not os.path.lexists(path) or name.endswith(_REASON):
+        raise UsageError(f"{where} has no recording {printable(name)[:80]!r}; it may be back in the inbox already")
+    if os.path.lexists(target):
+        raise StateError(f"the inbox has another {name}; wait for the next night, or rename one of them")
+    with disk_errors(f"{path} cannot be moved to {inbox}", "check the rights of the inbox"):
+        os.replace(path, target)  # noqa: PTH105
+        with suppress(FileNotFoundError):
+            os.unlink(f"{path}{_REASON}")  # noqa: PTH108
+        sync_path(inbox)
+
+
+def check_upload_name(inbox: Path, name: str) -> Path:
+    """Return where an uploaded recording belongs. Raises UsageError for an invalid name, StateError for one that exists."""
+    path = inbox / name
+    if not is_safe_name(name) or path.suffix not in FILE_SUFFIXES:
+        known = f"{', '.join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}"
+        words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_MAX_NAME_BYTES} bytes that end in {known}"
+        raise UsageError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
+    if os.path.lexists(path):
+        raise StateError(f"the inbox has a recording {name} already; rename one of them")
+    return path
+
+
 def is_safe_name(name: str) -> bool:
-    """True if a name can be displayed, logged and stored, and leaves room for prefix and suffix."""
-    return name.isprintable() and len(os.fsencode(name)) <= _MAX_NAME_BYTES
+    """True if a name can be displayed, logged and stored, is not hidden, and leaves room for prefix and suffix."""
+    is_plain = name.isprintable() and "/" not in name and not name.startswith(".")
+    return is_plain and 0 < len(os.fsencode(name)) <= _MAX_NAME_BYTES
 
 
 def _safe_name(path: Path) -> str:

@@ -17,11 +17,16 @@ def check_name(name: str, what: str) -> str:
     Raises UsageError (`what`: kind of the name) for anything but 1-64 of a-z 0-9 _ -, or a name that
     begins with _ or -.
     """
-    if _NAME.fullmatch(name) is None:
+    if not is_name(name):
         raise UsageError(
             f"{what} name {name[:80]!r}: use 1 to 64 of a-z, 0-9, '_' and '-', beginning with a letter or digit"
         )
     return name
+
+
+def is_name(name: str) -> bool:
+    """True if `check_name` accepts it."""
+    return _NAME.fullmatch(name) is not None
 
 
 def check_sha256(sha256: str) -> str:

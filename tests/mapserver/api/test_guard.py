@@ -113,6 +113,8 @@ def paths_of(client: TestClient) -> list[tuple[str, str]]:
         "robot": "r1",
         "operator": "olga",
         "asked": "00000000",
+        "box": "held",
+        "name": "monday.mcap",
         "number": "1",
     }
     paths = client.app.openapi()["paths"]

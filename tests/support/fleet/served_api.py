@@ -11,7 +11,9 @@ from fastapi.testclient import TestClient
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
+from mapserver.api.version_routes import ApiSettings
 from mapserver.fleet.fleet import Fleet
+from mapserver.serving.night_runs import NightRuns
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import save_sample_draft
@@ -31,13 +33,14 @@ class Server:
 
 
 @contextmanager
-def served_api(folder: Path) -> Iterator[Server]:
+def served_api(folder: Path, inbox: Path | None = None) -> Iterator[Server]:
     with MapStore.open(folder, create=True) as store, MemoryBus(MemoryHub()) as bus:
         save_sample_draft(store)
         releases.publish(store, "lab")
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
-        app = create_app(store, fleet, Metrics(store, fleet), bus)
+        settings = ApiSettings(nights=None if inbox is None else NightRuns(store, inbox))
+        app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
         with TestClient(app, "http://127.0.0.1", raise_server_exceptions=False, client=("127.0.0.1", 9)) as client:
             yield Server(client, store, fleet, bus, folder)
 

@@ -1,0 +1,81 @@
+"""A recording that is uploaded: a hidden file beside the inbox's recordings, which gets its name once all of it is on the disk."""
+
+import os
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from fleetmap.errors import StateError, UsageError, disk_errors
+from fleetmap.files import OWN_FILE, sync_path
+from mapserver.nightly.inbox import check_upload_name
+from mapserver.store.files import make_folder
+
+MOST_BYTES = 64 << 30  # an hour of two cameras
+_PART = ".upload.part"
+_KEPT_SHARE, _KEPT_BYTES = 10, 20 << 30  # a build needs space too: a tenth of the disk, but no more than that
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a killed server left of uploads into the inboxes in this folder."""
+    with suppress(OSError):
+        for path in folder.glob(f"*/.*{_PART}"):
+            path.unlink()
+
+
+class Upload:
+    """Writes one recording. Thread-safe; `end` or `discard` is called in any case. Errors are StateError, UsageError and StoreError."""
+
+    def __init__(self, inbox: Path, name: str, stated_bytes: int | None) -> None:
+        """inbox: of the site, made if it is missing. stated_bytes: as the client says, None if it does not."""
+        self._lock, self._stated_bytes, self.size_bytes = threading.Lock(), stated_bytes, 0
+        self._path, self._part = check_upload_name(inbox, name), inbox / f".{name}{_PART}"
+        self._descriptor: int | None = None
+        with disk_errors(*self._words()):
+            make_folder(inbox)
+            self._check_space(stated_bytes or 0)
+            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+            self._descriptor = os.open(self._part, flags, OWN_FILE)
+
+    def write(self, data: bytes) -> None:
+        """Append bytes; StateError where the disk would get too full."""
+        with self._lock, disk_errors(*self._words()):
+            if self._descriptor is None:
+                return
+            self.size_bytes += len(data)
+            self._check_space(len(data))
+            view = memoryview(data)
+            while view:
+                view = view[os.write(self._descriptor, view) :]
+
+    def end(self) -> None:
+        """Give it its name. UsageError if it is not as long as stated or empty, StateError if there is one of this name meanwhile."""
+        if self.size_bytes == 0 or self.size_bytes != (self._stated_bytes or self.size_bytes):
+            stated = "" if self._stated_bytes is None else f", {self._stated_bytes} were announced"
+            raise UsageError(f"{self._path.name} came with {self.size_bytes} bytes{stated}; upload it again")
+        with self._lock, disk_errors(*self._words()):
+            assert self._descriptor is not None
+            os.fsync(self._descriptor)
+            check_upload_name(self._path.parent, self._path.name)
+            os.replace(self._part, self._path)  # noqa: PTH105
+            sync_path(self._path.parent)
+
+    def discard(self) -> None:
+        """Remove what has not become a recording."""
+        with self._lock, suppress(OSError):
+            if self._descriptor is not None:
+                os.close(self._descriptor)
+                self._descriptor = None
+            os.unlink(self._part)  # noqa: PTH108
+
+    def _check_space(self, more_bytes: int) -> None:
+        disk = os.statvfs(self._path.parent)
+        kept = min(disk.f_blocks * disk.f_frsize // _KEPT_SHARE, _KEPT_BYTES)
+        left = disk.f_bavail * disk.f_frsize - kept
+        if left < more_bytes:
+            words = f"the disk has room for {max(0, left) / 1e9:.1f} GB of recordings, beside {kept / 1e9:.1f} GB that builds need"
+            raise StateError(
+                f"{self._path.name} is too large: {words}; remove old recordings from `done`, or give it a larger disk"
+            )
+
+    def _words(self) -> tuple[str, str]:
+        return f"{self._path} cannot be written", "check the rights and space of the inbox"

@@ -1,0 +1,240 @@
+"""Inboxes over HTTP: uploads whole or not at all, names from strangers, another try, rights, logs of jobs."""
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import anyio
+import pytest
+from starlette.types import Message
+
+from mapserver.drafting.job_lock import log_path
+from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
+from mapserver.operators.operators import Operators
+from mapserver.store import Actor
+from support.fleet.quick_passwords import use_quick_passwords
+from support.fleet.served_api import Server, check_problem, served_api
+
+INBOX = "/v1/sites/lab/inbox"
+ADA = {"actor": "ada", "reason": "aisle 3"}
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    (tmp_path / "inbox").mkdir()
+    with served_api(tmp_path / "store", tmp_path / "inbox") as made:
+        yield made
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """The inbox of the site."""
+    return tmp_path / "inbox/lab"
+
+
+def files(lab: Path) -> list[str]:
+    return sorted(str(path.relative_to(lab)) for path in lab.rglob("*") if path.is_file())
+
+
+def test_a_recording_comes_in_pieces_and_waits(server: Server, lab: Path) -> None:
+    pieces = [bytes([n]) * 700_000 for n in range(5)]
+    answer = server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=iter(pieces))
+    assert (answer.status_code, answer.json()) == (201, {"name": "monday.mcap", "size_bytes": 3_500_000})
+    assert (lab / "monday.mcap").read_bytes() == b"".join(pieces)
+    event = server.store.last_events("lab", 1)[0]
+    assert (event.kind, event.actor, event.reason) == ("recording_uploaded", "ada", "aisle 3")
+    here = server.client.get(INBOX).json()
+    assert [(one["name"], one["size_bytes"]) for one in here["waiting"]] == [("monday.mcap", 3_500_000)]
+    assert "5 s are waited" in here["waiting"][0]["reason"]
+    check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=b"x"), 409, "already")
+    assert files(lab) == ["monday.mcap"]
+    assert server.client.get("/v1/sites/nowhere/inbox").status_code == 404
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["..", ".h.mcap", "a/b.mcap", "../../b.mcap", "a\nb.mcap", "a\x00b.mcap", "\u202eb.mcap", "é" * 105 + ".mcap", "notes.txt", "held"],
+)  # fmt: skip
+def test_names_of_strangers_make_no_file(server: Server, lab: Path, name: str) -> None:
+    answer = server.client.put(f"{INBOX}/{quote(name, safe='')}", params=ADA, content=b"x")
+    assert answer.status_code in (404, 405, 422)
+    assert files(lab.parent) == []
+
+
+async def put(server: Server, name: str, *messages: Message | anyio.Event) -> list[int]:
+    """The status of an upload whose client sends these and waits for these events; empty if it is gone before the answer."""
+    scope = {
+        "type": "http", "method": "PUT", "path": f"{INBOX}/{name}", "raw_path": b"", "scheme": "http", "query_string": b"actor=ada",
+        "headers": [(b"host", b"127.0.0.1"), (b"content-length", b"2000000")], "client": ("127.0.0.1", 1),
+    }  # fmt: skip
+    left, answered = list(messages), []
+
+    async def receive() -> Message:
+        message = left.pop(0) if left else {"type": "http.disconnect"}
+        if isinstance(message, anyio.Event):
+            await message.wait()
+            return await receive()
+        return message
+
+    async def send(message: Message) -> None:
+        answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
+
+    await server.client.app(scope, receive, send)
+    return answered
+
+
+MIDDLE = {"type": "http.request", "body": bytes(1_000_000), "more_body": True}
+END = MIDDLE | {"more_body": False}
+
+
+def test_uploads_are_few_at_once(server: Server, lab: Path) -> None:
+    answers: list[int] = []
+
+    async def ask() -> None:
+        others = anyio.Event()
+
+        async def one(number: int) -> None:
+            answers.extend(await put(server, f"{number}.mcap", MIDDLE, others, END))
+
+        async with anyio.create_task_group() as tasks:
+            for number in range(4):
+                tasks.start_soon(one, number)
+            while len(files(lab)) < 4:
+                await anyio.sleep(0.01)
+            answers.extend([*await put(server, "0.mcap", MIDDLE, END), *await put(server, "4.mcap", MIDDLE, END)])
+            others.set()
+
+    anyio.run(ask)
+    assert answers == [409, 429, 201, 201, 201, 201]
+    assert files(lab) == [f"{number}.mcap" for number in range(4)]
+
+
+def test_half_an_upload_leaves_nothing(server: Server, lab: Path) -> None:
+    """The connection ends in its middle; it is not as long as it said; it is empty."""
+    seen: list[list[str]] = []
+
+    async def ask() -> None:
+        cut = anyio.Event()
+
+        async def look() -> None:
+            while not files(lab) or not (lab / files(lab)[0]).stat().st_size:
+                await anyio.sleep(0.01)
+            seen.append(files(lab))
+            cut.set()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(look)
+            assert await put(server, "monday.mcap", MIDDLE, MIDDLE, cut) == []
+
+    anyio.run(ask)
+    assert seen == [[".monday.mcap.upload.part"]]
+    assert files(lab) == []
+    for content, stated in ((b"short", "100"), (b"long" * 100, "100"), (b"", "0")):
+        answer = server.client.put(
+            f"{INBOX}/monday.mcap", params=ADA, content=content, headers={"Content-Length": stated}
+        )
+        check_problem(answer, 422, "upload it again")
+    assert files(lab) == []
+    (lab / ".friday.mcap.upload.part").touch()
+    (lab / ".friday.mcap.part").touch()
+    remove_unfinished(lab.parent)
+    assert files(lab) == [".friday.mcap.part"], "what a killed server left is removed, other programs' files are not"
+
+
+def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, statvfs = os.write, os.statvfs
+    free = [1 << 40]
+
+    def filled(descriptor: int, data: bytes) -> int:
+        if Path(f"/proc/self/fd/{descriptor}").readlink().suffix == ".part":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(descriptor, data)
+
+    def measured(path: Path) -> os.statvfs_result:
+        found = list(statvfs(path))
+        found[1:5] = [1, 100 << 30, free[0], free[0]]  # bytes: a block's size, all, free, free for us
+        return os.statvfs_result(found)
+
+    monkeypatch.setattr(os, "statvfs", measured)
+    with monkeypatch.context() as context:
+        context.setattr(os, "write", filled)
+        check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=b"x"), 503, "No space left")
+    free[0] = (10 << 30) + 100
+    check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=bytes(101)), 409, "is too large")
+    check_problem(
+        server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=iter([bytes(101)])), 409, "is too large"
+    )
+    assert server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=bytes(100)).status_code == 201
+    length = {"Content-Length": str(MOST_BYTES + 1)}
+    assert server.client.put(f"{INBOX}/large.mcap", params=ADA, content=b"x", headers=length).status_code == 413
+    assert files(lab) == ["monday.mcap"]
+
+
+def test_what_was_left_out_is_tried_again(server: Server, lab: Path) -> None:
+    held, name = lab / "held", "3fa9c1d2e4b5-mon day.mcap"
+    held.mkdir(parents=True)
+    (lab / "done").mkdir()
+    (lab / "done/3fa9c1d2e4b5-friday.mcap").touch()
+    (held / name).write_bytes(b"x")
+    (held / f"{name}.reason.txt").write_text(f"{lab}/{name} fits nowhere\n")
+    (lab / "link.mcap").symlink_to("/etc/passwd")
+    (lab / "ride").mkdir()
+    here = server.client.get(INBOX).json()
+    assert (here["held"], here["bad"], here["done"]) == (
+        [{"name": name, "size_bytes": 1, "reason": f"{name} fits nowhere"}], [], 1,
+    )  # fmt: skip
+    assert [one["name"] for one in here["waiting"]] == ["link.mcap", "ride"]
+    assert "symbolic link" in here["waiting"][0]["reason"]
+    (lab / name).touch()
+    again = f"{INBOX}/held/{quote(name)}/retry"
+    check_problem(server.client.post(again, json=ADA), 409, "another 3fa9c1d2e4b5-mon day.mcap")
+    (lab / name).unlink()
+    assert name in [one["name"] for one in server.client.post(again, json=ADA).json()["waiting"]]
+    assert files(held) == []
+    assert server.store.last_events("lab", 1)[0].kind == "recording_tried_again"
+    check_problem(server.client.post(again, json=ADA), 404, "no recording")
+    assert server.client.post(f"{INBOX}/done/{quote(name)}/retry", json=ADA).status_code == 422
+    assert server.client.post(f"{INBOX}/held/{quote('../x', safe='')}/retry", json=ADA).status_code == 404
+
+
+def test_who_may_only_look_changes_nothing(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_quick_passwords(monkeypatch)
+    operators = Operators(server.store)
+    keys = {}
+    for name, role in (("vic", "viewer"), ("olga", "operator")):
+        operators.add(name, role, "a password of the test", Actor("root"))
+        session = operators.sign_in(name, "a password of the test", name).session
+        keys[name] = {"Cookie": f"fleetmap={session}"}
+    lab.mkdir()
+    put, client = f"{INBOX}/monday.mcap", server.client
+    assert client.get(INBOX, headers=keys["vic"]).status_code == 200
+    for headers, status in ((keys["vic"], 403), ({}, 401), (keys["olga"] | {"Origin": "http://evil.example"}, 403)):
+        assert client.put(put, content=b"x", headers=headers).status_code == status
+        assert client.post("/v1/sites/lab/build", json={}, headers=headers).status_code == status
+    assert files(lab) == []
+    assert client.put(put, content=b"x", headers=keys["olga"]).status_code == 201
+    assert server.store.last_events("lab", 1)[0].actor == "olga"
+    assert client.put(f"{put}?actor=ada", content=b"x", headers=keys["olga"]).status_code == 403
+
+
+def test_a_server_without_an_inbox_says_how_to_get_one(server: Server, tmp_path: Path) -> None:
+    with served_api(tmp_path / "other") as bare:
+        for answer in (
+            bare.client.get(INBOX),
+            bare.client.put(f"{INBOX}/monday.mcap", params=ADA, content=b"x"),
+            bare.client.post("/v1/sites/lab/build", json=ADA),
+        ):
+            check_problem(answer, 409, "`mapserver serve --inbox DIR`")
+
+
+def test_the_end_of_a_log_is_text(server: Server) -> None:
+    job = server.store.begin_job("lab", "nightly")
+    check_problem(server.client.get(f"/v1/jobs/{job}/log"), 404, "has no log")
+    log_path(server.store.folder, job).write_bytes(b"begin\n" + b"x" * 100_000 + b"\n<b>end\xff\n")
+    answer = server.client.get(f"/v1/jobs/{job}/log")
+    assert answer.headers["content-type"] == "text/plain; charset=utf-8"
+    assert len(answer.content) < 66_000
+    assert answer.text.endswith("x\n<b>end�\n")
+    assert server.client.get("/v1/jobs/99/log").status_code == 404
