@@ -4,6 +4,7 @@ import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from pathlib import Path
 from typing import Generic, TypeVar
 
 from fleetmap.errors import FleetmapError, UsageError
@@ -19,9 +20,11 @@ from mapserver.dashboard.space.points import space_bytes, surfel_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.floor_plan.areas import Areas
+from mapserver.nightly.inbox import InboxContents, contents, sites_of
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.expected_views import failure_camera
+from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import JobInfo, MapStore, VerdictRow, VersionInfo
 from mapserver.surfels.surfel_map import index_address, surfels_of
 
@@ -56,23 +59,26 @@ class _Kept(Generic[T]):
 class MapData:
     """Reads maps in an open store, `store`. Methods may be called from any thread; errors are the store's."""
 
-    def __init__(self, store: MapStore, gate: GateSettings, trial_share: float) -> None:
-        self.store = store
+    def __init__(self, store: MapStore, gate: GateSettings, trial_share: float, inbox: Path | None = None) -> None:
+        """inbox: the folder with an inbox for each site; None if the server has none."""
+        self.store, self.inbox = store, inbox
         self._gate, self.trial_share = gate, trial_share
         self._plans, self._underlays = _Kept[Plan](), _Kept[tuple[bytes, Box] | None]()
         self._differences, self._foretold = _Kept[Difference](), _Kept[VerdictRow]()
 
     def sites(self) -> list[str]:
-        """Names of all sites."""
-        return [info.site for info in self.store.sites()]
+        """Names of all sites, also of those that have only jobs or an inbox yet."""
+        inboxes = [] if self.inbox is None else sites_of(self.inbox)
+        return sorted({*(info.site for info in self.store.sites()), *self.store.sites_with_jobs(), *inboxes})
 
-    def sites_with_jobs(self) -> list[str]:
-        """Sites of which there is a job, also those without any version yet."""
-        return self.store.sites_with_jobs()
+    def is_mapped(self, site: str) -> bool:
+        """Whether a site ever had a version."""
+        return any(info.site == site for info in self.store.sites())
 
     def chosen_site(self, site: str | None) -> str:
-        """`site`, or the first site if none is named; UsageError for an unknown one."""
-        known = self.sites()
+        """`site`, or the first site, one with a version before others, if none is named; UsageError for an unknown one."""
+        mapped = {info.site for info in self.store.sites()}
+        known = sorted(self.sites(), key=lambda name: name not in mapped)
         if not known:
             raise UsageError("the store has no site yet; `mapserver build` makes one from a recording")
         if site is not None and site not in known:
@@ -81,12 +87,16 @@ class MapData:
 
     def current_version(self, site: str) -> int | None:
         """The number of the current version, None before the first."""
-        current = self.store.current(site)
+        current = self.store.current(site) if self.is_mapped(site) else None
         return None if current is None else current.version
 
     def has_version(self, site: str, version: int) -> bool:
         """Whether the store has a version."""
-        return any(info.version == version for info in self.store.versions(site))
+        return self.is_mapped(site) and any(info.version == version for info in self.store.versions(site))
+
+    def inbox_of(self, site: str) -> InboxContents | None:
+        """What lies in the inbox of a site; None if the server has no inbox."""
+        return None if self.inbox is None else contents(self.inbox / site, SETTLE_S, self.store.now_ns())
 
     def foretold(self, draft: VersionInfo) -> VerdictRow:
         """What the gate would say now; kept, since it follows from the draft and the current version."""

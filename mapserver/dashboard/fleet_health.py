@@ -127,6 +127,7 @@ class HealthData:
         week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
         robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
         has_areas = bool(self._store.areas(site))
+        is_mapped = any(info.site == site for info in self._store.sites())
         return SiteHealth(
             kpis(days[-1]),
             kpis(week),
@@ -134,7 +135,7 @@ class HealthData:
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
             self._trials(site, now_ns),
-            tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles),
+            tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self._area_trends(site, "area" if has_areas else "tile", next_hour)),
             has_areas,
             (next_hour - WEEK_H) * HOUR_NS,

@@ -34,8 +34,9 @@ from mapserver.store import MapStore
 
 def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
     """Adds the pages to `app`."""
+    inbox = None if settings.nights is None else settings.nights.inbox
     services = Services(
-        MapData(store, settings.gate, settings.canary.share),
+        MapData(store, settings.gate, settings.canary.share, inbox),
         HealthData(store, settings.canary, settings.resurvey, time.time_ns),
         LiveRobots(fleet, time.monotonic),
         settings,

@@ -9,6 +9,7 @@ from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
 from mapserver.dashboard.console import Console, PageContext
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
+from mapserver.dashboard.space.loops import VERDICTS
 from mapserver.serving.live_surveys import LiveSurvey, LiveSurveys
 
 _MARGIN_M = 4.0
@@ -19,12 +20,6 @@ _PHASES = {
     "adjusting": ("", "The drive is over; the finished map is made."),
     "stored": ("good", "The finished map is stored as a draft."),
     "failed": ("bad", "No map could be made of it."),
-}
-_VERDICTS = {
-    "accepted": ("good", "accepted"),
-    "ambiguous": ("warn", "several places fit"),
-    "gated_out": ("bad", "too far away by odometry"),
-    "rejected": ("bad", "refused"),
 }
 
 
@@ -67,7 +62,7 @@ def _page(surveys: LiveSurveys, context: PageContext) -> dict[str, object]:
             "follows": True,
         },
         "hues": [_hue(number) for number in range(len(state.parts))],
-        "verdicts": _VERDICTS,
+        "verdicts": VERDICTS,
     }
 
 

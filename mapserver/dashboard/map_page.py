@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from fleetmap.errors import UsageError
 from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
@@ -67,6 +66,8 @@ def install(console: Console) -> None:
 
 def _page(services: Services, context: PageContext) -> dict[str, object]:
     maps, site, span_ns = services.maps, context.site, context.time_range()
+    if not maps.is_mapped(site):
+        return {"shown": None}
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
     verdicts = maps.store.last_verdicts(site)
     robots = [robot.version for robot in services.robots.look(site).robots]
@@ -74,7 +75,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
     shown = next((number for number in known if number is not None), None)
     if shown is None:
-        raise UsageError(f"site {site} has no version yet; `mapserver build` makes one from a recording")
+        return {"shown": None}
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in requests]

@@ -1,4 +1,4 @@
-"""The page of surveys: what was built, what failed? Jobs with their progress, what became of every recording, loops on the map."""
+"""The page of surveys: what was built, what failed? Inbox, jobs with progress and log, what became of every recording, loops on the map."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -7,19 +7,15 @@ from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
+from fleetmap.recordings import FILE_SUFFIXES
+from mapserver.api.inbox_routes import NO_INBOX
 from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
-from mapserver.dashboard.space.loops import Loop, builds_of, dicts, loops_of
+from mapserver.dashboard.space.loops import VERDICTS, Loop, builds_of, dicts, loops_of
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said
 _LONG_H = 12.0  # a job that is killed cannot say so
-_VERDICTS = {
-    "accepted": ("good", "accepted"),
-    "rejected": ("bad", "refused by what is seen"),
-    "ambiguous": ("bad", "refused as ambiguous"),
-    "gated_out": ("quiet", "refused by position"),
-}
 _LEFT_OUT = {"foreign": "another place", "undecided": "held", "bad": "refused"}
 
 
@@ -39,8 +35,7 @@ class _Recording(NamedTuple):
 def install(console: Console) -> None:
     """Adds the page."""
     services, knows = console.services, ("job", "since", "until")
-    sites = services.maps.sites_with_jobs
-    console.page("surveys", "surveys.html", lambda context: _page(services, context), knows=knows, under_way=sites)
+    console.page("surveys", "surveys.html", lambda context: _page(services, context), knows=knows)
 
 
 def _page(services: Services, context: PageContext) -> dict[str, object]:
@@ -55,6 +50,9 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "site": context.site,
         "jobs": [(job, _state(job), _progress(job)) for job in jobs],
         "chosen": chosen,
+        "inbox": services.maps.inbox_of(context.site),
+        "no_inbox": NO_INBOX,
+        "suffixes": FILE_SUFFIXES,
     }
     if chosen is None:
         return shown
@@ -67,13 +65,14 @@ def _state(job: JobInfo) -> str:
 
 
 def _progress(job: JobInfo) -> dict[str, object] | None:
-    """The stage of a running job, how far it is, and how many seconds that stage takes still."""
-    told = job.report.get("progress")
-    if job.state != "running" or not isinstance(told, dict):
+    """The stage of a running job, how far it is, and how many seconds that stage takes still; before the first stage, what it reads."""
+    if job.state != "running":
         return None
+    told, reads = job.report.get("progress") or {}, job.report.get("looking_at") or ()
     done, total, stage_s = (float(told.get(name) or 0) for name in ("done", "total", "stage_s"))
     left_s = stage_s * (total - done) / done if done > 0 and stage_s >= _TELLING_S else None
-    return {"stage": told.get("stage"), "done": done, "total": total, "left_s": left_s}
+    stage = told.get("stage") or (f"reading {reads[0]}" if reads else "starting")
+    return {"stage": stage, "done": done, "total": total, "left_s": left_s}
 
 
 def _recordings(job: JobInfo) -> list[_Recording]:
@@ -143,5 +142,5 @@ def _loops(services: Services, context: PageContext, build: dict[str, Any]) -> d
 
 def _told(loop: Loop) -> tuple[str, str]:
     """Tone and words of what became of a loop."""
-    tone, words = _VERDICTS.get(loop.verdict, ("quiet", loop.verdict))
+    tone, words = VERDICTS.get(loop.verdict, ("quiet", loop.verdict))
     return tone, f"{words}: {loop.reason}" if loop.reason else words

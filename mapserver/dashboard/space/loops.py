@@ -7,6 +7,13 @@ from typing import Any
 import msgspec
 
 MOST_LOOPS = 3000
+VERDICTS = {
+    "accepted": ("good", "accepted"),
+    "ambiguous": ("warn", "refused as several places fit"),
+    "rejected": ("bad", "refused by what is seen"),
+    "gated_out": ("quiet", "refused by position"),
+}
+"""Tone and words of what becomes of a revisit."""
 
 
 class Loop(msgspec.Struct, frozen=True):

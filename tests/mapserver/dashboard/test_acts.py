@@ -172,6 +172,51 @@ def test_a_test_alert_is_sent_and_its_answer_told(page: Page, tmp_path: Path) ->
     assert seen.faults == []
 
 
+def test_a_recording_is_uploaded_built_and_tried_again(page: Page, tmp_path: Path) -> None:
+    store, inbox, chosen = tmp_path / "store", tmp_path / "inbox", tmp_path / "mon day.mcap"
+    store.mkdir()
+    fill_store(store)
+    inbox.mkdir()
+    chosen.write_bytes(bytes(20_000_000))
+    (tmp_path / "notes.txt").write_bytes(bytes(20_000_000))
+    with serving(store, "--inbox", str(inbox)) as served:
+        seen = opened(page, served, "surveys")
+        waiting, uploads = page.get_by_role("list", name="Inbox"), page.get_by_role("list", name="Uploads")
+        expect(waiting).to_contain_text("Nothing waits in the inbox.")
+        page.get_by_text("Upload recordings").click()
+        with page.expect_file_chooser() as chooser:
+            page.get_by_role("button", name="Recordings").click()
+        chooser.value.set_files([tmp_path / "notes.txt", chosen])
+        form = page.locator("#upload")
+        form.get_by_label("Your name").fill("ada")
+        form.get_by_label("Reason").fill("aisle 3")
+        form.get_by_role("button", name="Upload", exact=True).click()
+        expect(waiting.get_by_role("listitem").filter(has_text="mon day.mcap")).to_contain_text("20.0 MB")
+        expect(uploads.get_by_role("listitem")).to_have_text(
+            re.compile("notes.txt .*is an invalid name of a recording")
+        )
+        assert (inbox / SITE / chosen.name).stat().st_size == 20_000_000
+        expect(waiting).to_contain_text("ready", timeout=15_000)
+        change(page, "Build now")
+        expect(waiting).to_contain_text("mon day.mcap is not an MCAP file", timeout=60_000)
+        page.get_by_role("link", name="Job 3: nightly").click()
+        page.get_by_text("Log of job 3").click()
+        expect(page.locator("#log pre")).to_contain_text("bad: mon day.mcap: ")
+        (inbox / SITE / chosen.name).touch()
+        change(page, "Try again")
+        expect(page.get_by_role("alert")).to_contain_text("the inbox has another mon day.mcap")
+        page.get_by_role("button", name="No, change nothing").click()
+        (inbox / SITE / chosen.name).unlink()
+        change(page, "Try again")
+        expect(waiting.locator(".bad")).to_have_count(0)
+        with MapStore.open(store) as maps:
+            kinds = [(event.kind, event.actor) for event in maps.last_events(SITE, 3)]
+        assert kinds == [(kind, "ada") for kind in ("recording_tried_again", "build_started", "recording_uploaded")]
+        refusals = ("422 (Unprocessable Entity)", "409 (Conflict)")
+        told = [f"Failed to load resource: the server responded with a status of {status}" for status in refusals]
+        assert [fault for fault in seen.faults if not fault.startswith("4")] == told
+
+
 def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> None:
     fill_store(tmp_path)
     with serving(tmp_path) as served:

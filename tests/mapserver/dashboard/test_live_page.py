@@ -70,7 +70,7 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
             "50 m²",
             "too few or too crowded",
             "nothing looks W",
-            "12 too far away by odometry",
+            "12 refused by position",
             "scale is not known",
         ):
             expect(page.locator("body")).to_contain_text(words)

@@ -267,8 +267,23 @@ def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None
 def test_surveys_begin_with_a_site_that_has_a_map(served: Served) -> None:
     with MapStore.open(served.folder) as store:
         store.update_job(store.begin_job("depot", "build"), "failed", "no images", {})
+        reading = store.begin_job("depot", "nightly")
     assert "Surveys of hall" in httpx.get(f"{served.http}/dashboard/surveys", timeout=60).text
-    assert "no images" in httpx.get(f"{served.http}/dashboard/surveys?site=depot", timeout=60).text
+
+    def shown(path: str) -> str:
+        answer = httpx.get(f"{served.http}/dashboard/{path}?site=depot", timeout=60)
+        assert answer.status_code == 200, path
+        return answer.text
+
+    assert "no images" in shown("surveys")
+    assert "<p>starting</p>" in shown("surveys")
+    with MapStore.open(served.folder) as store:
+        store.tell_progress(reading, ["monday.mcap"], "looking_at")
+        assert "<p>reading monday.mcap</p>" in shown("surveys")
+        store.update_job(reading, "failed", "", {})
+    assert "depot has no version yet" in shown("map")
+    for path in ("", "trends", "failures", "live"):
+        shown(path)
 
 
 def test_a_refused_stream_is_opened_again_and_a_hidden_page_has_none(page: Page, served: Served) -> None:
