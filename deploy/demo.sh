@@ -44,7 +44,7 @@ stop_server() {
 }
 
 start_server() {
-  "$BIN/mapserver" serve --create --store "$OUT/store" --http 127.0.0.1:0 --zenoh tcp/127.0.0.1:0 >"$OUT/server.log" 2>&1 &
+  "$BIN/mapserver" serve --create --store "$OUT/store" --inbox "$OUT/inbox" --http 127.0.0.1:0 --zenoh tcp/127.0.0.1:0 >"$OUT/server.log" 2>&1 &
   server_pid=$!
   local deadline=$((SECONDS + READY_WITHIN_S))
   until grep -qx ready "$OUT/server.log"; do
@@ -138,11 +138,12 @@ half_of() {
 
 warehouse() {
   local robot number
+  # The simulator draws the next day's recordings on the other core meanwhile; no robot has them before the map is there.
+  (record clip carried 1 && for robot in "${ROBOTS[@]}"; do record small-loop "$robot" 1; done) >"$OUT/robots.log" 2>&1 &
+  robots_pid=$!
   say "a survey robot drives through a simulated warehouse"
   record small-loop survey 0
   say "building a map of the survey; meanwhile it is the next day and two robots drive, stock has moved"
-  (for robot in "${ROBOTS[@]}"; do record small-loop "$robot" 1; done && record clip carried 1) >"$OUT/robots.log" 2>&1 &
-  robots_pid=$!
   build "$OUT/survey.mcap" --frame-from-ground-truth
   say "the robots come home with their recordings"
   wait "$robots_pid" || { cat "$OUT/robots.log" >&2; fail "recording the robots failed"; }
