@@ -37,6 +37,7 @@ T = TypeVar("T")
 PATH = "/dashboard"
 PAGES = {
     "": "Overview",
+    "robots": "Robots",
     "trends": "Trends",
     "map": "Map",
     "failures": "Failures",
@@ -44,7 +45,7 @@ PAGES = {
     "live": "Live",
     "administration": "Administration",
 }
-_UNDER = {"space": "map", "robots": ""}  # which of those leads to other pages
+_UNDER = {"space": "map"}  # which of those leads to other pages
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 _WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0

@@ -19,6 +19,7 @@ from mapserver.dashboard import (
     overview,
     people,
     robot,
+    robots,
     sign_in_page,
     space_page,
     survey_jobs,
@@ -48,12 +49,13 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     console.files()
     for module in (
         overview,
+        robots,
+        robot,
         map_page,
         failures,
         failure,
         space_page,
         live_page,
-        robot,
         survey_jobs,
         administration,
         people,

@@ -1,6 +1,7 @@
 """Current state of the robots, computed once for all open pages. Pure but for the clock that it is given."""
 
 import math
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,12 +20,12 @@ _CACHED_S = 0.9
 # Words and tone of a status.
 STATUSES: dict[str, tuple[str, str]] = {
     Status.TRACKING: ("localised", "good"),
-    Status.DEGRADED: ("unsure", "warn"),
+    Status.DEGRADED: ("uncertain", "warn"),
     Status.INITIALISING: ("starting", "warn"),
     Status.AMBIGUOUS: ("several places fit", "bad"),
     Status.LOST: ("lost", "bad"),
 }
-SILENT = ("silent", "quiet")
+SILENT = ("offline", "quiet")
 _SHAPES = {"warn": "triangle", "bad": "square"}
 
 
@@ -37,7 +38,7 @@ def words_of(status: str) -> tuple[str, str]:
 class LiveRobot:
     """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one; heading: from x to y.
 
-    state: the status that it sent, empty before. since_ns: since when it is localised, unsure or not localised, whichever it is.
+    state: the status that it sent, empty before. since_ns: since when it is localised, uncertain or not localised, whichever it is.
     metrics: figures of its last health report. calibration: what the map shows of its cameras, empty for a robot that does not report it.
     """
 
@@ -113,10 +114,15 @@ class LiveRobots:
             if cached is not None and self._clock_s() - cached[0] < _CACHED_S:
                 return cached[1]
             robots = [live_robot(status) for status in self.fleet.robots(site)]
-            robots.sort(key=lambda robot: (ORDER.get(robot.tone, 1), robot.name))
+            robots.sort(key=lambda robot: (ORDER.get(robot.tone, 1), _counted(robot.name)))
             found = LiveSite(tuple(robots))
             self._cached[site] = (self._clock_s(), found)
         return found
+
+
+def _counted(name: str) -> list[str | int]:
+    """A key by which tug-9 is before tug-10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def live_robot(status: RobotStatus) -> LiveRobot:

@@ -52,7 +52,7 @@ def _now(services: Services, context: PageContext) -> dict[str, object]:
     live, health = services.robots.look(context.site), services.health.site(context.site)
     areas = services.maps.areas(context.site)
     return {
-        "line": _line(live),
+        "line": site_line(live),
         "notices": _notices(context, health),
         "figures": _figures(live, health),
         "robots": [_robot(context, robot, health, areas) for robot in live.robots],
@@ -60,7 +60,7 @@ def _now(services: Services, context: PageContext) -> dict[str, object]:
     }
 
 
-def _line(live: LiveSite) -> dict[str, str]:
+def site_line(live: LiveSite) -> dict[str, str]:
     """One sentence for all robots."""
     online = [robot for robot in live.robots if robot.tone != "quiet"]
     lost, unsure = live.count("bad"), live.count("warn")
@@ -92,9 +92,24 @@ def _troubles(robot: LiveRobot) -> list[str]:
     return found + [f"{PARAMETERS[f.name]} drifts" for f in robot.calibration if f.is_drifted]
 
 
+def remarks(robot: LiveRobot) -> list[str]:
+    """What it reports, what is wrong, and whether it tries a version."""
+    trial = ["tries a new version"] if robot.is_canary else []
+    return [flag.replace("_", " ") for flag in robot.flags] + _troubles(robot) + trial
+
+
+def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
+    """For how long it is in its state or was not heard, and since which moment; empty where that is not known."""
+    if robot.tone == "quiet":
+        return age(robot.seconds_since), ""
+    if robot.since_ns is None:
+        return "", ""
+    return age(max(0.0, time.time() - robot.since_ns / 1e9)), context.moment(robot.since_ns) or ""
+
+
 def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas) -> dict[str, object]:
     """One row of the list."""
-    words, own = [*robot.flags, *_troubles(robot)], health.robots.get(robot.name)
+    words, own = remarks(robot), health.robots.get(robot.name)
     failures = 0 if own is None else own.failures.events + own.failures_running
     words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
     words += (
@@ -102,12 +117,8 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
         if own is not None and own.silent_estimated.events
         else []
     )
-    words += ["tries a new version"] if robot.is_canary else []
-    since, exact = "", ""
-    if robot.tone == "quiet":
-        since = f"{age(robot.seconds_since)} ago"
-    elif robot.tone != "good" and robot.since_ns is not None:
-        since, exact = age(max(0.0, time.time() - robot.since_ns / 1e9)), context.moment(robot.since_ns) or ""
+    since, exact = ("", "") if robot.tone == "good" else since_words(context, robot)
+    since += " ago" if robot.tone == "quiet" else ""
     return {
         "name": robot.name,
         "to": context.to(f"robots/{robot.name}"),
@@ -115,7 +126,7 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
         "state": robot.words,
         "since": since,
         "exact": exact,
-        "about": " · ".join(filter(None, [robot.where(areas), ", ".join(words).replace("_", " ")])),
+        "about": " · ".join(filter(None, [robot.where(areas), ", ".join(words)])),
         "place": robot.place_m,
     }
 
@@ -134,7 +145,7 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
     if is_telling(failures):
         low, high = (figure(value or 0.0) for value in (failures.low, failures.high))
         days = [day.per_robot_day if is_telling(day) else None for day in health.days]
-        value, more = figure(failures.per_robot_day or 0.0), f"{low} to {high} with 95 %"
+        value, more = figure(failures.per_robot_day or 0.0), f"in truth {low} to {high}, with 95 % certainty"
         found.append({"name": "Failures per robot-day, 24 h", "value": value, "more": more, "days": days})
     return found
 

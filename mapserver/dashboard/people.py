@@ -66,11 +66,11 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "left": lambda token: (token.ends_ns - now_ns) / 1e9,
         "robots": sorted(robots, key=lambda robot: (ORDER[robot.tone], robot.name)),
         "most": _MOST_ROBOTS,
-        "cannot_enrol": _cannot_enrol(RobotRegister(store)),
+        "cannot_enrol": cannot_enrol(RobotRegister(store)),
     }
 
 
-def _cannot_enrol(register: RobotRegister) -> str:
+def cannot_enrol(register: RobotRegister) -> str:
     """Why no robot can be enrolled, empty if one can."""
     try:
         _ = register.tls

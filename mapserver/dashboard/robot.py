@@ -38,7 +38,7 @@ def install(console: Console) -> None:
     def page(context: PageContext, robot: str) -> dict[str, object]:
         found = services.robots.look(context.site).robot(robot)
         if found is None:
-            raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the Overview lists them")
+            raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
         return _page(services, context, found)
 
     def now(context: PageContext, robot: str) -> dict[str, object]:

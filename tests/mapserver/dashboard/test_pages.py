@@ -28,6 +28,7 @@ from support.pages.whole_page import assert_whole
 
 PAGES = {
     "": "Overview of hall",
+    "robots": "Robots of hall",
     "trends": "Trends of hall",
     "map": "Map of hall",
     "failures": "Failures of hall",
@@ -71,13 +72,47 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         expect(page.get_by_role("status")).to_contain_text(re.compile(r"^Lost for \d+ "))
         expect(page.get_by_role("status")).to_have_attribute("title", re.compile(r"^since \d{4}-"))
         assert [mark["name"] for mark in marks(page)] == [lost]
-        expect(page.get_by_role("list", name="States, the last one first")).to_contain_text("lost")
+        states = page.get_by_role("list", name="States, the last one first")
+        expect(states).to_contain_text("lost", timeout=90_000)  # since seconds, and renewed each 30 s
         opened(page, served, "")
         before = page.evaluate("performance.timeOrigin")
         page.get_by_label("Find a robot").fill("tug-4")
         row = page.locator("#robots li", has=page.get_by_role("link", name="tug-4", exact=True))
         expect(row).to_contain_text("lost", timeout=15_000)
         assert page.evaluate("performance.timeOrigin") == before, "the page changed by itself, it was not loaded again"
+        assert seen.faults == []
+
+
+def test_robots_are_filtered_and_columns_chosen_by_the_address(page: Page, served: Served) -> None:
+    with talking(served.zenoh, ROBOTS) as moved:
+        moved["tug-4"] = (40.0, 14.0)
+        seen = opened(page, served, "robots")
+        table = page.get_by_role("table", name="Robots, problems first")
+        rows = table.locator("tbody tr")
+        expect(rows).to_have_count(ROBOTS)
+        expect(rows.first).to_contain_text(re.compile("lost|several places fit"))
+        page.get_by_role("navigation", name="States").get_by_role("link", name=re.compile("^lost")).click()
+        page.get_by_text("Columns", exact=True).click()
+        page.get_by_role("navigation", name="Columns").get_by_role("link", name="Since").click()
+        expect(table.get_by_role("columnheader", name="Since")).to_have_count(0)
+        page.get_by_label("Find a robot").fill("tug-4")
+        expect(page).to_have_url(re.compile("find=tug-4"))
+        expect(rows).to_have_count(1)
+        page.reload()
+        expect(rows).to_have_text([re.compile(r"^tug-4\s*lost.*40.0, 14.0 m")])
+        expect(table.get_by_role("columnheader", name="Since")).to_have_count(0)
+        del moved["tug-4"]
+        expect(rows).to_have_text([re.compile("No robot matches")])
+        page.get_by_label("Find a robot").fill("")
+        chosen = page.get_by_role("navigation", name="States").locator(".chosen")
+        expect(chosen).not_to_have_attribute("href", re.compile("find="))
+        chosen.click()
+        expect(rows).to_have_count(ROBOTS)
+        names = rows.get_by_role("link").all_inner_texts()
+        assert names.index("tug-9") < names.index("tug-10")
+        row = rows.filter(has=page.get_by_role("link", name="tug-9", exact=True))
+        row.locator(".where").click(force=True)  # all of the row is the link, which covers it
+        expect(page.locator("h1")).to_have_text("tug-9")
         assert seen.faults == []
 
 
@@ -234,6 +269,7 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("failures/77", "failure 77 does not exist"),
         ("surveys?job=99", "job 99 does not exist"),
         ("robots/nobody", "never heard of a robot"),
+        ("robots?without=colour", "there is no column &#39;colour&#39;"),
         ("failures?sinc=2026-01-01", "this page knows site, cause"),
         ("failures?since=soon", "is an invalid time; write"),
         ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
@@ -255,7 +291,7 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
 def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None:
     for path, leads_to in (
         ("failures/1", ' action="/dashboard/failures"'),
-        ("robots/tug-7", ' action="/dashboard/"'),
+        ("robots/tug-7", ' action="/dashboard/robots"'),
         ("space", ""),
     ):
         text = httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text

@@ -6,8 +6,19 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
+from mapserver.dashboard.console import PAGES
 from mapserver.store import MapStore
-from support.fleet.dashboard_scene import SITE, Served, change, fill_store, marks, opened, serving, talking
+from support.fleet.dashboard_scene import (
+    SITE,
+    Served,
+    change,
+    fill_store,
+    marks,
+    opened,
+    overlapping,
+    serving,
+    talking,
+)
 from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import SIZES, WEAKEST_CONTRAST
 
@@ -68,6 +79,16 @@ def test_every_act_is_in_reach_in_every_size_and_look(page: Page, served: Served
                     dialog.get_by_role("button", name=re.compile("^No")).click()
                     expect(dialog).to_have_count(0)
         assert seen.faults == []
+
+
+def test_every_page_is_in_reach_of_a_thumb(phone: Page, served: Served) -> None:
+    opened(phone, served, "robots")
+    links = phone.get_by_role("navigation", name="Pages").get_by_role("link").all()
+    assert len(links) == len(PAGES)
+    for link in links:
+        assert_in_reach(phone, link)
+    boxes = [(box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]) for box in map(box_of, links)]
+    assert overlapping(boxes) == []
 
 
 def test_all_acts_on_a_phone(phone: Page, served: Served) -> None:
