@@ -116,14 +116,14 @@ def _answer(found: Sequence[FailureRow]) -> str:
     told = f"{'The last ' * (len(found) >= MANY_FAILURES)}{len(found)} failure{'s' * (len(found) > 1)}"
     told += f", {suspected} of them suspected" if suspected else ""
     robots, parts = len({row.robot for row in found}), []
-    for values in (
-        [row.cause.replace("_", " ") for row in found],
-        [row.where for row in found],
-        [row.robot for row in found],
+    for link, values in (
+        ("", [row.cause.replace("_", " ") for row in found]),
+        ("in ", [row.where for row in found]),
+        ("of ", [row.robot for row in found]),
     ):
         ((most, count),) = Counter(value or "unknown" for value in values).most_common(1)
-        parts += [f"{most} ({count})"] if count > 1 else []
-    told += f", of {robots} robots" if robots > 1 else ""
+        parts += [f"{link}{most} ({count})"] if count > 1 else []
+    told += f" of {robots} robots" if robots > 1 else ""
     return f"{told}. Most: {', '.join(parts)}." if parts else f"{told}."
 
 
