@@ -316,7 +316,7 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         page.keyboard.press("Escape")
         expect(dialog).to_contain_text("is shown only now")
         dialog.get_by_role("button", name="Close").click()
-        page.get_by_label("Name").fill("bob")
+        page.get_by_label("Name", exact=True).fill("bob")  # not that of the page that is left
         page.get_by_label("Password").fill(password)
         page.get_by_role("button", name="Sign in").click()
         people, robots = (
