@@ -15,7 +15,11 @@ from mapserver.quality.figures import TileDirections
 
 _LONG_SIDE_PX = 1600
 _FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
-_BEYOND_M = 12.0  # margin around the robots' path; landmarks of far walls would shrink everything else
+_BEYOND_M, _MARGIN_M = (
+    12.0,
+    1.0,
+)  # around the robots' path, and around most landmarks: those of far walls would shrink everything else
+_FEW = 1.0  # per cent
 _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 
 
@@ -45,7 +49,7 @@ def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Pla
     tiles = [read_tile(entry) for entry in manifest.tiles]
     landmarks = np.concatenate([np.zeros((0, 2)), *(tile.points_map[:, :2] for tile in tiles)])
     places = np.concatenate([np.zeros((0, 2)), *(tile.map_from_cam[:, :2, 3] for tile in tiles)])
-    low, high = _corners(manifest, places)
+    low, high = _corners(manifest, places, landmarks)
     return Plan(
         (float(low[0]), float(low[1])),
         (float(high[0]), float(high[1])),
@@ -57,14 +61,17 @@ def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Pla
     )
 
 
-def _corners(manifest: Manifest, places: Array) -> tuple[Array, Array]:
+def _corners(manifest: Manifest, places: Array, landmarks: Array) -> tuple[Array, Array]:
     if not manifest.tiles:
         return np.array([-5.0, -5.0]), np.array([5.0, 5.0])
     cells = np.array([(entry.x, entry.y) for entry in manifest.tiles], float)
     low, high = cells.min(axis=0) * manifest.tile_size_m, (cells.max(axis=0) + 1) * manifest.tile_size_m
     if len(places):
-        near_low = np.maximum(low, places.min(axis=0) - _BEYOND_M)
-        near_high = np.minimum(high, places.max(axis=0) + _BEYOND_M)
+        # As far as most landmarks lie, but with all places.
+        most = np.percentile(np.concatenate([places, landmarks]), [_FEW, 100 - _FEW], axis=0)
+        nearest, farthest = places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
+        near_low = np.maximum(low, np.maximum(nearest - _BEYOND_M, np.minimum(nearest, most[0] - _MARGIN_M)))
+        near_high = np.minimum(high, np.minimum(farthest + _BEYOND_M, np.maximum(farthest, most[1] + _MARGIN_M)))
         if (near_high - near_low > 1.0).all():
             return near_low, near_high
     return low, high
