@@ -1,5 +1,6 @@
 """The OpenAPI document holds: whatever is asked as it allows (or not), the answers are as it says and never 500."""
 
+import os
 import time
 from pathlib import Path
 from unittest.mock import Mock
@@ -38,6 +39,7 @@ from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.quick_passwords import use_quick_passwords
 from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
 
+EXAMPLES = int(os.environ.get("FLEETMAP_API_EXAMPLES", "8"))  # of each operation
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
 
 PINS = ["a=200,400:0,0", "b=200,0:20,0"]
@@ -62,7 +64,7 @@ def ask_operation(operation: schemathesis.APIOperation, request: str, headers: d
     """The statuses of the answers to questions made up after the document, some of them about what is there."""
     statuses: list[int] = []
 
-    @settings(max_examples=8, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
     @given(case=operation.as_strategy())
     def ask(case: schemathesis.Case) -> None:
         number, path = len(statuses), case.path_parameters
@@ -131,7 +133,7 @@ def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.Monke
         headers = {"Authorization": f"Bearer {operators.make_token('root', Scope, 1, Actor('ada'))}"}
         asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
         receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
-        for number in range(1, 20, 2):
+        for number in range(1, 2 * EXAMPLES, 2):
             make_folder(tmp_path / "inbox/hall/held")
             (tmp_path / f"inbox/hall/held/held-{number}.mcap").touch()
         log_path(tmp_path, 1).write_text("reading monday\n")
