@@ -91,6 +91,13 @@ def test_every_page_is_in_reach_of_a_thumb(phone: Page, served: Served) -> None:
     assert overlapping(boxes) == []
 
 
+def test_each_robot_is_in_reach_on_a_phone_held_sideways(phone: Page, served: Served) -> None:
+    phone.set_viewport_size({"width": 844, "height": 390})
+    opened(phone, served, "")
+    phone.get_by_role("list", name="Robots, problems first").get_by_role("link", name="tug-7", exact=True).tap()
+    expect(phone.locator("h1")).to_have_text("tug-7")
+
+
 def test_all_acts_on_a_phone(phone: Page, served: Served) -> None:
     seen = opened(phone, served, "robots/tug-5")
     phone.locator(".site-map").tap(position={"x": 150, "y": 150})
