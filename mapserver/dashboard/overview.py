@@ -51,11 +51,12 @@ def _now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
     areas = services.maps.areas(context.site)
+    robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
         "notices": _notices(context, health),
         "figures": _figures(live, health),
-        "robots": [_robot(context, robot, health, areas) for robot in live.robots],
+        "robots": [_robot(context, robot, health, areas) for robot in robots],
         "marks": _marks(context, live),
     }
 
@@ -69,16 +70,21 @@ def site_line(live: LiveSite) -> dict[str, str]:
     if not online:
         last_s = min(robot.seconds_since for robot in live.robots)
         return {"tone": "quiet", "words": f"All robots are offline; the last one reported {age(last_s)} ago."}
-    troubled = sum(robot.tone == "good" and bool(_troubles(robot)) for robot in online)
-    counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "with something else to look at"))
+    troubled = sum(map(_is_troubled, online))
+    counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "localised with a problem"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
         words = (
             f"All {len(online)} robots online are localised." if len(online) > 1 else f"{online[0].name} is localised."
         )
         return {"tone": "good", "words": words}
-    told = f"{', '.join(parts)}; {len(online)} robots are online."
+    told = f"Of {len(online)} robot{'s' * (len(online) > 1)} online: {', '.join(parts)}."
     return {"tone": "bad" if lost else "warn", "words": told}
+
+
+def _is_troubled(robot: LiveRobot) -> bool:
+    """True for a robot that is localised with a problem."""
+    return robot.tone == "good" and bool(_troubles(robot))
 
 
 def _troubles(robot: LiveRobot) -> list[str]:

@@ -65,7 +65,7 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         moved["tug-4"] = (40.0, 14.0)
         at_new_place = "marks => marks.some(m => m.name === 'tug-4' && m.x === 40 && m.y === 14 && m.tone === 'bad')"
         wait_until(page, f"({at_new_place})(document.querySelector('.site-map').marks())")
-        expect(page.get_by_role("status")).to_contain_text(f"{ROBOTS} robots are online")
+        expect(page.get_by_role("status")).to_contain_text(f"Of {ROBOTS} robots online: ")
         page.get_by_role("list", name="Robots, problems first").get_by_role("link").first.click()
         lost = page.url.rpartition("/")[2].partition("?")[0]
         expect(page.locator("h1")).to_have_text(lost)
