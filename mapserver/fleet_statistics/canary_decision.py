@@ -80,8 +80,8 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
         action = "roll_back"
     else:
         action, why = "wait", _why_wait(ours, theirs, within, evidence)
-    allowed = f"{settings.margin_ratio:g} times as often, and {settings.margin_per_robot_day:g} times a robot-day more"
-    reason = f"{why}. With it: {_rate_text(ours)}; without: {_rate_text(theirs)}. It may fail up to {allowed}"
+    allowed = f"{settings.margin_ratio:g} times the rate without it, plus {settings.margin_per_robot_day:g} failures per robot-day"
+    reason = f"{why}. With it: {_rate_text(ours)}; without: {_rate_text(theirs)}. The limit is {allowed}"
     return CanaryFinding(action, reason, ours, theirs, evidence, within)
 
 
