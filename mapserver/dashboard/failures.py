@@ -121,8 +121,8 @@ def _answer(found: Sequence[FailureRow]) -> str:
         ("in ", [row.where for row in found]),
         ("of ", [row.robot for row in found]),
     ):
-        ((most, count),) = Counter(value or "unknown" for value in values).most_common(1)
-        parts += [f"{link}{most} ({count})"] if count > 1 else []
+        (most, count), (_, second) = [*Counter(value or "unknown" for value in values).most_common(2), ("", 1)][:2]
+        parts += [f"{link}{most} ({count})"] if count > second else []
     told += f" of {robots} robots" if robots > 1 else ""
     return f"{told}. Most: {', '.join(parts)}." if parts else f"{told}."
 

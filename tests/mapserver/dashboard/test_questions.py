@@ -133,6 +133,22 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     listed_in(page, "aisle 2")
 
 
+def test_is_it_one_robot_or_one_place(operator: Operator) -> None:
+    """Seven robots failed twice each: none of them stands out, and none is named."""
+    operator.click(operator.page.get_by_role("link", name="Failures", exact=True))
+    expect(operator.page.get_by_role("status")).to_contain_text(
+        re.compile(r"of 8 robots\. Most: no match \(\d+\), in aisle 2 \(\d+\)\.$")
+    )
+
+
+def test_the_worst_failure_by_the_keyboard(operator: Operator) -> None:
+    page = operator.page
+    opened(page, operator.served, "failures")
+    for key in ("Tab", "Enter", "Tab", "Enter"):
+        page.keyboard.press(key)
+    expect(page.locator("h1")).to_have_text(re.compile("^Failure "))
+
+
 def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
     page = operator.page
     operator.click(page.get_by_role("link", name="Area by area"))
