@@ -116,7 +116,7 @@ def test_robots_are_filtered_and_columns_chosen_by_the_address(page: Page, serve
         assert seen.faults == []
 
 
-# Where a mark is drawn, in metres, by the picture of the landmarks, whose corners are those of the hall's tiles; null without paint.
+# Where a mark is drawn, in metres, by the picture of the landmarks, whose corners the page knows; null without paint.
 PLACE_OF = """name => {
   const map = document.querySelector('.site-map');
   const picture = map.querySelector('img.picture').getBoundingClientRect();
@@ -125,8 +125,10 @@ PLACE_OF = """name => {
   const copy = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
   copy.drawImage(canvas, corner.x - x, corner.y - y);
   const paint = copy.getImageData(0, 0, 1, 1).data;
-  const scale = 64 / picture.width;
-  return paint[3] === 255 ? [(x - picture.x) * scale, (picture.bottom - y) * scale] : null;
+  const { layers } = JSON.parse(document.getElementById('data').textContent).scene;
+  const [left, low, right] = layers.flatMap(({ items }) => items).find(({ kind }) => kind === 'picture').box;
+  const scale = (right - left) / picture.width;
+  return paint[3] === 255 ? [left + (x - picture.x) * scale, low + (picture.bottom - y) * scale] : null;
 }"""
 
 
@@ -249,8 +251,10 @@ def test_versions_are_compared(page: Page, served: Served) -> None:
     sides = swipe.locator("clipPath rect").evaluate_all(
         "all => all.map(r => [r.x.baseVal.value, r.width.baseVal.value])"
     )
-    assert sides == [[0, 16], [16, 64]]
-    assert swipe.locator("image").evaluate_all("all => all.map(i => i.width.baseVal.value)") == [48.0, 64.0]
+    (low, before_m), (middle, whole_m) = sides
+    assert (before_m, middle) == (pytest.approx(0.25 * whole_m), pytest.approx(low + before_m))
+    one, other = swipe.locator("image").evaluate_all("all => all.map(i => i.width.baseVal.value)")
+    assert other - one == pytest.approx(16.0, abs=1.0), "a tile was added"
     assert seen.faults == []
 
 
