@@ -32,7 +32,8 @@ from mapserver.store.files import make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
 _HASH_SIGNS = 12
-_MAX_NAME_BYTES = 200  # of 255: room for the hash and a number before the name, and `.reason.txt` after it
+_MAX_NAME_BYTES = 220  # of 255: room for `.reason.txt` after it
+_UPLOAD_NAME_BYTES = 200  # room for the hash and a number before it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
 _REASON_BYTES = 2000
@@ -245,7 +246,7 @@ def _is_being_written(path: Path) -> bool:
 def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> Path:
     """Move a recording into a folder of its inbox, with the reason beside it; return its new path.
 
-    A name that `is_safe_name` refuses is replaced by one of its hash.
+    A name that `is_safe_name` refuses, then also with a number before it, is replaced by one of its hash.
 
     Raises StoreError if the disk refuses; the recording then stays in place.
     """
@@ -253,7 +254,8 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
-        target = _free(folder, prefix + (path.name if is_safe_name(path.name) else _safe_name(path)))
+        named = f"{prefix}{path.name}"
+        target = _free(folder, named if is_safe_name(f"99-{named}") else f"{prefix}{_safe_name(path)}")
         reason_file = folder / f"{target.name}{_REASON}"
         if reason is not None:
             write_atomically(reason_file, [f"{printable(reason)}\n".encode()])
@@ -362,9 +364,10 @@ def put_back(inbox: Path, where: str, name: str) -> None:
 def check_upload_name(inbox: Path, name: str) -> Path:
     """Return where an uploaded recording belongs. Raises UsageError for an invalid name, StateError for one that exists."""
     path = inbox / name
-    if not is_safe_name(name) or path.suffix not in FILE_SUFFIXES:
+    is_short = is_safe_name(name) and len(os.fsencode(name)) <= _UPLOAD_NAME_BYTES
+    if not is_short or path.suffix not in FILE_SUFFIXES:
         known = f"{', '.join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}"
-        words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_MAX_NAME_BYTES} bytes that end in {known}"
+        words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_UPLOAD_NAME_BYTES} bytes that end in {known}"
         raise UsageError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
     if os.path.lexists(path):
         raise StateError(f"the inbox has a recording {name} already; rename one of them")

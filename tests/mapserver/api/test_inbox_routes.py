@@ -11,6 +11,7 @@ import pytest
 from starlette.types import Message
 
 from mapserver.drafting.job_lock import log_path
+from mapserver.nightly.inbox import put_away
 from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
@@ -197,6 +198,20 @@ def test_what_was_left_out_is_tried_again(server: Server, lab: Path) -> None:
     check_problem(server.client.post(again, json=ADA), 404, "no recording")
     assert server.client.post(f"{INBOX}/done/{quote(name)}/retry", json=ADA).status_code == 422
     assert server.client.post(f"{INBOX}/held/{quote('../x', safe='')}/retry", json=ADA).status_code == 404
+
+
+def test_a_long_name_is_found_again(server: Server, lab: Path) -> None:
+    """Also with the hash before it, held and back in the inbox."""
+    name = "a" * 195 + ".mcap"
+    assert server.client.put(f"{INBOX}/{name}", params=ADA, content=b"x").status_code == 201
+    put_away(lab / name, "held", "3fa9" * 16, "fits nowhere")
+    (held,) = server.client.get(INBOX).json()["held"]
+    assert held["name"] == f"3fa93fa93fa9-{name}"
+    here = server.client.post(f"{INBOX}/held/{held['name']}/retry", json=ADA).json()
+    assert [one["name"] for one in here["waiting"]] == [held["name"]]
+    (lab / ("b" * 215 + ".mcap")).touch()
+    put_away(lab / ("b" * 215 + ".mcap"), "done", "5fa9" * 16, None)
+    assert server.client.get(INBOX).json()["done"] == 1
 
 
 def test_who_may_only_look_changes_nothing(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
