@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 
 from fleetmap.bus import Bus, check_endpoint, has_tls
-from fleetmap.errors import StateError
+from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.guard import actor_of
@@ -109,7 +109,12 @@ def _install_robot_routes(app: FastAPI, store: MapStore, bus: Bus | None) -> Non
     @app.post("/v1/sites/{site}/enrolled", response_class=Response)
     def enrol_robot(request: Request, site: p.Site, act: views.EnrolAct) -> Response:
         """Admit a robot to the bus: the answer is its bundle for `locclient enrol`, a secret until it is used, once, within a day."""
-        endpoint = own_endpoint() if act.endpoint is None else check_endpoint(act.endpoint)
+        try:
+            endpoint = own_endpoint() if act.endpoint is None else check_endpoint(act.endpoint)
+        except StateError:
+            raise
+        except UsageError as error:
+            raise HTTPException(422, str(error)) from error
         made = register.enrol(site, [act.robot], endpoint, actor=actor_of(request, act.actor, act.reason))
         headers = {"Content-Disposition": f'attachment; filename="{act.robot}.fleetmap"', **_ONCE}
         return Response(made[act.robot], media_type="application/octet-stream", headers=headers)

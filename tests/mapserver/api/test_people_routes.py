@@ -164,6 +164,7 @@ def test_what_makes_no_sense_is_refused(server: Server, named: dict[str, dict[st
         ("/v1/tokens", {"name": "ci", "scopes": ["read"], "days": 401}, 422, "body.days"),
         ("/v1/sites/lab/enrolled", {"robot": "R 1"}, 422, "body.robot"),
         ("/v1/sites/lab/enrolled", {"robot": "r1", "endpoint": "tcp/127.0.0.1:1"}, 422, "body.endpoint"),
+        ("/v1/sites/lab/enrolled", {"robot": "r1", "endpoint": "tls/127.0.0.1:99999"}, 422, "99999 is above 65535"),
         ("/v1/sites/lab/enrolled", {"robot": "r1", "endpoint": "tls/10.0.0.1:1"}, 409, "names 127.0.0.1, maps.example"),
         ("/v1/sites/lab/enrolled/r9/revoke", {}, 404, "has not enrolled r9"),
         ("/v1/sites/lab/robots/r9/remove", {}, 404, "knows no robot r9"),
