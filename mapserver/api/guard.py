@@ -32,6 +32,7 @@ _RIGHTS = (  # needed for reading, too
     (re.compile(r"/v1/(operators|tokens)(/|$)|/dashboard/administration/people(/|$)"), Right.OPERATORS),
     (re.compile(r"/v1/sites/[^/]+/(enrolled(/|$)|robots/[^/]+/remove(/|$))"), Right.ROBOTS),
 )
+_FORWARDED = {"forwarded", "x-forwarded-for", "x-real-ip"}
 _FORBIDDEN = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Not allowed – fleetmap</title><link rel="icon" href="data:,"><link rel="stylesheet" href="{style}"></head>
@@ -177,7 +178,7 @@ class Guard:
         """Refuse requests without a session or token, or with insufficient rights."""
         right = _needed(scope)
         if not self._settings.is_sign_in_on:
-            is_open = right not in {Right.OPERATORS, Right.ROBOTS} or is_loopback_name(address_of(scope))
+            is_open = right not in {Right.OPERATORS, Right.ROBOTS} or _is_from_here(scope)
             words = "without operators only the server's own machine may do this; `mapserver operators add NAME --role admin` there"
             return None if is_open else _refuse(scope, 403, words)
         if right is None:
@@ -217,13 +218,18 @@ def _with_ours(scope: Scope, headers: Any) -> list[tuple[bytes, bytes]]:
 
 
 def _needed(scope: Scope) -> Right | None:
-    path = scope["path"]
+    path = scope["path"].removeprefix(scope.get("root_path", "").rstrip("/"))  # as routes are found
     if path in _OPEN:
         return None
     for pattern, right in _RIGHTS:
         if pattern.match(path):
             return right
     return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
+
+
+def _is_from_here(scope: Scope) -> bool:
+    """True if the server's own machine sends the request, and not for somebody else, as a proxy on it does."""
+    return is_loopback_name(address_of(scope)) and _FORWARDED.isdisjoint(_headers(scope))
 
 
 def _is_somebodys(scope: Scope) -> bool:

@@ -233,4 +233,15 @@ def test_without_operators_other_machines_manage_nobody(server: Server) -> None:
             check_problem(stranger.get(path), 403, "only the server's own machine")
         for path, body, _ in ACTS:
             check_problem(stranger.post(path, json=body | {"actor": "eve", "role": "admin"}), 403, "operators add NAME")
+    proxied = server.client.post(
+        "/v1/operators", json=ACTS[0][1] | {"actor": "eve"}, headers={"X-Forwarded-For": "10.0.0.9"}
+    )
+    check_problem(proxied, 403, "only the server's own machine")
     assert server.client.get("/v1/operators").json()["operators"] == []
+
+
+def test_under_a_prefix_the_same_rights_are_needed(server: Server, named: dict[str, dict[str, str]]) -> None:
+    with TestClient(server.client.app, "http://127.0.0.1", root_path="/maps") as client:
+        for path, _ in LISTS:
+            assert client.get(f"/maps{path}", headers=named["ada"]).status_code == 200
+            assert client.get(f"/maps{path}", headers=named["olga"]).status_code == 403
