@@ -64,6 +64,15 @@ def test_a_clock_that_was_ahead_leaves_neither_long_sessions_nor_lost_tokens(
     assert operators.sign_in("ada", PASSWORD, "10.0.0.1").session, "nor are people kept out"
 
 
+def test_a_first_operator_is_noticed_though_the_clock_was_set_back(tmp_path: Path, clock: Clock) -> None:
+    with MapStore.open(tmp_path / "new", create=True, clock_ns=clock) as store:
+        serving = Operators(store)
+        assert not serving.is_sign_in_on
+        clock.s -= 3600
+        Operators(store).add("ada", "admin", PASSWORD, ADMIN)
+        assert serving.is_sign_in_on
+
+
 def test_a_session_names_its_operator_and_ends(operators: Operators, clock: Clock) -> None:
     session = operators.sign_in("ada", PASSWORD, "10.0.0.1").session
     who = operators.identify(session, "", "10.0.0.1")
