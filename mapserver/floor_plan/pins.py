@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ PIN_SIGMA_M = 0.03  # of click and map point together, each axis; larger if the 
 MAX_PINS = 100
 _MOST_OFF_M = ERROR_LIMIT_M  # a larger residual would make positions in the building off by the failure limit
 _LEAST_APART_M = 1.0
+_MOST = 1e12  # metres, or units of the drawing, from the origin; squares of larger ones are no numbers
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _PIN = re.compile(rf"(.{{1,80}}?)=({_NUMBER}),({_NUMBER}):({_NUMBER}),({_NUMBER})", re.ASCII)
 _Complex = NDArray[np.complex128]
@@ -53,8 +53,10 @@ class Fit:
 def parse_pin(text: str) -> Pin:
     """Parse NAME=px,py:mx,my. UsageError for invalid text."""
     match = _PIN.fullmatch(text)
-    if match is None or not match[1].isprintable() or not all(isfinite(float(value)) for value in match.groups()[1:]):
-        raise UsageError(f"pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map")
+    if match is None or not match[1].isprintable() or any(abs(float(value)) > _MOST for value in match.groups()[1:]):
+        raise UsageError(
+            f"pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map, each at most {_MOST:.0f}"
+        )
     px, py, mx, my = (float(value) for value in match.groups()[1:])
     return Pin(match[1].strip(), (px, py), (mx, my))
 
