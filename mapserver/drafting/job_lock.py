@@ -126,14 +126,16 @@ def log_path(store: Path, job: int) -> Path:
 
 
 class _Copied(io.TextIOBase):
-    """A stream whose text is copied into a log, up to `_LOG_BYTES`."""
+    """A stream whose text is copied into a log, up to `_LOG_BYTES`. A full disk under either ends neither the other nor the job."""
 
     def __init__(self, stream: TextIO, file: io.RawIOBase) -> None:
         self._stream, self._file, self._left = stream, file, _LOG_BYTES
 
     def write(self, text: str) -> int:
         self.log(text)
-        return self._stream.write(text)
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
 
     def log(self, text: str) -> None:
         data = text.encode("utf-8", "backslashreplace")[: self._left]
@@ -142,7 +144,8 @@ class _Copied(io.TextIOBase):
             self._file.write(data)
 
     def flush(self) -> None:
-        self._stream.flush()
+        with suppress(OSError):
+            self._stream.flush()
 
     def fileno(self) -> int:
         return self._stream.fileno()

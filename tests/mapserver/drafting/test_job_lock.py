@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from contextlib import redirect_stderr
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,16 @@ def test_a_job_keeps_its_log(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
     assert "ZeroDivisionError" in log_path(tmp_path, 201).read_text()
     assert sorted(path.name for path in tmp_path.glob("job-*.log")) == ["job-201.log", "job-202.log"]
     assert "reading [red]monday" in capfd.readouterr().err
+
+
+def test_a_full_disk_under_the_output_does_not_stop_a_build(tmp_path: Path) -> None:
+    """As of a build that an operator started, whose output lies in a temporary file."""
+    full = os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", 1)
+    with redirect_stderr(full), logged(tmp_path, 1):
+        plain_console(stderr=True).print("reading monday")
+    assert log_path(tmp_path, 1).read_text() == "reading monday\n"
+    with pytest.raises(OSError, match="No space"):
+        full.close()
 
 
 def test_a_busy_store_does_not_stop_a_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
