@@ -74,7 +74,8 @@ def steps(first_ns: int, end_ns: int, step_ns: int, zone: tzinfo | None) -> list
     offset = datetime.fromtimestamp(first_ns // 1_000_000_000, UTC).astimezone(zone).utcoffset() or timedelta()
     offset_ns = offset // timedelta(microseconds=1) * 1000
     begin_ns = (first_ns + offset_ns) // step_ns * step_ns  # as the clock shows it
-    edges = [begin_ns + n * step_ns for n in range((end_ns + offset_ns - begin_ns) // step_ns + 3)]
+    more = 3 + 24 * _HOUR_NS // step_ns  # a zone that crosses the date line loses a day
+    edges = [begin_ns + n * step_ns for n in range((end_ns + offset_ns - begin_ns) // step_ns + more)]
     if step_ns > _HOUR_NS:
         shown = (datetime.fromtimestamp(edge // 1_000_000_000, UTC).replace(tzinfo=None) for edge in edges)
         edges = [_local_ns(at, zone)[0] for at in shown]

@@ -65,6 +65,13 @@ def test_steps_around_a_clock_change_are_ranges_that_can_be_asked_for(day: str, 
         assert read_range(written(edge, BERLIN), written(following, BERLIN), BERLIN) == (edge, following)
 
 
+def test_steps_go_on_where_a_zone_lost_a_day() -> None:
+    apia = ZoneInfo("Pacific/Apia")  # crossed the date line at the end of 2011
+    first_ns, end_ns = read_range("2011-12-28", "2012-01-02", apia)
+    edges = steps(first_ns or 0, end_ns or 0, 6 * 3600 * 10**9, apia)
+    assert (edges[0], edges[-1]) == (first_ns, end_ns)
+
+
 def test_days_begin_at_midnight_also_after_a_clock_change() -> None:
     first_ns, end_ns = read_range("2026-10-24", "2026-10-26", BERLIN)
     edges = steps(first_ns or 0, end_ns or 0, 24 * 3600 * 10**9, BERLIN)
