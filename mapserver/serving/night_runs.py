@@ -23,6 +23,20 @@ _BEGIN_WITHIN_S = 60.0
 _STOP_WITHIN_S = 3.0
 _NICE = 10  # robots are served first
 _LOG_BYTES = 4000
+# A run whose server was killed ends, too: it then reads the end of its input. A shell's background process would ignore SIGINT.
+_RUN = """
+import os, signal, sys, threading
+
+def end_with_server():
+    os.read(0, 1)
+    os.kill(os.getpid(), signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+threading.Thread(target=end_with_server, daemon=True).start()
+sys.argv[0] = "mapserver"
+from mapserver.cli import main
+main()
+"""
 _log = logging.getLogger(__name__)
 
 
@@ -33,6 +47,7 @@ class NightRuns:
         self._store, self.inbox, self._config = store, inbox, config
         self._lock = threading.Lock()
         self._run: tuple[str, subprocess.Popen[bytes]] | None = None
+        self._input, self._kept_open = os.pipe()
 
     def start(self, site: str) -> JobInfo:
         """Start a run of a site and return its job, once it has one.
@@ -89,11 +104,11 @@ class NightRuns:
     def _started(self, site: str, errors: int) -> "subprocess.Popen[bytes]":
         options = ["--site", site, "--inbox", str(self.inbox / site), "--store", str(self._store.folder)]
         config = [] if self._config is None else ["--config", str(self._config)]
-        command = [sys.executable, "-m", "mapserver.cli", *config, "nightly", *options, "--settle-s", f"{SETTLE_S:g}"]
+        command = [sys.executable, "-c", _RUN, *config, "nightly", *options, "--settle-s", f"{SETTLE_S:g}"]
         with disk_errors("a build cannot be started", "see the memory of this machine", FleetmapError):
             process = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=self._input,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
                 start_new_session=True,  # Ctrl-C in the server's terminal is passed on by `close`

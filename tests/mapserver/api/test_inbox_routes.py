@@ -2,11 +2,15 @@
 
 import errno
 import os
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
 import anyio
+import psutil
 import pytest
 from starlette.types import Message
 
@@ -14,7 +18,7 @@ from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import put_away
 from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
 from mapserver.operators.operators import Operators
-from mapserver.store import Actor
+from mapserver.store import Actor, MapStore
 from support.fleet.quick_passwords import use_quick_passwords
 from support.fleet.served_api import Server, check_problem, served_api
 
@@ -232,6 +236,27 @@ def test_who_may_only_look_changes_nothing(server: Server, lab: Path, monkeypatc
     assert client.put(put, content=b"x", headers=keys["olga"]).status_code == 201
     assert server.store.last_events("lab", 1)[0].actor == "olga"
     assert client.put(f"{put}?actor=ada", content=b"x", headers=keys["olga"]).status_code == 403
+
+
+def test_a_build_ends_with_its_killed_server(tmp_path: Path) -> None:
+    killed = """
+import os, signal, sys
+from pathlib import Path
+from mapserver.serving.night_runs import NightRuns
+from mapserver.store import MapStore
+
+folder = Path(sys.argv[1])
+(folder / "inbox/lab").mkdir(parents=True)
+with MapStore.open(folder / "store", create=True) as store:
+    print(NightRuns(store, folder / "inbox")._started("lab", 2).pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    server = subprocess.run([sys.executable, "-c", killed, str(tmp_path)], stdout=subprocess.PIPE, check=False)
+    build = int(server.stdout)
+    while psutil.pid_exists(build) and psutil.Process(build).status() != psutil.STATUS_ZOMBIE:
+        time.sleep(0.1)
+    with MapStore.open(tmp_path / "store") as store:
+        assert [job.state for job in store.jobs("lab")] in ([], ["failed"], ["running"]), "it did not come to its end"
 
 
 def test_a_server_without_an_inbox_says_how_to_get_one(server: Server, tmp_path: Path) -> None:
