@@ -90,3 +90,4 @@ async function tell(act, answer) {
   }
   if (!dialog.open) dialog.showModal();
 }
+document.earlyAct?.click();

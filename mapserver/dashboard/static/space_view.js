@@ -12,6 +12,7 @@ const FRUSTUM_M = 0.25, ROBOT_VIEW = 4; // a robot's is so many times as long
 const TURN_DEG = 15, STEP_EVERY_MS = 700, FAR_M = 3;
 const VIEW_EVERY_MS = 1200, STILL_MS = 250; // the server draws one a second for an address
 const BAR_PX = 140, REACH_PX = 12, STILL_PX = 4;
+const BEHIND = 1.05; // times as far away: another surface
 const RAD = Math.PI / 180;
 // Keys of the walk, as its buttons are called.
 const KEYS = {
@@ -228,21 +229,25 @@ function pointedAt({ offsetX, offsetY }) {
   return best;
 }
 
-// The foremost point of what is shown within reach of the pointer.
+// The point of what is shown that is nearest to the pointer, of the foremost ones within its reach.
 function surfaceAt({ offsetX, offsetY }) {
   const seen = new THREE.Matrix4().multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).elements;
   const [x, y] = [(2 * offsetX) / canvas.clientWidth - 1, 1 - (2 * offsetY) / canvas.clientHeight];
   const [wide, high] = [canvas.clientWidth, canvas.clientHeight].map((side) => (2 * REACH_PX) / side);
-  let best, least = Infinity;
+  const found = [];
   for (const cloud of [groups.surfels, groups.landmarks].filter((group) => group.visible).flatMap((group) => group.children)) {
     const at = cloud.geometry.getAttribute("position").array;
     for (let n = 0; n < at.length; n += 3) {
       const row = (k) => seen[k] * at[n] + seen[k + 4] * at[n + 1] + seen[k + 8] * at[n + 2] + seen[k + 12];
       const away = row(3);
-      if (away > 0 && away < least && Math.abs(row(0) / away - x) < wide && Math.abs(row(1) / away - y) < high) [best, least] = [at.subarray(n, n + 3), away];
+      if (away <= 0) continue;
+      const off = [(row(0) / away - x) / wide, (row(1) / away - y) / high];
+      if (Math.max(...off.map(Math.abs)) < 1) found.push({ away, off: Math.hypot(...off), at: at.subarray(n, n + 3) });
     }
   }
-  return best && new THREE.Vector3(...best);
+  const foremost = found.reduce((least, { away }) => Math.min(least, away), Infinity);
+  const [best] = found.filter(({ away }) => away < BEHIND * foremost).sort((one, other) => one.off - other.off);
+  return best && new THREE.Vector3(...best.at);
 }
 
 function measure(event) {

@@ -173,7 +173,7 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
         )
         ask_for_survey(store, SITE, [(20.0, 2.0), (30.0, 2.0), (30.0, 9.0)], Actor("bob", "new racks"))
         trial = releases.start_canary(store, SITE, 1, 0.2)
-    failures = r"1\d failures of 8 robots\. Most: no match \(1\d\), in aisle 2 \(\d+\), of tug-\d"
+    failures = r"1\d failures of 8 robots\. Most: no match \(1\d\), in aisle 2 \(\d+\)\."
     for question, links, where, words in (
         ("is it one robot or one place", ["Failures"], "#answer", failures),
         (

@@ -102,7 +102,7 @@ def test_surfaces_are_seen_and_measured(page: Page, tmp_path: Path) -> None:
             page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
         expect(page.locator(".where")).to_contain_text("m apart")
         told = float(page.locator(".where").inner_text().split(" m apart")[0])
-        assert told == pytest.approx(float(np.linalg.norm(ends[1] - ends[0])), abs=0.6)
+        assert told == pytest.approx(float(np.linalg.norm(ends[1] - ends[0])), abs=0.3)
     assert seen.faults == []
 
 
