@@ -109,6 +109,7 @@ class ServerSync:
         self._announced.clear()
         wanted = self.client.wanted()
         self._ask_at_s = now_s + _ASK_EVERY_S
+        self._send_again()
         self._learn_frame()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
@@ -217,6 +218,14 @@ class ServerSync:
         except StoreError as error:
             self._deliver_at_s = now_s + _MAX_BACKOFF_S
             _log.warning("reports of failures wait: %s", error)
+
+    def _send_again(self) -> None:
+        """After the server's store was restored: what it had acknowledged before may be lost."""
+        for outbox in (self._outbox, self.replays):
+            if outbox is not None and (count := outbox.send_again(self.client.restored_ns)):
+                _log.warning(
+                    "the map server was restored from a backup: %d reports or recordings are sent again", count
+                )
 
     def _send_replay(self, now_s: float) -> None:
         """Send a part of a recording, at most one per second, while no report waits and no version is fetched."""

@@ -1,7 +1,12 @@
-"""The robot's outbox (spool): reports on the disk until the server acknowledges them. The only module of the robot with SQL."""
+"""The robot's outbox (spool): reports on the disk until the server acknowledges them, then for a week more.
+
+A server that loses its disk is restored from a backup, and the reports that it acknowledged since are sent again. The only module of the
+robot with SQL.
+"""
 
 import sqlite3
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +19,9 @@ CREATE TABLE IF NOT EXISTS report (
 ) STRICT;
 CREATE TABLE IF NOT EXISTS count (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
 """
+_LATER = "ALTER TABLE report ADD COLUMN delivered_ns INTEGER NOT NULL DEFAULT 0"  # 0: it waits
+_RESTORED = "restored_ns"  # of the server, for which reports were sent again
+_KEPT_NS = 7 * 86_400 * 1_000_000_000
 _BUSY_S = 10.0
 
 
@@ -26,19 +34,21 @@ class QueuedReport:
 
 
 class Outbox:
-    """Queue of reports, first in, first out; above `max_bytes` the oldest are dropped and counted.
+    """Queue of reports, first in, first out; above `max_bytes` the oldest are dropped, delivered ones first; others are counted.
 
     Once `put` has returned, a report survives a crash and a power failure. A damaged file is renamed and replaced by a new one: a
     robot that cannot report must still drive. Thread-safe; each call opens the file itself.
     """
 
-    def __init__(self, path: Path, *, max_bytes: int, is_needed: bool = True) -> None:
+    def __init__(
+        self, path: Path, *, max_bytes: int, is_needed: bool = True, wall_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         """Create the file and its folder; raise StoreError if that fails.
 
         is_needed: if False, store the reason in `fault` instead and retry at each call.
         """
         self._path = path
-        self._max_bytes = max_bytes
+        self._max_bytes, self._wall_ns = max_bytes, wall_ns
         self.set_aside: Path | None = None
         self._is_made, self.fault = False, ""
         try:
@@ -72,37 +82,53 @@ class Outbox:
 
     def waiting(self, limit: int = 1) -> list[QueuedReport]:
         with self._transaction("DEFERRED") as database:
-            rows = database.execute("SELECT id, payload FROM report ORDER BY number LIMIT ?", (limit,)).fetchall()
+            rows = database.execute(
+                "SELECT id, payload FROM report WHERE delivered_ns = 0 ORDER BY number LIMIT ?", (limit,)
+            ).fetchall()
         return [QueuedReport(*row) for row in rows]
 
     def done(self, report_id: str) -> None:
-        self._remove(report_id, "delivered")
+        """The server has stored a report; it is kept for a week, in case the server loses it."""
+        with self._transaction() as database:
+            delivered = "UPDATE report SET delivered_ns = ? WHERE id = ? AND delivered_ns = 0"
+            self._count(database, "delivered", database.execute(delivered, (self._wall_ns(), report_id)).rowcount)
 
     def refused(self, report_id: str) -> None:
         """Remove a report that the server rejects for good or cannot read."""
-        self._remove(report_id, "refused")
+        with self._transaction() as database:
+            self._count(database, "refused", database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
+
+    def send_again(self, restored_ns: int) -> int:
+        """Let delivered reports wait again, once for each restoration of the server, at its time; return their number.
+
+        Those delivered longer than a week ago are removed.
+        """
+        with self._transaction() as database:
+            old_ns = self._wall_ns() - _KEPT_NS
+            database.execute("DELETE FROM report WHERE delivered_ns BETWEEN 1 AND ?", (old_ns,))
+            known = database.execute("SELECT value FROM count WHERE name = ?", (_RESTORED,)).fetchone()
+            if restored_ns <= (0 if known is None else known[0]):
+                return 0
+            database.execute("INSERT OR REPLACE INTO count VALUES (?, ?)", (_RESTORED, restored_ns))
+            return database.execute("UPDATE report SET delivered_ns = 0 WHERE delivered_ns").rowcount
 
     def counts(self) -> dict[str, int]:
         """Return `waiting` now; `delivered`, `dropped` for lack of space and `refused` (including damaged) since the file was made."""
         with self._transaction("DEFERRED") as database:
             known = dict(database.execute("SELECT name, value FROM count").fetchall())
-            waiting = database.execute("SELECT COUNT(*) FROM report").fetchone()[0]
+            waiting = database.execute("SELECT COUNT(*) FROM report WHERE delivered_ns = 0").fetchone()[0]
         return {"waiting": waiting, **{name: known.get(name, 0) for name in ("delivered", "dropped", "refused")}}
 
-    def _remove(self, report_id: str, count: str) -> None:
-        with self._transaction() as database:
-            self._count(database, count, database.execute("DELETE FROM report WHERE id = ?", (report_id,)).rowcount)
-
     def _make_room(self, database: sqlite3.Connection) -> None:
-        """Drop the oldest reports, never the newest one."""
-        query = "SELECT number, LENGTH(payload) FROM report ORDER BY number"
+        """Drop the oldest reports, delivered ones first, never the newest one."""
+        query = "SELECT number, LENGTH(payload), delivered_ns = 0 FROM report ORDER BY delivered_ns = 0, number"
         rows = database.execute(query).fetchall()
-        total, dropped = sum(size for _, size in rows), 0
-        for number, size in rows[:-1]:
+        total, dropped = sum(size for _, size, _ in rows), 0
+        for number, size, is_waiting in rows[:-1]:
             if total <= self._max_bytes:
                 break
             database.execute("DELETE FROM report WHERE number = ?", (number,))
-            total, dropped = total - size, dropped + 1
+            total, dropped = total - size, dropped + is_waiting
         self._count(database, "dropped", dropped)
 
     def _count(self, database: sqlite3.Connection, name: str, more: int) -> None:
@@ -116,6 +142,8 @@ class Outbox:
         with closing(self._open()) as database:
             database.execute("PRAGMA journal_mode = WAL")
             database.executescript(_SCHEMA)
+            if "delivered_ns" not in {column for _, column, *_ in database.execute("PRAGMA table_info(report)")}:
+                database.execute(_LATER)
             if database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
                 raise sqlite3.DatabaseError("damaged")
 

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
+import msgspec
+
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
@@ -133,6 +135,7 @@ class MapClient(MapSource):
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
+        self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._away: UnreachableError | None = None  # while tiles are read
         self._begun = ""  # the manifest's address of the version that was admitted last
 
@@ -170,7 +173,8 @@ class MapClient(MapSource):
             raise LinkError(f"requested site {self._site}, the server answered for {wanted.site[:80]!r}")
         if self._trust is not None:
             self._trust.refresh()
-        return wanted
+        self.restored_ns = wanted.restored_ns
+        return msgspec.structs.replace(wanted, restored_ns=0)
 
     def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
         """Call `listener`, on a thread of the bus, whenever the server wants another version."""

@@ -4,6 +4,8 @@ import logging
 import threading
 from collections.abc import Callable
 
+import msgspec
+
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.live_survey import LiveSurveyState, live_key
@@ -54,7 +56,7 @@ class BusService:
         self._refusals = LogLimit(_log)
         self._rates = {what: RateLimit(burst, per_s, store.now_ns) for what, (burst, per_s) in REPORT_RATES.items()}
         self._rates["renew"] = RateLimit(*RENEWAL_RATE, store.now_ns)
-        self._lists = SignedLists(store.folder)
+        self._lists, self._restored_ns = SignedLists(store.folder), store.restored_ns()
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES, store.blob)
         self.surveys = LiveSurveys()
@@ -137,7 +139,8 @@ class BusService:
 
     def _wanted(self, key: str, _: bytes) -> bytes:
         wanted = self._fleet.take_question(*self._sender(key))
-        return encode_message(self._lists.admitted_or_current(wanted))
+        answer = self._lists.admitted_or_current(wanted)
+        return encode_message(msgspec.structs.replace(answer, restored_ns=self._restored_ns))
 
     def _failure(self, key: str, payload: bytes) -> bytes:
         site, robot = self._sender(key)

@@ -77,6 +77,14 @@ class Transactions:
         except sqlite3.Error as error:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
+    def copy_to(self, path: Path) -> None:
+        """Copy the database, as of one moment, page by page into a new file. Raises StoreError on a disk error."""
+        try:
+            with self._reading, closing(sqlite3.connect(path)) as target:
+                self._reader.conn.backup(target)
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path} cannot be copied to {path} ({error}); check its disk and space") from error
+
     def shrink(self, pages: int) -> None:
         """Return up to `pages` unused pages of the file to the disk."""
         with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
-from mapserver.store.version_rows import EXTRA_TABLES, set_state, site_releases
+from mapserver.store.version_rows import EXTRA_TABLES, mentioned, set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000
 
@@ -49,7 +49,7 @@ def collect(
         with transactions.write() as connection:
             _plan(transactions, retention, garbage)
             _write_down(transactions, connection, garbage, actor)
-    kept = _mentioned(transactions, set(garbage.removed) if dry_run else set())
+    kept = mentioned(transactions, set(garbage.removed) if dry_run else set())
     unmentioned = [blobs.path(sha256) for sha256 in sorted(blobs.addresses() - kept)]
     for path in [*unmentioned, *blobs.unreferenced()]:
         garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
@@ -97,10 +97,3 @@ def _write_down(transactions: Transactions, connection: sqlite3.Connection, garb
         for table in ("currents", "verdicts", "evidence", *EXTRA_TABLES.values(), "version_blobs", "versions"):
             connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
         transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))
-
-
-def _mentioned(transactions: Transactions, leaving: set[tuple[str, int]]) -> set[str]:
-    tables = ("version_blobs", *EXTRA_TABLES.values())
-    rows = [row for t in tables for row in transactions.query(f"SELECT site, version, sha256 FROM {t}")]
-    kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
-    return kept | {row["sha256"] for row in transactions.query("SELECT sha256 FROM site_files")}

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -35,11 +35,19 @@ from mapserver.store.rows import (
     VersionInfo,
 )
 from mapserver.store.usage import DiskSpace, StoreUsage, UsageMeter, disk_space
-from mapserver.store.version_rows import canaries, site_releases
+from mapserver.store.version_rows import canaries, mentioned, site_releases
 
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
 _OF_VERSIONS = ("manifest", "tile", "vocabulary")
+_RESTORED = "restored"
 _SERVED_KINDS = (*_OF_VERSIONS, "grid", *FOR_ROBOTS)
+
+
+class DatabaseCopy(NamedTuple):
+    """Content of a copied database: addresses of the blobs that it names, number of versions."""
+
+    blobs: set[str]
+    versions: int
 
 
 class StoreQueries:
@@ -86,6 +94,26 @@ class StoreQueries:
                     removed.append(robot)
                     self._transactions.log(connection, site, LogEntry("robot removed", robot, None, actor))
         return removed
+
+    def named_blobs(self) -> set[str]:
+        """Return the addresses of all blobs that the database names."""
+        return mentioned(self._transactions)
+
+    def copy_database(self, path: Path) -> DatabaseCopy:
+        """Copy the database into a new file, as of one moment, and return what the copy names. Raises StoreError on a disk error."""
+        self._transactions.copy_to(path)
+        copy = Transactions(path, self._clock_ns, read_only=True)
+        try:
+            versions = copy.query("SELECT count(*) n FROM versions")[0]["n"]
+            return DatabaseCopy(mentioned(copy), versions)
+        finally:
+            copy.close()
+
+    def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
+        """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
+        with self._transactions.write() as connection:
+            connection.execute("UPDATE sites SET last_version = last_version + ?", (ahead,))
+            self._transactions.log(connection, "", LogEntry(_RESTORED, detail, None, actor))
 
     def sites(self) -> list[SiteInfo]:
         return self._transactions.rows(
@@ -242,6 +270,11 @@ class StoreQueries:
         """Log an event that no other method writes, such as an enrolment, a signature or a refusal."""
         with self._transactions.write() as connection:
             self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
+
+    def restored_ns(self) -> int:
+        """Return when the store was last restored from a backup, 0 if never."""
+        rows = self._transactions.query("SELECT max(stamp_ns) stamp_ns FROM events WHERE kind = ?", (_RESTORED,))
+        return int(rows[0]["stamp_ns"] or 0)
 
     def audit_lines(self, last: int | None = None) -> list[AuditLine]:
         """Return the log of all sites and of the store itself, oldest line first, or its last lines."""

@@ -10,7 +10,7 @@ from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 from mapserver.store.files import is_plain_file
 from mapserver.store.rows import SiteReleases, VersionInfo
-from mapserver.store.version_rows import references, site_releases
+from mapserver.store.version_rows import mentioned, references, site_releases
 
 
 @dataclass(slots=True)
@@ -63,19 +63,15 @@ def _links(folder: Path) -> list[Path]:
 
 
 def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
-    rows = transactions.query(
-        """SELECT sha256 FROM version_blobs UNION SELECT sha256 FROM site_files
-           UNION SELECT sha256 FROM grid_blobs UNION SELECT sha256 FROM surfel_blobs"""
-    )
-    mentioned, present = {row["sha256"] for row in rows}, blobs.addresses()
-    found.orphans = len(present - mentioned)
+    named, present = mentioned(transactions), blobs.addresses()
+    found.orphans = len(present - named)
     found.leftovers = len(blobs.unreferenced())
     found.blobs = len(present)
     found.blob_bytes = sum(blobs.path(sha256).stat().st_size for sha256 in present)
-    found.faults += [f"{blobs.path(sha256)} is missing" for sha256 in sorted(mentioned - present)]
-    damaged = {sha256 for sha256 in mentioned & present if not blobs.is_whole(sha256)}
+    found.faults += [f"{blobs.path(sha256)} is missing" for sha256 in sorted(named - present)]
+    damaged = {sha256 for sha256 in named & present if not blobs.is_whole(sha256)}
     found.faults += [f"{blobs.path(sha256)} is damaged" for sha256 in sorted(damaged)]
-    return (mentioned & present) - damaged
+    return (named & present) - damaged
 
 
 def _version_faults(transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str]) -> list[str]:

@@ -1,7 +1,7 @@
 """SQL on versions, canaries and the history of current versions. `releases` decides the changes."""
 
 import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import FOR_ROBOTS
@@ -111,3 +111,11 @@ def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:
     found = {("manifest", info.manifest_sha256), ("vocabulary", manifest.vocabulary.sha256)}
     found |= {("tile", tile.sha256) for tile in manifest.tiles}
     return found | ({("archive", info.archive_sha256)} if info.archive_sha256 is not None else set())
+
+
+def mentioned(transactions: Transactions, leaving: Set[tuple[str, int]] = frozenset()) -> set[str]:
+    """Return the addresses that the database names, but for versions that leave."""
+    tables = ("version_blobs", *EXTRA_TABLES.values())
+    rows = [row for t in tables for row in transactions.query(f"SELECT site, version, sha256 FROM {t}")]
+    kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
+    return kept | {row["sha256"] for row in transactions.query("SELECT sha256 FROM site_files")}

@@ -37,11 +37,14 @@ _COMPACT = JSONSerializer(compact=True)
 
 
 class ListRepository:
-    """The signed lists of one store, for writing, and its keys. now: reference time of expiry."""
+    """The signed lists of one store, for writing, and its keys. now: reference time of expiry.
+
+    ahead: numbers that the server's keys skip, after a restoration from a backup.
+    """
 
     def __init__(self, store: Path, now: datetime) -> None:
         self.lists, self.keys = SignedLists(store), KeyFolder(store / "keys")
-        self.now = now.astimezone(UTC).replace(microsecond=0)
+        self.now, self.ahead = now.astimezone(UTC).replace(microsecond=0), 0
 
     def root(self) -> Root:
         """Content of the newest root; errors as of `SignedLists.metadata`."""
@@ -120,7 +123,7 @@ class ListRepository:
     def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], key: Signer) -> int:
         """Write the next list of a site, and return its number; StateError unless the site's key signed."""
         name = site_role(site)
-        signed = site_targets(site, admitted, self.lists.newest(name) + 1)
+        signed = site_targets(site, admitted, self.lists.newest(name) + 1 + self.ahead)
         self._sign(name, signed, key, judges=(self.targets(),))
         return signed.version
 
@@ -140,10 +143,15 @@ class ListRepository:
                 meta |= {} if entry is None else {f"{name}.json": entry}
         if self.lists.path(TIMESTAMP, 0).is_file():
             stamped = self.lists.read(TIMESTAMP).version
-        if before is None or before.meta != meta or not is_fresh("snapshot", before.expires, self.now):
-            number += 1
+        if before is None or before.meta != meta or self.ahead or not is_fresh("snapshot", before.expires, self.now):
+            number += 1 + self.ahead
             self._sign("snapshot", Snapshot(version=number, meta=meta), online)
-        self._sign(TIMESTAMP, Timestamp(version=stamped + 1, snapshot_meta=MetaFile(number)), online, judges=(root,))
+        self._sign(
+            TIMESTAMP,
+            Timestamp(version=stamped + 1 + self.ahead, snapshot_meta=MetaFile(number)),
+            online,
+            judges=(root,),
+        )
 
     def _last_snapshot(self, root: Root) -> Snapshot | None:
         """Return the last one if it can stay, else None: one signed by a replaced key cannot, despite the same content."""

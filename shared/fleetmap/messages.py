@@ -114,11 +114,15 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
-    """Version that a robot should run; None while the site has none."""
+    """Version that a robot should run; None while the site has none.
+
+    restored_ns, in the answer to a question: when the server's store was last restored from a backup, 0 if never.
+    """
 
     site: Name
     version: Version | None
     manifest_sha256: str | None
+    restored_ns: int = 0
 
 
 class InitialPoseMessage(msgspec.Struct, frozen=True, kw_only=True):

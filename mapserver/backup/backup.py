@@ -1,0 +1,152 @@
+"""Backup of a store, also while it is served.
+
+SQLite copies the database as of one moment; blobs never change and are on the disk before the database names them, so they may be read
+afterwards. If garbage collection removes one meanwhile, the database is copied again.
+"""
+
+import io
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pyrage
+
+from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
+from fleetmap.mapformat import sha256_hex
+from mapserver.backup.snapshots import BackupTarget, Snapshot
+from mapserver.store import MapStore
+from mapserver.store.database import format_of
+from mapserver.store.files import is_plain_file, locked
+
+_TRIES = 3  # copies of the database, each after another garbage collection
+_PIECE_BYTES = 4 << 20  # of the database, whose unchanged pages stay where they are
+_LEFT_OVER = ".backup-"
+
+
+@dataclass(frozen=True, slots=True)
+class BackupReport:
+    """Result of a backup. uploaded: objects that the target did not have. missing: blobs that the store itself has lost or damaged.
+
+    removed: snapshots beyond the kept ones.
+    """
+
+    snapshot: str
+    bytes: int
+    uploaded: int
+    uploaded_bytes: int
+    has_keys: bool
+    missing: tuple[str, ...]
+    removed: tuple[str, ...]
+
+
+def recipient_of(text: str | None) -> "pyrage.x25519.Recipient | None":
+    """Return the age recipient of a text; UsageError if it is none."""
+    try:
+        return None if text is None else pyrage.x25519.Recipient.from_str(text)
+    except pyrage.RecipientError as error:
+        advice = "name the line that `age-keygen` prints, age1..."
+        raise UsageError(f"--recipient {text!r} is no public key of age ({error}); {advice}") from error
+
+
+def back_up(
+    store: MapStore,
+    target: BackupTarget,
+    *,
+    recipient: "pyrage.x25519.Recipient | None" = None,
+    keep: int = 30,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> BackupReport:
+    """Write a snapshot of the store, and remove all but the newest `keep` ones; without a recipient it has no keys.
+
+    progress: called with the numbers of blobs done and in all. Raises StoreError if either side cannot be read or written, or if another
+    backup of this store is under way.
+    """
+    folder, upload = store.folder, _Upload(target)
+    with (
+        disk_errors(f"{folder} cannot be read", "check its rights and space"),
+        locked(folder / "backup.lock", shared=False),
+    ):
+        for path in folder.glob(f"{_LEFT_OVER}*"):  # of a killed backup
+            shutil.rmtree(path)
+        keys = "" if recipient is None else upload.put(pyrage.encrypt(_packed(folder / "keys"), [recipient]))
+        files = _lists(folder / "trust", upload)
+        for _ in range(_TRIES):
+            with tempfile.TemporaryDirectory(prefix=_LEFT_OVER, dir=folder) as temporary:
+                copy = Path(temporary) / "store.sqlite3"
+                content = store.copy_database(copy)
+                files["store.sqlite3"] = [upload.put(piece) for piece in _pieces(copy)]
+                store_format = format_of(copy)
+            missing = upload.blobs(store, content.blobs, progress)
+            if not missing & content.blobs - store.named_blobs():  # none of them was dropped since the copy
+                break
+        else:
+            raise StateError(f"garbage was collected during each of {_TRIES} tries; back up at another time of day")
+        snapshot = Snapshot(
+            store_format=store_format, versions=content.versions, files=files, blobs=sorted(content.blobs - missing),
+            keys=keys, missing=sorted(missing),
+        )  # fmt: skip
+        now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
+        name = target.write(snapshot, now)
+        removed, _ = target.prune(keep, now)
+    total = sum(upload.sizes[address] for address in snapshot.objects())
+    return BackupReport(name, total, upload.count, upload.bytes, bool(keys), tuple(snapshot.missing), tuple(removed))
+
+
+class _Upload:
+    """Uploads what the target lacks. sizes: of all objects there, by address; count, bytes: of the uploaded ones."""
+
+    def __init__(self, target: BackupTarget) -> None:
+        self._target, self.sizes = target, target.objects()
+        self.count = self.bytes = 0
+
+    def put(self, data: bytes) -> str:
+        address = sha256_hex(data)
+        if self.sizes.get(address) != len(data):
+            self._target.put(data)
+            self.count, self.bytes, self.sizes[address] = self.count + 1, self.bytes + len(data), len(data)
+        return address
+
+    def blobs(self, store: MapStore, addresses: set[str], progress: Callable[[int, int], None]) -> set[str]:
+        """Upload blobs; return those that the store has lost or damaged and the target does not have either."""
+        missing = set()
+        for number, address in enumerate(sorted(addresses), start=1):
+            progress(number, len(addresses))
+            if address in self.sizes:
+                continue
+            try:
+                self.put(store.blob(address))
+            except FleetmapError:
+                missing.add(address)
+        return missing
+
+
+def _lists(folder: Path, upload: _Upload) -> dict[str, list[str]]:
+    """Upload the signed lists, which are older than the database then: the restored store signs what is missing."""
+    if not folder.is_dir():
+        return {}
+    with locked(folder / "lock", shared=False):  # old lists are removed under it
+        return {f"trust/{path.name}": [upload.put(path.read_bytes())] for path in _plain_files(folder, ".json")}
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE_BYTES):
+            yield piece
+
+
+def _plain_files(folder: Path, *suffixes: str) -> list[Path]:
+    found = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path for path in found if is_plain_file(path) and path.suffix in suffixes)
+
+
+def _packed(folder: Path) -> bytes:
+    """Return the files of a folder of keys as a tar archive."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as archive:
+        for path in _plain_files(folder, ".pem", ".crt", ".old"):
+            archive.add(path, path.name)
+    return packed.getvalue()

@@ -1,0 +1,168 @@
+"""The target of backups: objects by their SHA-256, and snapshots that name them.
+
+    URL/objects/ab/<sha256>      blobs of the store; pieces of its database, signed lists and encrypted keys
+    URL/snapshots/<UTC>.json     what a store consisted of at that time; written last, so that each one there is complete
+    URL/restores/<number>        one for each restoration, which counts them
+
+An object is uploaded once, however many snapshots name it. URL: a folder, or s3://BUCKET/PREFIX and what else obstore opens, with the
+credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL, ...).
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import obstore
+from obstore.exceptions import BaseError
+from obstore.store import LocalStore, ObjectStore, from_url
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, UsageError
+from fleetmap.mapformat import check_sha256, sha256_hex, verified
+
+FORMAT = 1
+_OBJECTS, _SNAPSHOTS, _RESTORES = "objects", "snapshots", "restores"
+_NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z")
+_PATH = re.compile(r"store\.sqlite3|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
+_LONGEST_BACKUP = timedelta(days=1)
+_MOST_BYTES = 1 << 30  # of a snapshot
+
+
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """A store at one time. files: pieces by path, in order. keys: its folder of keys, encrypted; empty without a recipient.
+
+    missing: blobs that the store itself had lost or had damaged.
+    """
+
+    format: int = FORMAT
+    store_format: int
+    versions: int
+    files: dict[str, list[str]]
+    blobs: list[str]
+    keys: str = ""
+    missing: list[str] = []
+
+    def objects(self) -> set[str]:
+        """Addresses of all objects that it names."""
+        keys = [self.keys] if self.keys else []
+        return {*self.blobs, *keys, *(piece for pieces in self.files.values() for piece in pieces)}
+
+
+class BackupTarget:
+    """Objects and snapshots under one URL or in one folder, created if needed. Raises StoreError if it cannot be reached."""
+
+    def __init__(self, where: str, *, create: bool = False) -> None:
+        self.where, self._is_local = where, "://" not in where
+        with self._errors():
+            if self._is_local:
+                if not create and not (Path(where) / _SNAPSHOTS).is_dir():
+                    raise UsageError(f"{where} holds no backups; `mapserver backup {where} --store DIR` makes one")
+                self._store: ObjectStore = LocalStore(Path(where).absolute(), mkdir=True)
+            else:
+                self._store = from_url(where, client_options={"allow_http": True})
+
+    def objects(self) -> dict[str, int]:
+        """Return the sizes of all objects by address."""
+        with self._errors():
+            return {name: size for name, size, _ in self._listed(_OBJECTS)}
+
+    def put(self, data: bytes) -> None:
+        """Upload bytes to their address."""
+        with self._errors():
+            obstore.put(self._store, _path(sha256_hex(data)), data)
+
+    def get(self, address: str) -> bytes:
+        """Return the bytes of an address, verified; StoreError if missing, MapFormatError if damaged."""
+        with self._errors():
+            return verified(bytes(obstore.get(self._store, _path(address)).bytes()), address)
+
+    def snapshots(self) -> list[str]:
+        """Return the names of all snapshots, oldest first."""
+        with self._errors():
+            return sorted(name for name, _, _ in self._listed(_SNAPSHOTS) if _NAME.fullmatch(name))
+
+    def read(self, name: str | None = None) -> tuple[str, Snapshot]:
+        """Return a snapshot, the newest for None, with its name. UsageError for an unknown one, MapFormatError for a damaged one."""
+        names = self.snapshots()
+        if name is None and names:
+            name = names[-1]
+        if name not in names:
+            raise UsageError(
+                f"{self.where} has no snapshot {name or 'at all'}; it has {', '.join(names[-5:]) or 'none'}"
+            )
+        with self._errors():
+            found = obstore.get(self._store, f"{_SNAPSHOTS}/{name}.json")
+            if found.meta["size"] > _MOST_BYTES:
+                raise MapFormatError(f"snapshot {name} has {found.meta['size']} bytes, the limit is {_MOST_BYTES}")
+            data = bytes(found.bytes())
+        return name, _decoded(name, data)
+
+    def write(self, snapshot: Snapshot, now: datetime) -> str:
+        """Write a snapshot, whose objects are there, and return its name."""
+        self._sync()
+        name = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}"
+        with self._errors():
+            obstore.put(self._store, f"{_SNAPSHOTS}/{name}.json", to_json(snapshot))
+        self._sync()
+        return name
+
+    def prune(self, keep: int, now: datetime) -> tuple[list[str], int]:
+        """Remove all but the newest `keep` snapshots, then objects that none names; return names, and the number of objects.
+
+        Objects of the last day stay: they may belong to a backup under way.
+        """
+        names = self.snapshots()
+        gone, kept = names[:-keep], set[str]().union(*(self.read(name)[1].objects() for name in names[-keep:]))
+        with self._errors():
+            obstore.delete(self._store, [f"{_SNAPSHOTS}/{name}.json" for name in gone])
+            old = [name for name, _, changed in self._listed(_OBJECTS) if changed < now - _LONGEST_BACKUP]
+            loose = [name for name in old if name not in kept]
+            obstore.delete(self._store, [_path(name) for name in loose])
+        return gone, len(loose)
+
+    def count_restore(self) -> int:
+        """Return the number of this restoration, from 1 on; no other one gets it."""
+        with self._errors():
+            number = 1 + max((int(name) for name, _, _ in self._listed(_RESTORES) if name.isdecimal()), default=0)
+            obstore.put(self._store, f"{_RESTORES}/{number:06}", b"", mode="create")
+        self._sync()
+        return number
+
+    def _listed(self, prefix: str) -> Iterator[tuple[str, int, datetime]]:
+        for batch in obstore.list(self._store, prefix):
+            for meta in batch:
+                yield meta["path"].rpartition("/")[2].removesuffix(".json"), meta["size"], meta["last_modified"]
+
+    def _sync(self) -> None:
+        if self._is_local:  # an object store answers once its bytes are durable
+            os.sync()
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (BaseError, OSError, ValueError) as error:
+            reason = str(error).split("\n\nDebug source", 1)[0].replace("\n", " ")
+            raise StoreError(f"{self.where}: {reason}; check the URL, its rights, and the credentials") from error
+
+
+def _path(address: str) -> str:
+    return f"{_OBJECTS}/{address[:2]}/{address}"
+
+
+def _decoded(name: str, data: bytes) -> Snapshot:
+    try:
+        found = msgspec.json.decode(data, type=Snapshot)
+        for address in found.objects():
+            check_sha256(address)
+    except (msgspec.MsgspecError, MapFormatError) as error:
+        raise MapFormatError(f"snapshot {name} is damaged ({error}); take an earlier one with --snapshot") from error
+    if found.format > FORMAT:
+        raise NewerFormatError(f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it")
+    if unknown := [path for path in found.files if not _PATH.fullmatch(path)]:
+        raise MapFormatError(f"snapshot {name} names the file {unknown[0][:200]!r}, which no store has")
+    return found

@@ -1,0 +1,126 @@
+"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleetmap.cli_options import expand_options
+from fleetmap.console import plain_console
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
+from mapserver.commands.store import EXIT_STATUS_FAULTS
+
+Where = Annotated[str, typer.Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
+
+
+def backup(
+    target: Where,
+    store: StoreFolder,
+    recipient: Annotated[
+        str | None,
+        typer.Option(
+            metavar="AGE1", help="Public key of age for which the store's keys are encrypted; default: without keys."
+        ),
+    ] = None,
+    keep: Annotated[int, typer.Option(min=1, help="Number of snapshots to keep.")] = 30,
+    json: Json = False,
+) -> None:
+    """Back up a store, also while it is served; only what changed since the last time is copied."""
+    from mapserver.backup.backup import back_up, recipient_of
+    from mapserver.backup.snapshots import BackupTarget
+
+    key = recipient_of(recipient)
+    with open_store(store, read_only=True) as maps, _progress("blobs") as progress:
+        done = back_up(maps, BackupTarget(target, create=True), recipient=key, keep=keep, progress=progress)
+    if json:
+        print_json(done)
+    else:
+        typer.echo(
+            f"snapshot {done.snapshot}: {done.bytes} bytes, {done.uploaded_bytes} of them copied; "
+            f"{'keys encrypted' if done.has_keys else 'without keys (--recipient)'}; {len(done.removed)} older ones removed"
+        )
+        for address in done.missing:
+            typer.echo(
+                f"fault: blob {address} is lost or damaged in the store, and in no backup; `mapserver verify` says of what"
+            )
+    if done.missing:
+        raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+@expand_options
+def restore(
+    target: Where,
+    *,
+    store: Annotated[Path, typer.Option(help="Folder of the new store; it must not exist, or be empty.")],
+    snapshot: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Snapshot, as `mapserver backups` lists them; default: the last.")
+    ] = None,
+    identity: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Private key of age, for the store's keys.")
+    ] = None,
+    by: ActorOptions,
+    json: Json = False,
+) -> None:
+    """Make a store of a backup. Robots then send again what the lost server had acknowledged in the last week."""
+    from mapserver.backup.restore import identities_of
+    from mapserver.backup.restore import restore as restored
+    from mapserver.backup.snapshots import BackupTarget
+
+    identities = identities_of(identity)
+    with _progress("blobs") as progress:
+        done = restored(
+            BackupTarget(target), store, by.named(), name=snapshot, identities=identities, progress=progress
+        )
+    if json:
+        print_json(done)
+        return
+    typer.echo(f"{store} holds snapshot {done.snapshot}: {done.versions} versions, {len(done.keys)} key files")
+    if not done.is_signed:
+        typer.echo(
+            "the signed lists are those of the backup, and robots may know later ones: restore with --identity, or put the keys into "
+            f"{store / 'keys'} and run `mapserver trust rotate online --store {store}`"
+        )
+    for address in done.missing:
+        typer.echo(f"blob {address} was lost or damaged already when the backup was made")
+
+
+def backups(
+    target: Where,
+    verify: Annotated[bool, typer.Option("--verify", help="Read every byte; status 3 for a fault.")] = False,
+    json: Json = False,
+) -> None:
+    """List the snapshots of a backup."""
+    from mapserver.backup.restore import verify as verified
+    from mapserver.backup.snapshots import BackupTarget
+
+    where = BackupTarget(target)
+    if not verify:
+        names = where.snapshots()
+        if json:
+            print_json(names)
+        else:
+            typer.echo("\n".join(names) or "no snapshots")
+        return
+    with _progress("objects") as progress:
+        found = verified(where, progress)
+    if json:
+        print_json(found)
+    else:
+        typer.echo(f"{found.snapshots} snapshots, {found.objects} objects of {found.bytes} bytes")
+        for fault in found.faults:
+            typer.echo(f"fault: {fault}")
+        typer.echo(f"{len(found.faults)} faults" if found.faults else "clean")
+    if found.faults:
+        raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many are done of how many."""
+    from rich.progress import Progress
+
+    with Progress(console=plain_console(stderr=True), transient=True) as bars:
+        bar = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(bar, completed=done, total=total)

@@ -1,0 +1,267 @@
+"""Backups in a folder and in S3: only what is new is copied, what comes back is whole, and what is damaged is named."""
+
+import io
+import re
+import sqlite3
+import subprocess
+import sys
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import obstore
+import pyrage
+import pytest
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError
+from fleetmap.mapformat import blob_path, sha256_hex
+from mapserver import releases
+from mapserver.backup.backup import back_up, recipient_of
+from mapserver.backup.restore import identities_of, restore, verify
+from mapserver.backup.snapshots import BackupTarget
+from mapserver.store import Actor, MapStore, Retention
+from mapserver.trust import SignedLists, init_here
+from support.storage.clock import Clock
+from support.storage.map_samples import publish_samples, save_sample_draft
+
+ADA = Actor("ada", "a drill")
+DAY_NS = 86_400_000_000_000
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
+        publish_samples(opened, 2)
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def s3(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of rclone's S3 server, with a bucket named backups."""
+    folder = tmp_path_factory.mktemp("s3")
+    (folder / "backups").mkdir()
+    (folder / "config").touch()
+    words = [
+        "serve",
+        "s3",
+        str(folder),
+        "--addr",
+        "127.0.0.1:0",
+        "--auth-key",
+        "backupkey,backupsecret",
+        "--config",
+        str(folder / "config"),
+    ]
+    process = subprocess.Popen(
+        [str(Path(sys.executable).with_name("rclone")), *words], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        found = next(filter(None, (re.search(r"http://[^/\]]+", line) for line in process.stderr)))
+        yield found[0]
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        process.stderr.close()
+
+
+@pytest.fixture(params=["folder", "s3"])
+def where(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "folder":
+        return str(tmp_path / "backups")
+    names = {
+        "AWS_ACCESS_KEY_ID": "backupkey",
+        "AWS_SECRET_ACCESS_KEY": "backupsecret",
+        "AWS_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": request.getfixturevalue("s3"),
+    }
+    for name, value in names.items():
+        monkeypatch.setenv(name, value)
+    return f"s3://backups/{tmp_path.name}"
+
+
+def content(store: MapStore) -> list[tuple[object, ...]]:
+    return [(v.version, v.state, v.manifest_sha256) for v in store.versions("lab")]
+
+
+def test_what_is_restored_is_the_store(store: MapStore, where: str, tmp_path: Path, clock: Clock) -> None:
+    target = BackupTarget(where, create=True)
+    first = back_up(store, target)
+    assert (first.uploaded, first.missing, first.has_keys) == (len(target.objects()), (), False)
+    save_sample_draft(store, seed=7)
+    clock.now_ns += DAY_NS
+    second = back_up(store, target)
+    assert 0 < second.uploaded_bytes < first.uploaded_bytes
+    assert verify(target).faults == []
+    report = restore(target, tmp_path / "new", ADA)
+    assert (report.snapshot, report.versions) == (second.snapshot, 3)
+    with MapStore.open(tmp_path / "new", clock_ns=clock) as restored:
+        assert restored.verify().faults == []
+        assert content(restored) == content(store)
+        assert restored.restored_ns() > 0
+        assert restored.audit_lines(1)[0].reason == ADA.reason
+        assert save_sample_draft(restored, seed=8) > 1000, "the lost store may have given the next numbers"
+    restore(target, tmp_path / "older", ADA, name=first.snapshot)
+    with MapStore.open(tmp_path / "older", clock_ns=clock) as older:
+        assert content(older) == content(store)[:2]
+
+
+def test_old_snapshots_go_with_what_they_alone_name(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    names = []
+    for seed in range(4):
+        clock.now_ns += 3 * DAY_NS
+        save_sample_draft(store, seed=20 + seed)
+        names.append(back_up(store, target, keep=9).snapshot)
+    clock.now_ns += 40 * DAY_NS
+    store.collect_garbage(Retention(keep_drafts=0, keep_days=0.0))
+    last = back_up(store, target, keep=2)
+    assert list(last.removed) == names[:3]
+    assert target.snapshots() == [names[3], last.snapshot]
+    assert verify(target).faults == []
+
+
+def test_garbage_that_is_collected_meanwhile_is_no_fault(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    save_sample_draft(store, seed=7)
+    clock.now_ns += 40 * DAY_NS
+
+    def collect(done: int, _: int) -> None:
+        if done == 1:
+            store.collect_garbage(Retention(keep_drafts=0, keep_days=0.0))
+
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    report = back_up(store, target, progress=collect)
+    assert report.missing == ()
+    assert target.read()[1].versions == 2
+    restore(target, tmp_path / "new", ADA)
+
+
+def test_a_blob_that_the_store_lost_is_named_and_the_rest_is_kept(store: MapStore, tmp_path: Path) -> None:
+    lost, damaged = (tile.sha256 for tile in store.manifest("lab", 2).tiles[:2])
+    (store.folder / blob_path(lost)).unlink()
+    (store.folder / blob_path(damaged)).write_bytes(b"other")
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    report = back_up(store, target)
+    assert set(report.missing) == {lost, damaged}
+    assert restore(target, tmp_path / "new", ADA).missing == report.missing
+
+
+def test_a_backup_heals_what_the_store_loses_later(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target)
+    (store.folder / blob_path(store.manifest("lab", 2).tiles[0].sha256)).unlink()
+    clock.now_ns += DAY_NS
+    assert back_up(store, target).missing == ()
+    restore(target, tmp_path / "new", ADA)
+    with MapStore.open(tmp_path / "new") as restored:
+        assert restored.verify().faults == []
+
+
+def test_a_damaged_backup_restores_nothing(store: MapStore, where: str, tmp_path: Path) -> None:
+    target = BackupTarget(where, create=True)
+    back_up(store, target)
+    address = store.manifest("lab", 2).tiles[0].sha256
+    obstore.put(target._store, f"objects/{address[:2]}/{address}", b"other")
+    assert [address in fault for fault in verify(target).faults] == [True]
+    with pytest.raises(MapFormatError, match=address):
+        restore(target, tmp_path / "new", ADA)
+    assert not (tmp_path / "new").exists()
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_keys_come_back_with_the_right_identity_alone(store: MapStore, tmp_path: Path) -> None:
+    init_here(store)
+    identity, other = pyrage.x25519.Identity.generate(), pyrage.x25519.Identity.generate()
+    (tmp_path / "key").write_text(f"# made by age-keygen\n{identity}\n")
+    (tmp_path / "other").write_text(f"{other}\n")
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    report = back_up(store, target, recipient=recipient_of(str(identity.to_public())))
+    assert report.has_keys
+    secret = (store.folder / "keys" / "online.pem").read_bytes()
+    assert not any(secret in path.read_bytes() for path in (tmp_path / "backups").rglob("*") if path.is_file())
+    with pytest.raises(UsageError, match="not the key"):
+        restore(target, tmp_path / "new", ADA, identities=identities_of(tmp_path / "other"))
+    without = restore(target, tmp_path / "without", ADA)
+    assert (without.keys, without.is_signed) == ((), False)
+    restored = restore(target, tmp_path / "new", ADA, identities=identities_of(tmp_path / "key"))
+    assert restored.is_signed
+    assert (tmp_path / "new" / "keys" / "online.pem").read_bytes() == secret
+    assert (tmp_path / "new" / "keys" / "online.pem").stat().st_mode & 0o777 == 0o600
+    lists, before = SignedLists(tmp_path / "new"), SignedLists(store.folder)
+    assert lists.newest("site-lab") > before.newest("site-lab") + 1000
+
+
+def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    identity = pyrage.x25519.Identity.generate()
+    name = back_up(store, target, recipient=identity.to_public()).snapshot
+    found = target.read(name)[1]
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as archive:
+        archive.addfile(tarfile.TarInfo("../../outside.pem"))
+    target.put(stolen := pyrage.encrypt(packed.getvalue(), [identity.to_public()]))
+    hostile = [
+        msgspec.structs.replace(found, files={**found.files, "../outside": found.files["store.sqlite3"]}),
+        msgspec.structs.replace(found, blobs=["../outside"]),
+        msgspec.structs.replace(found, keys=sha256_hex(stolen)),
+        msgspec.structs.replace(found, format=2),
+    ]
+    for bad in [to_json(snapshot) for snapshot in hostile] + [b"{", b"[]", b"\xff"]:
+        (tmp_path / "backups" / "snapshots" / f"{name}.json").write_bytes(bad)
+        with pytest.raises(FleetmapError):
+            restore(target, tmp_path / "new", ADA, identities=[identity])
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["backups", "store"]
+
+
+def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="holds no backups"):
+        BackupTarget(str(tmp_path / "nothing"))
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    with pytest.raises(UsageError, match="no snapshot"):
+        restore(target, tmp_path / "new", ADA)
+    with pytest.raises(UsageError, match="public key of age"):
+        recipient_of("age1wrong")
+    back_up(store, target)
+    with pytest.raises(UsageError, match="not empty"):
+        restore(target, store.folder, ADA)
+    with pytest.raises(UsageError, match="without --recipient"):
+        restore(target, tmp_path / "new", ADA, identities=[pyrage.x25519.Identity.generate()])
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    with pytest.raises(StoreError, match="credentials"):
+        BackupTarget("s3://nowhere/a").snapshots()
+    with pytest.raises(StoreError, match="credentials"):
+        BackupTarget("nonsense://nowhere/a")
+
+
+def test_an_open_transaction_is_not_half_in_a_backup(store: MapStore, tmp_path: Path) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    other = sqlite3.connect(store.folder / "store.sqlite3", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    other.execute("UPDATE versions SET landmarks = 1 WHERE version = 1")
+    back_up(store, target)
+    other.execute("ROLLBACK")
+    other.close()
+    restore(target, tmp_path / "new", ADA)
+    with MapStore.open(tmp_path / "new") as restored:
+        assert restored.verify().faults == []
+
+
+def test_a_served_store_is_backed_up_after_releases_too(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    init_here(store)
+    identity = pyrage.x25519.Identity.generate()
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target, recipient=identity.to_public())
+    save_sample_draft(store, seed=9)
+    releases.publish(store, "lab")
+    clock.now_ns += DAY_NS
+    back_up(store, target, recipient=identity.to_public())
+    restore(target, tmp_path / "new", ADA, identities=[identity])
+    with MapStore.open(tmp_path / "new", clock_ns=clock) as restored:
+        assert restored.current("lab").version == 3
+        assert SignedLists(restored.folder).served("lab").state("current").about.version == 3
