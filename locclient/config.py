@@ -23,7 +23,7 @@ TIERS = {
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint robot_height_m autostart",
         "topics": "*",
-        "vda5050": "broker manufacturer serial_number interface username password_file ca map_id versions download_from "
+        "vda5050": "broker version manufacturer serial_number interface username password_file ca map_id versions download_from "
         "download_token_file download_ca robot_actions factsheet frame",
     },
     "tuning": {

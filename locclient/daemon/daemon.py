@@ -36,6 +36,7 @@ from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Robot
 from locclient.vda5050.adapter import FleetAdapter
+from locclient.vda5050.dialects import dialect
 from locclient.vda5050.factsheet import read_factsheet
 from locclient.vda5050.fleet_maps import FleetMaps
 from locclient.vda5050.mqtt_link import MqttLink
@@ -207,7 +208,7 @@ def _fleet_manager(
         lost_radius_m=config.localizer.track.lost_radius_m,
     )
     server.on_change = adapter.changed_version
-    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet))
+    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), dialect(section.version))
     return MqttLink(check_section(section, insecure=insecure), section, adapter, sheet)
 
 

@@ -271,7 +271,8 @@ class FleetAdapter:
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
             how = (outcome, self._lost_radius_m, self._fleet_from_map)
-            self._see(self._localization.after(*how, is_driving=is_driving(outcome.speed_mps)))
+            speed_mps = outcome.speed_mps  # an unknown one is no driving: nobody may rely on it
+            self._see(self._localization.after(*how, is_driving=speed_mps is not None and is_driving(speed_mps)))
             self._judge_position()
 
     def silence(self) -> None:
@@ -336,6 +337,15 @@ class FleetAdapter:
             found["errors"] = to_plain(errors) + found.get("errors", [])
             found["instantActionStates"] = to_plain(self._book.states) + found.get("instantActionStates", [])
             return found
+
+    def position(self) -> dict[str, Any] | None:
+        """Return what the topic visualization shows, without its header; None before the first pose."""
+        with self._lock:
+            place = self._localization.mobile_robot_position(self.map_id, self._lost_radius_m)
+            velocity = None if self._part is None else self._part.velocity
+            if place is None:
+                return None
+            return {"mobileRobotPosition": place} | ({} if velocity is None else {"velocity": to_plain(velocity)})
 
     def _robots_own(self) -> dict[str, Any]:
         age_s = self._clock_s() - self._part_s

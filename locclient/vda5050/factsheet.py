@@ -6,94 +6,85 @@ from typing import Annotated, Any
 import msgspec
 
 from fleetmap.errors import UsageError, disk_errors
-from locclient.vda5050.actions import PARAMETERS
+from locclient.vda5050.actions import MAP_ACTIONS, PARAMETERS
+from locclient.vda5050.dialects import Dialect
 from locclient.vda5050.messages import MAX_PAYLOAD_BYTES
 
 _HEADER = ("headerId", "timestamp", "version", "manufacturer", "serialNumber")
-_Least = Annotated[float, msgspec.Meta(ge=0)]
+_LEAST = Annotated[float, msgspec.Meta(ge=0)]
+_OBJECTS: dict[str, Any] = {"loadSpecification": dict[str, Any]}
+_KINDS = {"seriesName": str, "localizationTypes": list[str], "navigationTypes": list[str]}
+_NEW: dict[str, Any] = _OBJECTS | {
+    "typeSpecification": _KINDS | {"mobileRobotKinematics": str, "mobileRobotClass": str, "maximumLoadMass": _LEAST},
+    "physicalParameters": dict.fromkeys(("minimumSpeed", "maximumSpeed", "maximumAcceleration"), _LEAST)
+    | dict.fromkeys(("maximumDeceleration", "minimumHeight", "maximumHeight", "width", "length"), float),
+    "protocolLimits": dict.fromkeys(("maximumStringLengths", "maximumArrayLengths"), dict[str, Any])
+    | {"timing": dict.fromkeys(("minimumOrderInterval", "minimumStateInterval"), _LEAST)},
+    "protocolFeatures": {
+        "optionalParameters": list[dict[str, Any]],
+        "mobileRobotActions": [
+            {"actionType": str, "actionScopes": list[str], "pauseAllowed": bool, "cancelAllowed": bool}
+        ],
+    },
+    "mobileRobotGeometry": dict[str, Any],
+}
+_OLD: dict[str, Any] = _OBJECTS | {
+    "typeSpecification": _KINDS | {"agvKinematic": str, "agvClass": str, "maxLoadMass": _LEAST},
+    "physicalParameters": dict.fromkeys(
+        ("speedMin", "speedMax", "accelerationMax", "decelerationMax", "heightMax", "width", "length"), float
+    ),
+    "protocolLimits": dict.fromkeys(("maxStringLens", "maxArrayLens"), dict[str, Any])
+    | {"timing": dict.fromkeys(("minOrderInterval", "minStateInterval"), float)},
+    "protocolFeatures": {
+        "optionalParameters": list[dict[str, Any]],
+        "agvActions": [{"actionType": str, "actionScopes": list[str]}],
+    },
+    "agvGeometry": dict[str, Any],
+}
+"""What the standard's upper levels require, by name: a type, the same of an object, or of each object in a list."""
 
 
-class _Camel(msgspec.Struct, rename="camel", kw_only=True):
-    pass
+def _type(shape: Any) -> Any:
+    if isinstance(shape, list):
+        return list[_type(shape[0])]  # type: ignore[misc]
+    if not isinstance(shape, dict):
+        return shape
+    fields = [(f"field_{number}", _type(of)) for number, of in enumerate(shape.values())]
+    names = dict(zip((name for name, _ in fields), shape, strict=True))
+    return msgspec.defstruct("Object", fields, rename=names, kw_only=True)
 
 
-class _TypeSpecification(_Camel):
-    series_name: str
-    mobile_robot_kinematics: str
-    mobile_robot_class: str
-    maximum_load_mass: _Least
-    localization_types: list[str]
-    navigation_types: list[str]
-
-
-class _PhysicalParameters(_Camel):
-    minimum_speed: _Least
-    maximum_speed: _Least
-    maximum_acceleration: _Least
-    maximum_deceleration: float
-    minimum_height: float
-    maximum_height: float
-    width: float
-    length: float
-
-
-class _Timing(_Camel):
-    minimum_order_interval: _Least
-    minimum_state_interval: _Least
-
-
-class _ProtocolLimits(_Camel):
-    maximum_string_lengths: dict[str, Any]
-    maximum_array_lengths: dict[str, Any]
-    timing: _Timing
-
-
-class _MobileRobotAction(_Camel):
-    action_type: str
-    action_scopes: list[str]
-    pause_allowed: bool
-    cancel_allowed: bool
-
-
-class _ProtocolFeatures(_Camel):
-    optional_parameters: list[dict[str, Any]]
-    mobile_robot_actions: list[_MobileRobotAction]
-
-
-class _Factsheet(_Camel):
-    type_specification: _TypeSpecification
-    physical_parameters: _PhysicalParameters
-    protocol_limits: _ProtocolLimits
-    protocol_features: _ProtocolFeatures
-    mobile_robot_geometry: dict[str, Any]
-    load_specification: dict[str, Any]
-
-
-def read_factsheet(path: Path) -> dict[str, Any]:
-    """Return the content of a factsheet without its header; the file's actions and localization types are kept beside ours.
+def read_factsheet(path: Path, spoken: Dialect) -> dict[str, Any]:
+    """Return the content of a factsheet in the spoken version without its header; its actions and localization types are kept beside ours.
 
     Raises UsageError if the file cannot be read, or lacks required objects of the standard at its upper levels.
     """
     with disk_errors(f"[vda5050] factsheet {path} cannot be read", "check the path", UsageError):
         data = path.read_bytes()[: MAX_PAYLOAD_BYTES + 1]
+    is_old = spoken.major == "v2"
     try:
         if len(data) > MAX_PAYLOAD_BYTES:
             raise ValueError(f"more than {MAX_PAYLOAD_BYTES} bytes")
-        msgspec.json.decode(data, type=_Factsheet)
+        msgspec.json.decode(data, type=_type(_OLD if is_old else _NEW))
         sheet: dict[str, Any] = msgspec.json.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise UsageError(f"[vda5050] factsheet {path}: {error}; it must fit VDA 5050's factsheet.schema") from error
+        raise UsageError(
+            f"[vda5050] factsheet {path}: {error}; it must fit the factsheet.schema of VDA 5050 {spoken.version}"
+        ) from error
     kinds, features = sheet["typeSpecification"]["localizationTypes"], sheet["protocolFeatures"]
     if "NATURAL" not in kinds:
         kinds.append("NATURAL")
-    others = [action for action in features["mobileRobotActions"] if action["actionType"] not in PARAMETERS]
-    features["mobileRobotActions"] = [*others, *(_described(kind) for kind in PARAMETERS)]
+    ours = [kind for kind in PARAMETERS if not is_old or kind != "clearInstantActions"]
+    described = [_described(kind, spoken) for kind in ours if spoken.has_maps or kind not in MAP_ACTIONS]
+    key, own = "agvActions" if is_old else "mobileRobotActions", {action["actionType"] for action in described}
+    features[key] = [*(action for action in features[key] if action["actionType"] not in own), *described]
     return {key: value for key, value in sheet.items() if key not in _HEADER}
 
 
-def _described(action_type: str) -> dict[str, Any]:
-    found: dict[str, Any] = {"actionType": action_type, "actionScopes": ["INSTANT"], "blockingTypes": ["NONE"]}
-    found |= {"pauseAllowed": False, "cancelAllowed": False}
+def _described(action_type: str, spoken: Dialect) -> dict[str, Any]:
+    found: dict[str, Any] = {"actionType": spoken.action_name(action_type), "actionScopes": ["INSTANT"]}
+    if spoken.major != "v2":  # the schema of 2.1 allows no list of blockingTypes
+        found |= {"blockingTypes": ["NONE"], "pauseAllowed": False, "cancelAllowed": False}
     listed = [
         {"key": key, "valueDataType": kind.rstrip("?"), "isOptional": kind.endswith("?")}
         for key, kind in PARAMETERS[action_type].items()

@@ -53,7 +53,7 @@ class Localization:
     stamp_ns: int | None = None
     position: Position | None = None
     is_localized: bool = False
-    is_driving: bool = True
+    is_driving: bool = False
     is_silent: bool = True
     has_map: bool = False
     is_aligned: bool = True

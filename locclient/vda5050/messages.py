@@ -10,8 +10,6 @@ import msgspec
 
 from fleetmap.errors import LinkError
 
-VERSION = "3.0.0"
-MAJOR = "v3"
 MAX_PAYLOAD_BYTES = 256 << 10
 _MOST = 1000
 T = TypeVar("T")

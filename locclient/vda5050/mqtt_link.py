@@ -1,4 +1,4 @@
-"""Connection of the adapter to the broker, MQTT 5 by paho-mqtt: topics, headers, last will, timing of states."""
+"""Connection of the adapter to the broker, by paho-mqtt: topics, headers, last will, timing. MQTT 5, or 3.1.1 for VDA 5050 2.x."""
 
 import logging
 import ssl
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from locclient.vda5050.adapter import FleetAdapter
-from locclient.vda5050.messages import MAJOR, MAX_PAYLOAD_BYTES, VERSION, timestamp
+from locclient.vda5050.dialects import dialect
+from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
 from locclient.vda5050.settings import Broker, Vda5050Section
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 ROBOT_TOPIC = "robotState"
 _LEAST_S = 0.1  # between two states
+_VISUALIZATION_S = 0.2
 _GOODBYE_S = 2.0
 _KEEPALIVE_S = 15
 _log = logging.getLogger(__name__)
@@ -32,12 +34,13 @@ class MqttLink:
     ) -> None:
         """Raises UsageError if paho-mqtt is missing, or the broker's authorities cannot be read."""
         self.adapter, self._broker, self._section, self._factsheet = adapter, broker, section, factsheet
-        self._prefix = f"{section.interface}/{MAJOR}/{section.manufacturer}/{section.serial_number}"
+        self._dialect = dialect(section.version)
+        self._prefix = f"{section.interface}/{self._dialect.major}/{section.manufacturer}/{section.serial_number}"
         self._sent: Counter[str] = Counter()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vda5050", daemon=True)
         self._heard: dict[str, Callable[[bytes], None]] = {
-            "instantActions": adapter.instant_actions,
+            "instantActions": lambda payload: adapter.instant_actions(self._dialect.heard(payload)),
             "order": adapter.order,
             ROBOT_TOPIC: adapter.robot_part,
         }
@@ -68,7 +71,10 @@ class MqttLink:
                 "[vda5050] needs paho-mqtt, which is not installed: pip install '.[client,vda5050]'"
             ) from error
         name = f"{self._section.manufacturer}-{self._section.serial_number}"
-        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, protocol=mqtt.MQTTv5)
+        kind: dict[str, Any] = {"protocol": mqtt.MQTTv5}
+        if self._dialect.major == "v2":  # whose brokers need not know MQTT 5
+            kind = {"protocol": mqtt.MQTTv311, "clean_session": True}
+        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, **kind)
         client.suppress_exceptions = True  # exceptions would end paho's thread; its logger has them
         client.enable_logger(_log)
         client.reconnect_delay_set(1, 30)
@@ -87,12 +93,13 @@ class MqttLink:
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
-        limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-        limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
+        more: dict[str, Any] = {}
+        if self._dialect.major != "v2":
+            limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
+            more = {"clean_start": True, "properties": limits}
         self._set_will()
-        self._client.connect_async(
-            self._broker.host, self._broker.port, _KEEPALIVE_S, clean_start=True, properties=limits
-        )
+        self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
 
     def _set_will(self) -> None:
         will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"})
@@ -115,16 +122,24 @@ class MqttLink:
             handle(message.payload)
 
     def _run(self) -> None:
+        state_at_s, seen = 0.0, None
         while not self._stop.is_set():
-            self.adapter.changed.wait(self._section.state_interval_s)
-            self.adapter.changed.clear()
+            is_changed = self.adapter.changed.wait(_VISUALIZATION_S)
             if not self._client.is_connected() or self._stop.is_set():
                 self._stop.wait(_LEAST_S)
                 continue
             if self._factsheet is not None and self.adapter.factsheet_wanted.is_set():
                 self.adapter.factsheet_wanted.clear()
                 self._publish("factsheet", self._factsheet, qos=0, retain=True)
-            self._publish("state", self.adapter.state(), qos=0, retain=False)
+            if is_changed or time.monotonic() >= state_at_s:
+                self.adapter.changed.clear()
+                state_at_s = time.monotonic() + self._section.state_interval_s
+                self._publish("state", self.adapter.state(), qos=0, retain=False)
+            position = self.adapter.position()
+            if position is not None and position != seen:
+                last = {"referenceStateHeaderId": (self._sent["state"] - 1) & 0xFFFFFFFF}
+                self._publish("visualization", {**last, **position}, qos=0, retain=False)
+                seen = position
             self._stop.wait(_LEAST_S)
 
     def _publish(self, topic: str, content: dict[str, Any], *, qos: int, retain: bool) -> Any:
@@ -134,9 +149,9 @@ class MqttLink:
         header = {
             "headerId": self._sent[topic] & 0xFFFFFFFF,
             "timestamp": timestamp(time.time_ns()),
-            "version": VERSION,
+            "version": self._dialect.version,
             "manufacturer": self._section.manufacturer,
             "serialNumber": self._section.serial_number,
         }
         self._sent[topic] += 1
-        return to_json({**header, **content})
+        return to_json({**header, **self._dialect.said(topic, content)})

@@ -19,6 +19,7 @@ class Vda5050Section(Section, frozen=True):
     """Broker, name of the robot there, and selection of its map. Without a broker nothing is reported."""
 
     broker: str | None = None
+    version: Literal["2.0.0", "2.1.0", "3.0.0"] = "3.0.0"
     manufacturer: str = ""
     serial_number: str = ""
     interface: str = "vda5050"
@@ -69,6 +70,10 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
         )
     if section.state_interval_s > 30:
         raise UsageError(f"[vda5050] state_interval_s = {section.state_interval_s}: VDA 5050 wants 30 at most")
+    if section.version == "2.0.0" and section.versions == "fleet manager":
+        raise UsageError(
+            '[vda5050] version = "2.0.0" has no actions on maps: set versions = "map server", or version = "2.1.0"'
+        )
     scheme, host, port = match[1], match[2].strip("[]"), int(match[3] or (8883 if match[1] == "mqtts" else 1883))
     if scheme == "mqtt" and not insecure and not is_loopback(f"tcp/{host}:{port}"):
         raise UsageError(

@@ -43,14 +43,16 @@ def http_server(store: MapStore, fleet: Fleet) -> Iterator[str]:
 
 
 @contextmanager
-def robot(folder: Path, endpoint: str, broker: int, http: str) -> Iterator[subprocess.Popen[bytes]]:
+def robot(
+    folder: Path, endpoint: str, broker: int, http: str, version: str = "3.0.0"
+) -> Iterator[subprocess.Popen[bytes]]:
     recording = robot_world.write(folder / "ride", robot_world.carried(FRAMES, CARRIED_AT))
     config = folder / "robot.toml"
     config.write_text(
         f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\noutbox = "{folder}/outbox"\n'
         f'[source]\nkind = "recording"\nrecording = "{recording}"\n'
         f'[vda5050]\nbroker = "mqtt://127.0.0.1:{broker}"\nmanufacturer = "acme"\nserial_number = "0001"\n'
-        f'download_from = ["{http}"]\nstate_interval_s = 0.5\ninitialize_s = 10.0\n'
+        f'download_from = ["{http}"]\nstate_interval_s = 0.5\ninitialize_s = 10.0\nversion = "{version}"\n'
     )
     arguments = [sys.executable, "-m", "locclient.cli", "run", "--config", str(config), "--verbose"]
     environment = {**os.environ, "PYTHONPATH": ":".join(sys.path)}
@@ -79,6 +81,41 @@ def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_aw
                 _story(master, store, http)
                 process.kill()
                 until(lambda: master.connections[-1] == "CONNECTION_BROKEN")
+        finally:
+            master.close()
+            service.close()
+        assert master.faults == []
+        assert len(master.visualizations) > 10
+
+
+@pytest.mark.timeout(600)
+def test_a_fleet_manager_of_an_older_version_is_understood(tmp_path: Path) -> None:
+    with (
+        mosquitto(tmp_path) as broker,
+        MapStore.open(tmp_path / "store", create=True) as store,
+        Bus.listen("tcp/127.0.0.1:0") as bus,
+    ):
+        robot_world.save(store)
+        init_here(store)
+        fleet = Fleet(store)
+        service = BusService(store, fleet, bus, lambda *_: None)
+        master = Master(broker, "2.1.0")
+        try:
+            with http_server(store, fleet) as http, robot(tmp_path, bus.endpoint, broker, http, "2.1.0") as process:
+                until(lambda: bool(master.states), "no state", START_S)
+                assert (master.connections[-1], master.state["operatingMode"]) == ("ONLINE", "MANUAL")
+                master.begin_robot_part()
+                master.done(master.act("downloadMap", **httpx.get(f"{http}/v1/sites/room/versions/1/vda5050").json()))
+                master.done(master.act("enableMap", mapId="room", mapVersion="1"))
+                assert master.maps() == {"1": "ENABLED"}
+                until(lambda: master.state.get("agvPosition", {}).get("positionInitialized", False))
+                there = {key: master.state["agvPosition"][key] for key in ("x", "y", "theta")}
+                master.done(master.act("initPosition", **there, mapId="room", lastNodeId="n-9"))
+                assert master.state["lastNodeId"] == "n-9"
+                assert master.state["batteryState"]["batteryCharge"] == 71.5
+                until(lambda: bool(master.visualizations))
+                process.kill()
+                until(lambda: master.connections[-1] == "CONNECTIONBROKEN")
         finally:
             master.close()
             service.close()

@@ -18,6 +18,7 @@ from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.continuous_odom import PublishedPose
 from locclient.vda5050.adapter import FleetAdapter
+from locclient.vda5050.dialects import dialect
 from locclient.vda5050.factsheet import read_factsheet
 from locclient.vda5050.localization import Localization, Position
 from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
@@ -66,6 +67,7 @@ class Adapter(FleetAdapter):
     def __init__(self, **settings: Any) -> None:
         self.now_s, self.offers, self.priors = 100.0, [], []
         self.schema = validator("state")
+        self.older = [(dialect(version), validator("state", version)) for version in ("2.0.0", "2.1.0")]
         super().__init__(
             Vda5050Section(**settings), "hall", FakeMaps(), active=lambda: None, offer=self.offers.append,  # type: ignore[arg-type]
             put_prior=self.priors.append, lost_radius_m=3.0, clock_s=lambda: self.now_s,
@@ -77,6 +79,10 @@ class Adapter(FleetAdapter):
         """The state as it leaves."""
         state = json.loads(msgspec.json.encode({**HEADER, **self.state()}))
         assert list(self.schema.iter_errors(state)) == []
+        for spoken, schema in self.older:
+            told = {**HEADER, **spoken.said("state", state)}
+            assert list(schema.iter_errors(told)) == []
+            assert not told.keys() & {"mobileRobotPosition", "powerSupply", "instantActionStates"}
         return state
 
     def ask(self, kind: str = "enableMap", name: str = "a", **parameters: Any) -> dict[str, Any]:
@@ -340,7 +346,7 @@ def _sheet() -> dict[str, Any]:
 def test_a_factsheet_is_completed(tmp_path: Path) -> None:
     path = tmp_path / "factsheet.json"
     path.write_text(json.dumps(_sheet()))
-    sheet = read_factsheet(path)
+    sheet = read_factsheet(path, dialect("3.0.0"))
     assert list(validator("factsheet").iter_errors({**HEADER, **sheet})) == []
     assert sheet["typeSpecification"]["localizationTypes"] == ["RFID", "NATURAL"]
     assert "downloadMap" in [action["actionType"] for action in sheet["protocolFeatures"]["mobileRobotActions"]]
@@ -353,7 +359,7 @@ def test_a_factsheet_is_completed(tmp_path: Path) -> None:
         change(spoiled)
         path.write_text(json.dumps(spoiled))
         with pytest.raises(UsageError, match="factsheet"):
-            read_factsheet(path)
+            read_factsheet(path, dialect("3.0.0"))
 
 
 @pytest.mark.parametrize(
@@ -363,6 +369,7 @@ def test_a_factsheet_is_completed(tmp_path: Path) -> None:
         ({"broker": "mqtt://10.0.0.9"}, "without TLS"),
         ({"broker": "mqtts://x", "serial_number": "a/b"}, "serial_number"),
         ({"broker": "mqtts://x", "username": "u"}, "belong together"),
+        ({"broker": "mqtts://x", "version": "2.0.0"}, "no actions on maps"),
         ({"broker": "mqtts://x", "state_interval_s": 31.0}, "30 at most"),
         ({"broker": "mqtts://x", "initial_sigma_m": 0.05}, "a dock's"),
         ({"broker": "mqtts://x", "username": "u", "password_file": "/nowhere"}, "cannot be read"),

@@ -15,15 +15,15 @@ from typing import Any
 import jsonschema_rs
 import pytest
 
-SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050" / "json_schemas"
-PREFIX = "vda5050/v3/acme/0001"
+SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050"
 PATIENCE_S = 60.0
 
 
-def validator(topic: str) -> jsonschema_rs.Draft202012Validator:
+def validator(topic: str, version: str = "3.0.0") -> jsonschema_rs.Draft202012Validator:
     """The official schema of a topic; skips if it is absent."""
-    path = SCHEMAS / f"{topic}.schema"
-    if not path.is_file():
+    folder = SCHEMAS / ("json_schemas" if version == "3.0.0" else version)
+    path = next(iter(folder.glob(f"{topic}.*")), None)
+    if path is None:
         pytest.skip(f"the schemas of VDA 5050 are not in {SCHEMAS}")
     return jsonschema_rs.Draft202012Validator(json.loads(path.read_text("utf-8")), validate_formats=True)
 
@@ -65,20 +65,23 @@ def until(found: Callable[[], bool], words: object = "", patience_s: float = PAT
 class Master:
     """Hears one robot, and sends to it."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, version: str = "3.0.0") -> None:
+        self.version, self.prefix = version, f"vda5050/v{version[0]}/acme/0001"
         mqtt = pytest.importorskip("paho.mqtt.client")
         self.states: list[dict[str, Any]] = []
         self.connections: list[str] = []
         self.factsheets: list[dict[str, Any]] = []
+        self.visualizations: list[dict[str, Any]] = []
         self.faults: list[str] = []
         self.retained: list[str] = []
-        self._schemas = {topic: validator(topic) for topic in ("state", "connection", "factsheet", "instantActions")}
+        topics = ("state", "connection", "factsheet", "visualization", "instantActions")
+        self._schemas = {topic: validator(topic, version) for topic in topics}
         self._count = 0
         self._robot_part: bytes | None = None
         self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, client_id="master")
         self._client.on_message = self._hear
         self._client.connect("127.0.0.1", port)
-        self._client.subscribe(f"{PREFIX}/#")
+        self._client.subscribe(f"{self.prefix}/#")
         self._client.loop_start()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._speak_for_the_robot, daemon=True)
@@ -91,7 +94,7 @@ class Master:
 
     def _hear(self, _: object, __: object, message: Any) -> None:
         topic = message.topic.rpartition("/")[2]
-        if topic not in {"state", "connection", "factsheet"}:
+        if topic not in {"state", "connection", "factsheet", "visualization"}:
             return
         content = json.loads(message.payload)
         self.faults += [
@@ -103,6 +106,8 @@ class Master:
         elif topic == "connection":
             self.connections.append(content["connectionState"])
             self.retained += [topic] * message.retain
+        elif topic == "visualization":
+            self.visualizations.append(content)
         else:
             self.factsheets.append(content)
 
@@ -123,7 +128,7 @@ class Master:
         self.send("robotState", self._robot_part)
 
     def send(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
-        self._client.publish(f"{PREFIX}/{topic}", payload, retain=retain).wait_for_publish(5)
+        self._client.publish(f"{self.prefix}/{topic}", payload, retain=retain).wait_for_publish(5)
 
     def act(self, action_type: str, *, is_valid: bool = True, **parameters: Any) -> str:
         """Sends an instant action and returns its id."""
@@ -133,7 +138,7 @@ class Master:
             "actionParameters": [{"key": key, "value": value} for key, value in parameters.items()],
         }  # fmt: skip
         stamp = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.") + "000Z"
-        message = {"headerId": self._count, "timestamp": stamp, "version": "3.0.0", "manufacturer": "acme"}
+        message = {"headerId": self._count, "timestamp": stamp, "version": self.version, "manufacturer": "acme"}
         message |= {"serialNumber": "0001", "actions": [action]}
         assert self._schemas["instantActions"].is_valid(message) is is_valid
         self.send("instantActions", json.dumps(message).encode())
@@ -144,7 +149,8 @@ class Master:
         return self.states[-1] if self.states else {}
 
     def action(self, action_id: str) -> dict[str, Any]:
-        found = [state for state in self.state.get("instantActionStates", []) if state["actionId"] == action_id]
+        states = self.state.get("instantActionStates" if self.version == "3.0.0" else "actionStates", [])
+        found = [state for state in states if state["actionId"] == action_id]
         return found[0] if found else {"actionStatus": "UNSEEN"}
 
     def done(self, action_id: str, status: str = "FINISHED", patience_s: float = PATIENCE_S) -> dict[str, Any]:
