@@ -22,10 +22,10 @@ from mapserver.survey.bundle.problem import (
     ImageRows,
     InertialTerms,
     MotionPrior,
-    PriorTerm,
     SelfCalibration,
 )
 from mapserver.survey.settings import BundleSettings
+from mapserver.survey.state import PriorTerm
 
 SETTINGS = BundleSettings(max_iterations=12, huber_sigmas=3.0, cutoff_sigmas=8.0, lambda_start=1e-6)
 _ROUNDS = 5  # each re-estimates the noise scales and integrates the samples at the new biases

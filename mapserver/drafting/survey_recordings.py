@@ -35,12 +35,13 @@ from mapserver.drafting.sensor_subset import reduced
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence
-from mapserver.survey.finish.dock_alignment import aligned_by_priors, map_from_survey_by_priors
+from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey
+from mapserver.survey.state import SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 
 _log = logging.getLogger(__name__)
@@ -76,7 +77,13 @@ class Surveyed:
         apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
         whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with the part before: {c.refused}" for c in apart]
         left_out = [component.remark() for component in self.survey.components if not component.kept]
-        return [*self.findings, *(turned if yaw.corrected else ()), *whole, *left_out]
+        return [
+            *self.findings,
+            *(turned if yaw.corrected else ()),
+            *whole,
+            *left_out,
+            *_contradictions(self.survey.state),
+        ]
 
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
@@ -86,6 +93,16 @@ class Surveyed:
             return self.calibration
         words = f"the survey's disparities are {-yaw.shift_px:+.2f} px off by its motion; the doctor did not find this"
         return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
+
+
+def _contradictions(state: SurveyState) -> list[str]:
+    """Return the position priors that the survey contradicts, as text."""
+    apart = [(p, state.map_from_body[p.k, :3, 3] - p.map_from_body[:3, 3]) for p in state.priors if not p.is_believed]
+    return [
+        f"not used: the position prior {1e-9 * (state.stamps_ns[p.k] - state.stamps_ns[0]):.1f} s after the first keyframe, "
+        f"{np.linalg.norm(off):.2f} m from the place by the survey; check the position of this dock or tag"
+        for p, off in apart
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,8 +369,8 @@ def survey_recording(
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
     """Return the survey, in metres if its priors give an unknown scale, and map_from_survey (4, 4) by them, None without any."""
     priors, base_from_body = recording.priors, recording.calibration.base_from_body
-    if done.map.scale_known:
-        return done, map_from_survey_by_priors(done.map, priors, base_from_body)
+    if done.map.scale_known:  # a survey with priors is in `map` already
+        return done, np.eye(4) if any(prior.is_believed for prior in done.state.priors) else None
     aligned = aligned_by_priors(done.map, priors, base_from_body)
     if aligned is None:
         return done, None

@@ -4,7 +4,7 @@
 |---|---|---|
 | `follow` | frames, IMU, wheels, or given poses | `OdometryPass`: odometry of all frames, keyframes with their features |
 | `adjust_chain` | that | `AdjustedChain`: keyframes matched with their neighbours, landmarks, both adjusted |
-| `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` with keyframes after the pose graph, and the `Loops` |
+| `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` after the pose graph, in `map` by priors, and the `Loops` |
 | `adjust_globally` | keyframes after loops, matched pairs | all views matched again and adjusted; the pair's error of yaw |
 | `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
 | `place_frames`, `assemble` | the kept state | all frames, and the map; inconsistent observations are culled |
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.errors import SurveyError
+from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
 from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, initial_state, odometry_factors
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
@@ -43,8 +44,14 @@ from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.odometry_pass import run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import optimize_pose_graph
-from mapserver.survey.pose_graph.position_priors import learn_priors
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.pose_graph.position_priors import (
+    judged_priors,
+    learn_priors,
+    level,
+    placed_by_priors,
+    prior_edges,
+)
 from mapserver.survey.segments import in_segments
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks, OdometryPass, PosedKeyframes, SurveyState
@@ -182,13 +189,16 @@ def adjust_chain(
 def close_loops(
     begun: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools
 ) -> tuple[SurveyState, Loops]:
-    """Find loops, and return the keyframes after the pose graph with them. Only the gate uses position priors."""
+    """Find loops, and return the keyframes after the pose graph with them: in `map` if position priors give its frame."""
     odometry, state, settings = begun.odometry, begun.state, config.settings
     chain, scale_walk = chain_edges(odometry, state), settings.monocular.scale_walk
     known = chain if odometry.scale_known else gate_covariances(chain, scale_walk)
     marginals = GraphMarginals(state.map_from_body, known)
-    if odometry.scale_known:
-        learn_priors(marginals, inputs.priors, inputs.calibration.base_from_body, odometry)
+    if odometry.scale_known and inputs.priors:
+        base_from_body = inputs.calibration.base_from_body
+        placed, terms = placed_by_priors(state.map_from_body, marginals, inputs.priors, base_from_body, odometry)
+        marginals = GraphMarginals(placed, known)
+        state = replace(state.moved(placed), priors=learn_priors(marginals, terms))
     groups = find_groups(state, _sigmas_m(odometry), settings.join_sigma_m)
     closer = LoopCloser(
         _posed(odometry, state),
@@ -203,15 +213,31 @@ def close_loops(
         closer.close(i)
         tools.at("loops", i + 1, len(odometry.keyframes))
     loops = closer.loops
+    if odometry.scale_known:
+        return _solved(state, closer.begin, chain, loops)
     if not loops.edges:
         return state, loops
-    if odometry.scale_known:
-        solved = optimize_pose_graph(closer.begin, [*chain, *loops.edges])
-        return state.moved(solved.map_from_body), loops.without_outliers(solved.loop_weights)
     scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
     state = state.moved(scaled.map_from_body)
     factors = odometry_factors(odometry, state.map_from_body)
     return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(scaled.loop_weights)
+
+
+def _solved(state: SurveyState, map_from_body: Array, chain: list[PoseEdge], loops: Loops) -> tuple[SurveyState, Loops]:
+    """Return the state and the loops after the pose graph of both and of believed priors; begun at map_from_body (K, 4, 4)."""
+    believed = [n for n, term in enumerate(state.priors) if term.is_believed]
+    if not loops.edges and not believed:
+        return state, loops
+    if not believed:
+        solved = optimize_pose_graph(map_from_body, [*chain, *loops.edges])
+        return state.moved(solved.map_from_body), loops.without_outliers(solved.loop_weights)
+    nodes, held = prior_edges(map_from_body, [state.priors[n] for n in believed])
+    solved = optimize_pose_graph(nodes, [*chain, *loops.edges, *held])
+    new_from_map = level(se3_inverse(solved.map_from_body[-1]), state.priors[believed[0]].map_from_body)
+    weights = dict(zip(believed, solved.loop_weights[len(loops.edges) :] >= 0.5, strict=True))
+    priors = [replace(term, is_believed=bool(weights.get(n, False))) for n, term in enumerate(state.priors)]
+    state = replace(state.moved(new_from_map @ solved.map_from_body[:-1]), priors=priors)
+    return state, loops.without_outliers(solved.loop_weights[: len(loops.edges)])
 
 
 def adjust_globally(
@@ -248,6 +274,7 @@ def adjust_globally(
             )
             joined = tracks_of(pairs, tracks)
             redundant = redundant_keyframes(joined, odometry.keyframes, settings)
+            redundant[[term.k for term in state.priors]] = False
             landmarks = build_landmarks(posed, joined, settings, tools.executor, redundant)
             observed_from = posed.map_from_cam
             del pairs, joined
@@ -257,6 +284,9 @@ def adjust_globally(
         del landmarks, state  # otherwise observations would be in memory twice
         tools.release()
         state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
+        priors, believed = judged_priors(state.priors, state.map_from_body)
+        if not believed:
+            state = adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
         if round_number == 0:
             yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
     return odometry, state, yaw

@@ -300,6 +300,19 @@ class RelativeTerm:
 
 
 @dataclass(frozen=True)
+class PriorTerm:
+    """Prior of keyframe k's pose: map_from_body (4, 4); information (6, 6) of a perturbation in map axes.
+
+    is_believed: False for a dock, tag or zone that contradicts the survey; it has no influence.
+    """
+
+    k: int
+    map_from_body: Array
+    information: Array
+    is_believed: bool = True
+
+
+@dataclass(frozen=True)
 class KeyframeMotion:
     """Velocities and biases at K keyframes; inertial is False for a rig without a gravity estimate.
 
@@ -332,7 +345,10 @@ class KeyframeMotion:
 
 @dataclass(frozen=True)
 class SurveyState:
-    """Variables of the adjustment: K keyframes and the landmarks."""
+    """Variables of the adjustment: K keyframes and the landmarks.
+
+    priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`.
+    """
 
     stamps_ns: Indices
     map_from_body: Array
@@ -341,15 +357,20 @@ class SurveyState:
     motion: KeyframeMotion
     landmarks: Landmarks
     is_depth_camera: bool = False
+    priors: Sequence[PriorTerm] = ()
 
     def of(self, chosen: Mask) -> "SurveyState":
         """Return a separate state of the chosen keyframes (K,) and of the landmarks seen by two of them."""
         number = np.cumsum(chosen) - 1
         marks = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2)
         marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
-        stamps_ns, map_from_body = self.stamps_ns[chosen], self.map_from_body[chosen]
         return replace(
-            self, stamps_ns=stamps_ns, map_from_body=map_from_body, landmarks=marks, motion=self.motion.of(chosen)
+            self,
+            stamps_ns=self.stamps_ns[chosen],
+            map_from_body=self.map_from_body[chosen],
+            landmarks=marks,
+            motion=self.motion.of(chosen),
+            priors=[replace(p, k=int(number[p.k])) for p in self.priors if chosen[p.k]],
         )
 
     def moved(self, map_from_body: Array) -> "SurveyState":

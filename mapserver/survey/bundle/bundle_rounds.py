@@ -141,10 +141,13 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
 
 
 def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
-    """Return the bundle problem of a state; `free` (K,) are the keyframes that may move, all for None."""
-    marks, motion = state.landmarks, state.motion
+    """Return the bundle problem of a state; `free` (K,) are the keyframes that may move, all for None.
+
+    Believed priors fix the map; without any the first keyframe does.
+    """
+    marks, motion, priors = state.landmarks, state.motion, [p for p in state.priors if p.is_believed]
     fixed = np.zeros(len(state.stamps_ns), bool) if free is None else ~free
-    if not fixed.any():
+    if not fixed.any() and not priors:
         fixed[0] = True
     holds_all = free is None or bool(free[0])
     return BundleProblem(
@@ -159,7 +162,8 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
         obs_sigma_px=marks.obs_sigma_px,
         inertial=_inertial(state, settings, fixed if not holds_all else None) if motion.inertial else None,
         relative=motion.relative,
-        gauge="yaw_position" if motion.inertial and holds_all else "pose",
+        priors=priors,
+        gauge="yaw_position" if motion.inertial and holds_all and not priors else "pose",
     )
 
 

@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import Preintegrated
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.state import RelativeTerm
-
-
-@dataclass(frozen=True)
-class PriorTerm:
-    """Prior of keyframe k's pose: map_from_body (4, 4); information (6, 6) of a perturbation in map axes."""
-
-    k: int
-    map_from_body: Array
-    information: Array
+from mapserver.survey.state import PriorTerm, RelativeTerm
 
 
 @dataclass(frozen=True)

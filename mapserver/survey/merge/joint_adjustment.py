@@ -17,12 +17,13 @@ from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, PriorTerm, continued
+from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
+from mapserver.survey.pose_graph.position_priors import judged_priors
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
-from mapserver.survey.state import Landmarks, RelativeTerm, SurveyState
+from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState
 from mapserver.survey.survey_map import SurveyMap, history_of
 
 
@@ -72,12 +73,17 @@ def adjust_jointly(
     """Return old and new keyframes and landmarks with the best fit to all observations; map_from_body (K, 4, 4): start of the new ones.
 
     known: constraints of the map; None for a published one, whose keyframes stay within `anchor_sigma_m`. A survey without sight of the map
-    keeps its shape, and its first keyframe its pose. The first adjustment finds outliers. finely: a second one uses the redescending cost
-    with measured noise, as in a survey's own last one: with the stated noise, depth edges would bias the scale of the survey.
+    keeps its shape, and its first keyframe its pose. Docks of the survey that contradict the result have no influence.
+    The first adjustment finds outliers. finely: a second one uses the redescending cost with measured noise, as in a survey's own
+    last one: with the stated noise, depth edges would bias the scale of the survey.
     """
     final = settings.final_bundle
     for how in (msgspec.structs.replace(final, cutoff_sigmas=np.inf), final)[: 1 + finely]:
         solution = _solved(base, known, state, map_from_body, sightings, settings, how)
+        priors, believed = judged_priors(state.priors, solution.map_from_body)
+        if not believed:
+            state = replace(state, priors=priors)
+            solution = _solved(base, known, state, map_from_body, sightings, settings, how)
         map_from_body, sightings = solution.map_from_body, solution.sightings
     return solution
 
@@ -131,7 +137,8 @@ def _solved(
     )
     if own_rig:  # a survey with another mount contributes its pictures only
         relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
-        problem = replace(problem, relative=earlier.relative + relative)
+        priors = [replace(p, k=p.k + old) for p in state.priors if p.is_believed]
+        problem = replace(problem, relative=earlier.relative + relative, priors=earlier.priors + priors)
     problem.inertial = _inertial(earlier, state, turn, settings, own_rig)
     result = optimize(replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas)), how)
 

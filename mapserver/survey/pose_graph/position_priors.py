@@ -1,100 +1,163 @@
-"""Position priors as edges of the loops' gate: relative poses of keyframes by docks, tags and zones. Pure.
+"""Position priors of a survey (docks, tags, zones): its frame `map`, edges of its pose graph, terms of its adjustment. Pure.
 
-In a survey among similar aisles some devices give its position to a metre from time to time. Its pose graph drifts by more than that;
-an aisle is 4.5 m wide. The gate therefore uses each prior relative to the first one with a heading. The map does not: its shape is
-measured by the sensors only.
+They hold what pictures and the IMU leave weak, such as the yaw of a block of aisles, each with its own covariance. A prior that contradicts
+the survey beyond both covariances has no influence and is reported: before loops are searched by the chain of odometry, after the
+adjustment by the prior's own covariance.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.samples import PositionPrior
+from mapserver.survey.bundle.odometry_factors import carried, edge_covariance
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
-from mapserver.survey.state import OdometryPass
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.state import OdometryPass, PriorTerm
 
 _MAX_GAP_NS = 500_000_000  # between a prior and the frame used for it
 _HEADING_KNOWN_RAD = 0.2
 _UNKNOWN_VARIANCE = np.array([1.0] * 3 + [1e4] * 3)  # rad^2, m^2
-# Errors of a prior by the floor's unevenness and a robot's tilt (roll, pitch, yaw in rad; x, y, z in m), and by its transfer to a keyframe.
-_BETWEEN = np.diag(np.square([0.05, 0.05, 0.0, 0.05, 0.05, 0.25]))
+# Errors of a prior by the floor's unevenness and a robot's tilt: roll, pitch, yaw in rad; x, y, z in m.
+_UNEVEN = np.diag(np.square([0.05, 0.05, 0.0, 0.01, 0.01, 0.25]))
+# Of the frame `map` about the first keyframe: gravity knows roll and pitch, priors yaw and position.
+_LEVEL = np.diag(np.square([1e-3, 1e-3, 0.5, 10.0, 10.0, 10.0]))
 
 
-def learn_priors(
-    marginals: GraphMarginals, priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass
-) -> int:
-    """Add position priors to a graph of the odometry's keyframes; return how many contradict it and were left out.
+def placed_by_priors(
+    survey_from_body: Array,
+    marginals: GraphMarginals,
+    priors: Sequence[PositionPrior],
+    base_from_body: Array,
+    odometry: OdometryPass,
+) -> tuple[Array, list[PriorTerm]]:
+    """Return keyframes (K, 4, 4) in `map`, and the terms of the priors, the reference first; no terms without a usable prior.
 
-    Without a prior with a heading nothing is added: positions alone do not give the survey's heading.
+    The reference is the prior with a heading with which most others agree within the covariances of `marginals`; among equals the first.
+    Positions alone suffice if there are two. A prior without heading takes that of the survey.
     """
-    usable = _usable(priors, odometry)
-    first = next((n for n, (prior, _) in enumerate(usable) if prior.cov_rot_trans[2, 2] <= _HEADING_KNOWN_RAD**2), None)
-    if first is None:
-        return 0
-    contradicting = 0
-    reference, frame = usable[first]
-    keyframe = _keyframe_at(frame, odometry)
-    map_from_i = reference.map_from_base @ base_from_body @ se3_inverse(_led(keyframe, frame, odometry))
-    for n, (prior, at) in enumerate(usable):
-        other = _keyframe_at(at, odometry)
-        if n == first or other == keyframe:
-            continue
-        led = _led(other, at, odometry)
-        edge = _edge(marginals, keyframe, map_from_i, reference, other, prior, led, base_from_body)
-        if marginals.innovation_squared(edge) <= CHI2_6_0999:
-            marginals.add(edge)
-        else:
-            contradicting += 1
-    return contradicting
+    terms = _terms(priors, base_from_body, odometry, survey_from_body)
+    headed = [n for n, term in enumerate(terms) if _has_heading(term)]
+    order = list(range(len(terms)))
+    if headed:
+        agreeing = [sum(_innovation(marginals, terms[n], terms[m]) <= CHI2_6_0999 for m in headed) for n in headed]
+        order.insert(0, order.pop(headed[int(np.argmax(agreeing))]))
+        reference = terms[order[0]]
+        map_from_survey = level(
+            reference.map_from_body @ se3_inverse(survey_from_body[reference.k]), reference.map_from_body
+        )
+    elif len(terms) > 1:
+        map_from_survey = _by_positions(terms, survey_from_body)
+    else:
+        return survey_from_body, []
+    map_from_body = map_from_survey @ survey_from_body
+    terms = _terms(priors, base_from_body, odometry, map_from_body)
+    return map_from_body, [terms[n] for n in order]
 
 
-def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[tuple[PositionPrior, int]]:
-    """Return priors of devices with known position in the plane, each with the frame nearest in time."""
+def learn_priors(marginals: GraphMarginals, priors: Sequence[PriorTerm]) -> list[PriorTerm]:
+    """Add priors to a graph of a survey's keyframes; those that contradict it are not added, and no longer believed.
+
+    Without a heading nothing is added: positions alone do not give the survey's heading.
+    """
+    if not priors or not _has_heading(priors[0]):
+        return list(priors)
+    reference, judged = priors[0], [priors[0]]
+    for term in priors[1:]:
+        is_believed = term.k == reference.k or _innovation(marginals, reference, term) <= CHI2_6_0999
+        if is_believed and term.k != reference.k:
+            marginals.add(_edge(reference, term))
+        judged.append(replace(term, is_believed=is_believed))
+    return judged
+
+
+def prior_edges(map_from_body: Array, priors: Sequence[PriorTerm]) -> tuple[Array, list[PoseEdge]]:
+    """Return keyframes (K, 4, 4) with the frame `map` as a node behind them, and the edges from there: its level, then the priors."""
+    count = len(map_from_body)
+    edges = [PoseEdge(count, 0, map_from_body[0], carried(_LEVEL, -map_from_body[0, :3, 3]), is_loop=False)]
+    for term in priors:
+        covariance = carried(np.linalg.inv(term.information), -term.map_from_body[:3, 3])
+        edges.append(PoseEdge(count, term.k, term.map_from_body, covariance, is_loop=True))
+    return np.concatenate([map_from_body, np.eye(4)[None]]), edges
+
+
+def level(map_from_survey: Array, there: Array) -> Array:
+    """Return map_from_survey (4, 4) without its tilt, which gravity knows better; the place `there` (4, 4) in `map` stays."""
+    turn = so3_exp(np.array([0.0, 0.0, float(np.arctan2(map_from_survey[1, 0], map_from_survey[0, 0]))]))
+    stays_m = map_from_survey[:3, :3].T @ (there[:3, 3] - map_from_survey[:3, 3])
+    return se3(turn, there[:3, 3] - turn @ stays_m)
+
+
+def judged_priors(priors: Sequence[PriorTerm], map_from_body: Array) -> tuple[list[PriorTerm], bool]:
+    """Return priors of keyframes at map_from_body (K, 4, 4), and True if none changed.
+
+    Beyond the 0.999 of their covariance they are no longer believed.
+    """
+    judged = []
+    for term in priors:
+        off = map_from_body[term.k] @ se3_inverse(term.map_from_body)
+        apart = np.concatenate([so3_log(off[:3, :3]), map_from_body[term.k, :3, 3] - term.map_from_body[:3, 3]])
+        is_near = float(apart @ term.information @ apart) <= CHI2_6_0999
+        judged.append(replace(term, is_believed=term.is_believed and is_near))
+    return judged, all(a.is_believed == b.is_believed for a, b in zip(judged, priors, strict=True))
+
+
+def _terms(
+    priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass, map_from_body: Array
+) -> list[PriorTerm]:
+    """Return terms of devices with known position in the plane, each at the keyframe nearest in time; map_from_body (K, 4, 4)."""
     stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
+    frames = np.array([keyframe.frame_index for keyframe in odometry.keyframes])
     found = []
     for prior in priors:
         frame = int(np.argmin(np.abs(stamps_ns - prior.stamp_ns)))
         is_near = abs(int(stamps_ns[frame]) - prior.stamp_ns) <= _MAX_GAP_NS
-        if is_near and not prior.is_revisable and np.isfinite(np.diag(prior.cov_rot_trans)[3:5]).all():
-            found.append((prior, frame))
+        if prior.is_revisable or not is_near or not np.isfinite(np.diag(prior.cov_rot_trans)[3:5]).all():
+            continue
+        k = int(np.argmin(np.abs(frames - frame)))
+        # By odometry from the frame to its keyframe: both are standing at a dock, and near each other elsewhere.
+        body_from_k = se3_inverse(odometry.odom_from_body[frame]) @ odometry.odom_from_body[frames[k]]
+        base_from_k, map_from_base = base_from_body @ body_from_k, prior.map_from_base
+        if not np.sqrt(prior.cov_rot_trans[2, 2]) <= _HEADING_KNOWN_RAD:
+            map_from_base = se3((map_from_body[k] @ se3_inverse(base_from_k))[:3, :3], map_from_base[:3, 3])
+        map_from_k = map_from_base @ base_from_k
+        covariance = carried(_finite(prior) + _UNEVEN, map_from_k[:3, 3] - map_from_base[:3, 3])
+        if frames[k] != frame:
+            first, last = sorted((frame, int(frames[k])))
+            turned = np.kron(np.eye(2), map_from_k[:3, :3])
+            covariance = covariance + turned @ edge_covariance(odometry, first, last) @ turned.T
+        found.append(PriorTerm(k, map_from_k, np.linalg.inv(covariance)))
     return found
 
 
-def _keyframe_at(frame: int, odometry: OdometryPass) -> int:
-    """Return the keyframe nearest to a frame."""
-    return int(np.argmin([abs(k.frame_index - frame) for k in odometry.keyframes]))
+def _has_heading(term: PriorTerm) -> bool:
+    return float(np.linalg.inv(term.information)[2, 2]) <= _HEADING_KNOWN_RAD**2
 
 
-def _led(keyframe: int, frame: int, odometry: OdometryPass) -> Array:
-    """Return keyframe_from_frame (4, 4) of the body, by odometry."""
-    first = odometry.odom_from_body[odometry.keyframes[keyframe].frame_index]
-    return np.asarray(se3_inverse(first) @ odometry.odom_from_body[frame])
+def _innovation(marginals: GraphMarginals, reference: PriorTerm, term: PriorTerm) -> float:
+    """Return the squared distance in sigmas, 6 degrees of freedom, between two priors and the graph."""
+    return 0.0 if reference.k == term.k else marginals.innovation_squared(_edge(reference, term))
 
 
-def _edge(
-    marginals: GraphMarginals,
-    i: int,
-    map_from_i: Array,
-    reference: PositionPrior,
-    j: int,
-    prior: PositionPrior,
-    led: Array,
-    base_from_body: Array,
-) -> PoseEdge:
-    """Return the pose of keyframe j relative to i by their priors. Its heading is the graph's own and unconstrained by the edge."""
-    placed = marginals.map_from_body
-    turn_ij = placed[i, :3, :3].T @ placed[j, :3, :3]
-    turn_map_j = map_from_i[:3, :3] @ turn_ij
-    turn_map_base = turn_map_j @ led[:3, :3] @ base_from_body[:3, :3].T
-    body_m = prior.map_from_base[:3, 3] + turn_map_base @ base_from_body[:3, 3] - turn_map_j @ led[:3, 3]
-    i_from_j = se3(turn_ij, map_from_i[:3, :3].T @ (body_m - map_from_i[:3, 3]))
-    turned = np.kron(np.eye(2), map_from_i[:3, :3].T)
-    free = adjoint(i_from_j)[:, :3]  # any rotation of j about itself
-    where = np.diag([0.0] * 3 + [1.0] * 3)  # of the prior only its position counts
-    covariance = turned @ (_finite(reference) + where @ _finite(prior) @ where + _BETWEEN) @ turned.T + free @ free.T
-    return PoseEdge(i, j, i_from_j, covariance, is_loop=True)
+def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:
+    """Return the pose of a term's keyframe relative to the reference's."""
+    apart_m = term.map_from_body[:3, 3] - reference.map_from_body[:3, 3]
+    i_from_map = np.kron(np.eye(2), reference.map_from_body[:3, :3].T)
+    both = np.linalg.inv(reference.information) + carried(np.linalg.inv(term.information), -apart_m)
+    i_from_j = se3_inverse(reference.map_from_body) @ term.map_from_body
+    return PoseEdge(reference.k, term.k, i_from_j, i_from_map @ both @ i_from_map.T, is_loop=True)
+
+
+def _by_positions(terms: Sequence[PriorTerm], survey_from_body: Array) -> Array:
+    """Return the rotation about z and the translation (4, 4) that bring positions nearest to each other (Horn 1987, in the plane)."""
+    there = np.array([term.map_from_body[:3, 3] for term in terms])
+    here = np.array([survey_from_body[term.k, :3, 3] for term in terms])
+    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
+    turn = so3_exp(np.array([0.0, 0.0, float(yaw)]))
+    return se3(turn, there.mean(axis=0) - turn @ here.mean(axis=0))
 
 
 def _finite(prior: PositionPrior) -> Array:

@@ -9,9 +9,9 @@ import pytest
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import optimize
-from mapserver.survey.bundle.problem import BundleProblem, BundleResult, PriorTerm
+from mapserver.survey.bundle.problem import BundleProblem, BundleResult
 from mapserver.survey.settings import BundleSettings
-from mapserver.survey.state import RelativeTerm
+from mapserver.survey.state import PriorTerm, RelativeTerm
 from support.worlds.bundle_gtsam import gtsam_graph
 from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, disturbed, make_scene
 

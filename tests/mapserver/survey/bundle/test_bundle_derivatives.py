@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import solver_of
-from mapserver.survey.bundle.problem import BundleProblem, MotionPrior, PriorTerm
+from mapserver.survey.bundle.problem import BundleProblem, MotionPrior
 from mapserver.survey.settings import BundleSettings
-from mapserver.survey.state import RelativeTerm
+from mapserver.survey.state import PriorTerm, RelativeTerm
 from support.worlds.bundle_scene import disturbed, make_scene, plain_residuals
 
 NO_ROBUSTNESS = BundleSettings(huber_sigmas=1e9)

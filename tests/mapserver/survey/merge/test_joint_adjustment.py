@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, bundle_rounds
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
+from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
 
 CAMERA = StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 0.0]))
@@ -170,3 +170,62 @@ def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: floa
     joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     assert joint.measured.problem.camera.baseline_m == max(map_m, survey_m)
     assert np.linalg.norm((joint.map_from_body - later.map_from_body)[:, :3, 3], axis=1).max() < 0.1
+
+
+def docked(made: Drive, keyframes: list[int], moved_m: float = 0.0) -> list[PriorTerm]:
+    """Docks of 2 cm and half a degree beside keyframes; the last one is said to be so far aside."""
+    information = np.diag([1 / 0.05**2] * 2 + [1 / np.radians(0.5) ** 2] + [1 / 0.02**2] * 2 + [1 / 0.25**2])
+    places = [made.map_from_body[k].copy() for k in keyframes]
+    places[-1][1, 3] += moved_m
+    return [PriorTerm(k, place, information) for k, place in zip(keyframes, places, strict=True)]
+
+
+def bent(made: Drive, first: int, yaw_rad: float) -> SurveyState:
+    """The drive without what joins its block from keyframe `first` on to the one before, but odometry that turned by yaw_rad too far."""
+    marks, last = made.state.landmarks, made.state.map_from_body[first - 1]
+    turned = last @ se3(so3_exp(np.array([0, 0, yaw_rad])), np.zeros(3)) @ se3_inverse(last)
+    placed = made.state.map_from_body.copy()
+    placed[first:] = turned @ placed[first:]
+    block = marks.obs_keyframe >= first
+    apart = np.where(block, len(marks.points_map), 0) + marks.obs_landmark
+    used, number = np.unique(apart, return_inverse=True)
+    points = np.concatenate([marks.points_map, transform_points(turned, marks.points_map)])[used]
+    order = np.argsort(number, kind="stable")
+    marks = marks.taken(order, points, marks.obs_keyframe[order], number[order])
+    step = RelativeTerm(
+        first - 1, first, se3_inverse(last) @ placed[first], np.diag([1 / 0.1**2] * 3 + [1 / 0.03**2] * 3)
+    )
+    return replace(
+        made.state, map_from_body=placed, landmarks=marks, motion=replace(made.state.motion, relative=[step])
+    )
+
+
+def test_two_docks_hold_a_block_whose_yaw_drifts() -> None:
+    """Where pictures show nothing odometry turned by two degrees too much: 0.6 m at the end of the drive."""
+    rng = np.random.default_rng(3)
+    points, at_edge = shelves(rng)
+    made = drive(points, at_edge, [(-2, 0), (LENGTH_M + 1, 0), (LENGTH_M + 1, AISLES_M), (-2, AISLES_M)], rng)
+    end = len(made.map_from_body) - 1
+    start = bent(made, 40, np.radians(2.0))
+    off_m = {}
+    for name, priors in (("none", []), ("held", docked(made, [0, end]))):
+        state = bundle_rounds(replace(start, priors=priors), SETTINGS, rounds=3, final=True)
+        off_m[name] = np.linalg.norm((state.map_from_body - made.map_from_body)[[0, end], :3, 3], axis=1).max()
+    assert off_m["none"] > 0.5
+    assert off_m["held"] < 0.02
+
+
+def test_a_dock_that_contradicts_the_survey_is_not_obeyed() -> None:
+    rng = np.random.default_rng(4)
+    points, at_edge = shelves(rng)
+    first, later = (drive(points, at_edge, [(-2, 0), (8, 0)], rng) for _ in range(2))
+    known, sightings = beside(first, later, len(points))
+    base: Any = None
+    found = {}
+    for name, priors in (("none", []), ("right", docked(later, [0, 10])), ("wrong", docked(later, [0, 10], 0.3))):
+        state = replace(later.state, priors=priors)
+        joint = adjust_jointly(base, known, state, later.map_from_body, sightings, SETTINGS, finely=True)
+        found[name] = joint.map_from_body
+        believed = [term.k - len(first.map_from_body) for term in joint.measured.problem.priors]
+        assert believed == {"none": [], "right": [0, 10], "wrong": [0]}[name]
+    assert np.abs(found["wrong"] - found["none"])[:, :3, 3].max() < 0.005

@@ -1,0 +1,120 @@
+"""Accepted loops of simulated surveys without pictures against the truth, in units of their covariance and of the gate's.
+
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_loops.py [--first 40100] [--loops 1500] [--out FILE.json]
+
+Surveys of many seeds until there are so many loops. A loop's error has six degrees of freedom: `beyond` counts those outside the ellipsoid
+that holds 0.9973 of a normal error, as three sigmas of one axis do; NEES is the squared error in sigmas by degree of freedom. The gate's
+is that of the pose graph's prediction before the loop, which loops are tested against.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+from scipy.stats import chi2
+
+from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.sensors.samples import SensorSet
+from mapserver.config import survey_settings
+from mapserver.survey.loops.loops import LoopCloser
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.stages import adjust_chain, close_loops
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+
+SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
+BEYOND = float(chi2.ppf(0.9973, 6))
+SITES = ("five-aisles", "survey"), ("small-loop", "survey"), ("busy", "survey"), ("identical-aisles", "survey-both-ways")
+
+
+class Loop(NamedTuple):
+    """An accepted loop: its error and the gate's before it, squared, in sigmas; metres from the truth."""
+
+    squared: float
+    gate_squared: float
+    off_m: float
+
+
+def accepted(survey: SimulatedSurvey) -> list[Loop]:
+    """The loops of a survey that its pose graph keeps."""
+    frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
+    truth, found = survey.map_from_body[frames], dict[tuple[int, int], Loop]()
+    accept = LoopCloser._accept
+
+    def noted(closer: LoopCloser, edge: PoseEdge) -> None:
+        true = se3_inverse(truth[edge.i]) @ truth[edge.j]
+        placed = closer._marginals.map_from_body
+        predicted = se3_inverse(placed[edge.i]) @ placed[edge.j]
+        off, off_gate = (se3_log(true @ se3_inverse(each)) for each in (edge.i_from_j, predicted))
+        gate = closer._marginals.relative_cov(edge.i, edge.j)
+        found[edge.i, edge.j] = Loop(
+            _squared(off, edge.cov_rot_trans), _squared(off_gate, gate), float(np.linalg.norm((true - edge.i_from_j)[:3, 3]))
+        )
+        accept(closer, edge)
+
+    tools = SurveyTools()
+    with drawn_alignment(survey), patch.object(LoopCloser, "_accept", noted):
+        chain = adjust_chain(survey.odometry, survey.inputs, SETTINGS, tools)
+        _, loops = close_loops(chain, survey.inputs, SurveyConfig(SETTINGS, default_vocabulary()), tools)
+    return [found[edge.i, edge.j] for edge in loops.edges]
+
+
+def _squared(off: Array, covariance: Array) -> float:
+    return float(off @ np.linalg.solve(covariance, off))
+
+
+def surveys(first: int) -> Iterator[tuple[str, int, list[Loop]]]:
+    """Each site in turn with a seed of its own."""
+    for n in count():
+        site, robot = SITES[n % len(SITES)]
+        survey = simulated_survey(session_of(site, [robot], seed=first + n), SETTINGS)
+        yield site, first + n, accepted(survey)
+
+
+def summary(loops: list[Loop]) -> dict[str, Any]:
+    """Figures of all loops."""
+    own, gate, off_m = (np.array(column) for column in zip(*loops, strict=True))
+    return {
+        "loops": len(loops),
+        "beyond": int((own > BEYOND).sum()),
+        "gate_beyond": int((gate > BEYOND).sum()),
+        "nees": float(own.mean() / 6),
+        "gate_nees": float(gate.mean() / 6),
+        "largest": float(own.max() / BEYOND),
+        "off_median_m": float(np.median(off_m)),
+        "off_max_m": float(off_m.max()),
+    }
+
+
+def main() -> None:
+    """Print a line for each survey, then the figures; write them as JSON if wanted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first", type=int, default=40100, help="seed of the first survey")
+    parser.add_argument("--loops", type=int, default=1500)
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    every = list[Loop]()
+    for site, seed, loops in surveys(given.first):
+        every += loops
+        own = summary(loops) if loops else {"loops": 0}
+        print(json.dumps({"site": site, "seed": seed, "cpu_s": round(time.process_time(), 1), **own}), flush=True)
+        if len(every) >= given.loops:
+            break
+    figures = summary(every)
+    print(json.dumps(figures))
+    if given.out is not None:
+        given.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Four rendered drives of one hall joined into one map, and two halves of each real recording.
+
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_joined_drives.py [--seed 60817] [--work FOLDER] [--out FILE.json] [NAME...]
+
+Each drive maps three of nine aisles and shares the last with the next drive. The halves of a real recording are its even and its odd pairs.
+Joined as in one night: all sessions are adjusted together. Joined to a published map: the first session is published, the others extend
+it. Errors are those of all frames after rigid alignment; moved: the distance by which the map's earlier keyframes leave their place.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.geometry import Array
+from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.samples import Trajectory
+from fleetsim.commands import record_order
+from fleetsim.motion.routes import Route
+from fleetsim.recorder import Order
+from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.scene.layout import Layout
+from mapserver.config import survey_settings
+from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error
+from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session, chained
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.survey_map import SurveyMap, history_of
+from support.recordings.realdata import DATA
+
+DRIVES, _RATE_HZ, _END_M = 4, 7.5, 2.7
+REAL = "euroc_mh01_start", "euroc_v101_keyframes"
+
+
+def blocks() -> Scenario:
+    """A hall of nine aisles, and a drive for each block of three."""
+    layout = Layout(aisles=2 * DRIVES + 1, bays=6)
+    left, right = _END_M, layout.length_m - _END_M
+    runs = {}
+    for n in range(DRIVES):
+        a, b, c = (layout.aisle_y_m(2 * n + k) for k in range(3))
+        aside = left + 0.6
+        ends = [(left, a), (left, c), (aside, c), (aside, a)]
+        aisles = [(right, a), (right, b), (left, b), (left, c), (right, c)]
+        runs[f"drive-{n}"] = Run("surveyor", (Route((*ends, *aisles)),), rate_hz=_RATE_HZ, is_sharp=True)
+    return Scenario("nine aisles in four drives", layout, runs)
+
+
+def recorded(seed: int, n: int, work: Path) -> Path:
+    """The recording of a drive, rendered unless the work folder has it."""
+    path = work / f"blocks-{seed}-{n}.mcap"
+    if not path.exists():
+        SCENARIOS["blocks"] = blocks
+        record_order(Order("blocks", seed, robot=f"drive-{n}"), path.with_suffix(".part"))
+        path.with_suffix(".part").rename(path)
+    return path
+
+
+def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> Surveyed:
+    """The survey of a recording's frames, without a store."""
+    reading = RecordingOptions(frames)
+    admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
+    with reading.open(path) as (recording, _):
+        settings = survey_settings(None, recording.sensor_set)
+    return survey_recording(
+        path, admitted[path], reading, pinhole, SurveyConfig(settings, default_vocabulary()), SurveyTools()
+    )
+
+
+def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[Surveyed]) -> float:
+    """Of all frames, after one alignment."""
+    truths = [survey.truth for survey in surveys]
+    assert all(truth is not None for truth in truths)
+    together = chained([truth for truth in truths if truth is not None], trajectories)
+    return absolute_trajectory_error(chained(trajectories, trajectories), together).rmse_m
+
+
+def added(base: SurveyMap | None, surveys: Sequence[Surveyed]) -> MergedMap:
+    """The map with these sessions; RuntimeError if one is not joined."""
+    joining = MapMerger(base, survey_settings(None, surveys[0].sensor_set))
+    for each in surveys:
+        joining.add(Session(each.survey, each.map_from_survey))
+    found = joining.finish()
+    for outcome in found.outcomes:
+        if not outcome.joined:
+            raise RuntimeError(f"session {outcome.number}: {outcome.reason}")
+    return found
+
+
+def moved_m(before: SurveyMap, after: SurveyMap) -> Array:
+    """(K,) how far keyframes of a map that are still there were moved."""
+    _, old, new = np.intersect1d(history_of(before).keyframe_ids, history_of(after).keyframe_ids, return_indices=True)
+    centres = (each.map_from_body @ each.body_from_cam for each in (before, after))
+    a, b = (places[rows, :3, 3] for places, rows in zip(centres, (old, new), strict=True))
+    return np.asarray(np.linalg.norm(b - a, axis=1))
+
+
+def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
+    """Errors alone, joined in one night, and joined one by one to a published map."""
+    alone = [ate_m([each.survey.map.trajectory], [each]) for each in surveys]
+    row: dict[str, Any] = {"alone_m": alone, "mean_alone_m": float(np.mean(alone))}
+    print(json.dumps(row), flush=True)
+    night = added(None, surveys)
+    published = added(None, surveys[:1]).map
+    trajectories, shifts = [published.trajectory], []
+    for each in surveys[1:]:
+        found = added(published, [each])
+        shifts.append(moved_m(published, found.map))
+        published, trajectories = found.map, [*trajectories, *found.trajectories]
+    for name, places in (("night", night.trajectories), ("published", trajectories)):
+        each_m = [ate_m([place], [survey]) for place, survey in zip(places, surveys, strict=True)]
+        whole_m, ratio = ate_m(places, surveys), float(np.mean(each_m) / np.mean(alone))
+        row[name] = {"each_m": each_m, "each_to_alone": ratio, "ate_m": whole_m, "to_alone": whole_m / np.mean(alone)}
+    row["published"] |= {
+        "moved_max_m": [float(shift.max()) for shift in shifts],
+        "moved_rms_m": [float(np.sqrt(np.square(shift).mean())) for shift in shifts],
+    }
+    return row
+
+
+def main() -> None:
+    """Print the figures of each part; write them as JSON if wanted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help=f"drives, {', '.join(REAL)}; all of them by default")
+    parser.add_argument("--seed", type=int, default=60817)
+    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "fleetmap-bench")
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    given.work.mkdir(parents=True, exist_ok=True)
+    figures = {}
+    for name in given.names or ("drives", *REAL):
+        surveys = list[Surveyed]()
+        parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
+        for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
+            surveys.append(surveyed(path, frames, surveys[0].survey.state.camera if surveys else None))
+        figures[name] = joined(surveys)
+        print(json.dumps({name: figures[name]}), flush=True)
+    if given.out is not None:
+        given.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
