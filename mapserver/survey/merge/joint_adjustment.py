@@ -12,16 +12,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, continued
+from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
-from mapserver.survey.pose_graph.position_priors import judged_priors
+from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
 from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState
 from mapserver.survey.survey_map import SurveyMap, history_of
@@ -31,12 +31,14 @@ from mapserver.survey.survey_map import SurveyMap, history_of
 class Measured:
     """Constraints of a map, at its optimum: the observations, motion and priors of its keyframes.
 
-    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, -1 if not included.
+    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, -1 if not included. map_from_docks (4, 4): the map keeps
+    the frame of its first survey, whose docks place it only to their own accuracy; None for a map without docks.
     """
 
     problem: BundleProblem
     keyframes: Rows
     landmarks: Rows
+    map_from_docks: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class JointSolution:
     map_from_body (K, 4, 4) of the new keyframes; base_keyframes (B,) of the map that took part, base_from_body (B, 4, 4) their
     poses; base_rows (R,) landmarks of the map that took part, base_points_map (R, 3); own_points_map (N, 3) of the
     survey's own landmarks, NaN if not included; sightings without outliers. measured: the problem at its optimum,
-    the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 if not included.
+    the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 if not included. priors_refused: docks, tags and zones
+    of the survey that contradict it or the map.
     """
 
     map_from_body: Array
@@ -58,6 +61,7 @@ class JointSolution:
     sightings: list[Sighting | None]
     measured: Measured
     own_numbers: Rows
+    priors_refused: int
 
 
 def adjust_jointly(
@@ -72,7 +76,8 @@ def adjust_jointly(
 ) -> JointSolution:
     """Return old and new keyframes and landmarks with the best fit to all observations; map_from_body (K, 4, 4): start of the new ones.
 
-    known: constraints of the map; None for a published one, whose keyframes stay within `anchor_sigma_m`. A survey without sight of the map
+    known: constraints of the map; None for a published one, whose keyframes stay within `anchor_sigma_m`. Docks of the survey take part if
+    the map has some, and a published one is held by its anchors. A survey without sight of the map
     keeps its shape, and its first keyframe its pose. Docks of the survey that contradict the result have no influence.
     The first adjustment finds outliers. finely: a second one uses the redescending cost with measured noise, as in a survey's own
     last one: with the stated noise, depth edges would bias the scale of the survey.
@@ -80,9 +85,10 @@ def adjust_jointly(
     final = settings.final_bundle
     for how in (msgspec.structs.replace(final, cutoff_sigmas=np.inf), final)[: 1 + finely]:
         solution = _solved(base, known, state, map_from_body, sightings, settings, how)
-        priors, believed = judged_priors(state.priors, solution.map_from_body)
+        priors, believed = judged_priors(_placed(state.priors, solution.measured), solution.map_from_body)
         if not believed:
-            state = replace(state, priors=priors)
+            judged = zip(state.priors, priors, strict=True)
+            state = replace(state, priors=[replace(own, is_believed=there.is_believed) for own, there in judged])
             solution = _solved(base, known, state, map_from_body, sightings, settings, how)
         map_from_body, sightings = solution.map_from_body, solution.sightings
     return solution
@@ -137,10 +143,15 @@ def _solved(
     )
     if own_rig:  # a survey with another mount contributes its pictures only
         relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
-        priors = [replace(p, k=p.k + old) for p in state.priors if p.is_believed]
+        priors = [replace(p, k=p.k + old) for p in _placed(state.priors, known) if p.is_believed]
         problem = replace(problem, relative=earlier.relative + relative, priors=earlier.priors + priors)
     problem.inertial = _inertial(earlier, state, turn, settings, own_rig)
     result = optimize(replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas)), how)
+    map_from_docks = known.map_from_docks
+    if map_from_docks is not None:
+        stay = level_fit(earlier.map_from_body[:, :3, 3], result.map_from_body[:old, :3, 3])
+        result, map_from_docks = _in_frame(result, stay), stay @ map_from_docks
+        problem.priors = [in_frame(prior, stay) for prior in problem.priors]
 
     fits = result.squared_sigmas < settings.noise.cut_sigmas**2
     fitting, start = list[Sighting | None](), len(earlier.obs_keyframe)
@@ -160,8 +171,9 @@ def _solved(
         base_points_map=result.points_map[known.landmarks[base_rows]],
         own_points_map=own_points_map,
         sightings=fitting,
-        measured=Measured(continued(problem, result), known.keyframes, known.landmarks),
+        measured=Measured(continued(problem, result), known.keyframes, known.landmarks, map_from_docks),
         own_numbers=own_numbers,
+        priors_refused=sum(not prior.is_believed for prior in state.priors),
     )
 
 
@@ -189,6 +201,23 @@ def _published(
         priors=[PriorTerm(n, base.map_from_body[k], np.diag(1.0 / sigma**2)) for n, k in enumerate(held)],
     )
     return Measured(problem, keyframes, landmarks)
+
+
+def _placed(priors: Sequence[PriorTerm], known: Measured) -> list[PriorTerm]:
+    """Return the priors of a survey in the frame of the map, none if that has no docks."""
+    there = known.map_from_docks
+    return [] if there is None else [in_frame(prior, there) for prior in priors]
+
+
+def _in_frame(result: BundleResult, new_from_map: Array) -> BundleResult:
+    """Return the result in another upright frame; new_from_map (4, 4)."""
+    velocities = result.velocities_map_mps
+    return replace(
+        result,
+        map_from_body=new_from_map @ result.map_from_body,
+        points_map=transform_points(new_from_map, result.points_map),
+        velocities_map_mps=None if velocities is None else velocities @ new_from_map[:3, :3].T,
+    )
 
 
 def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
@@ -230,7 +259,8 @@ def _inertial(
 def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: SurveySettings) -> Measured:
     """Return the constraints of a map's first survey, its state in the map's frame; landmarks (N,): rows of the state in the map."""
     keyframes = np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
-    return Measured(bundle_problem(state, settings, None), keyframes, landmarks)
+    problem = bundle_problem(state, settings, None)
+    return Measured(problem, keyframes, landmarks, np.eye(4) if problem.priors else None)
 
 
 def grown(joint: JointSolution, change: Change, base: BaseMap, after: SurveyMap) -> Measured:
@@ -250,4 +280,4 @@ def grown(joint: JointSolution, change: Change, base: BaseMap, after: SurveyMap)
         obs_pixels=problem.obs_pixels[keep],
         obs_sigma_px=problem.obs_sigma_px[keep],
     )
-    return Measured(problem, keyframes, landmarks)
+    return Measured(problem, keyframes, landmarks, before.map_from_docks)

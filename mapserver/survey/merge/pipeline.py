@@ -29,13 +29,14 @@ from mapserver.survey.survey_map import SurveyMap
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Figures of a join: fixes tried and accepted, keyframes located in the map, and the map's landmarks."""
+    """Figures of a join: fixes tried and accepted, keyframes located in the map, refused priors, and the map's landmarks."""
 
     fixes: int
     believed_fixes: int
     keyframes_in_map: int
     keyframes_added: int
     keyframes_moved: int
+    priors_refused: int
     landmarks_expected: int
     landmarks_seen: int
     landmarks_kept: int
@@ -124,6 +125,7 @@ def extend(
         keyframes_in_map=sum(s is not None for s in joint.sightings),
         keyframes_added=len(np.unique(change.added.obs_keyframe)),
         keyframes_moved=moved_keyframes,
+        priors_refused=joint.priors_refused,
         landmarks_expected=int((found.expected > 0).sum()),
         landmarks_seen=int((found.seen > 0).sum()),
         landmarks_kept=len(result.landmark_ids) - fresh - moved_landmarks,

@@ -49,7 +49,10 @@ def placed_by_priors(
             reference.map_from_body @ se3_inverse(survey_from_body[reference.k]), reference.map_from_body
         )
     elif len(terms) > 1:
-        map_from_survey = _by_positions(terms, survey_from_body)
+        there, here = np.array([(t.map_from_body[:3, 3], survey_from_body[t.k, :3, 3]) for t in terms]).transpose(
+            1, 0, 2
+        )
+        map_from_survey = level_fit(there, here)
     else:
         return survey_from_body, []
     map_from_body = map_from_survey @ survey_from_body
@@ -78,7 +81,7 @@ def prior_edges(map_from_body: Array, priors: Sequence[PriorTerm]) -> tuple[Arra
     count = len(map_from_body)
     edges = [PoseEdge(count, 0, map_from_body[0], carried(_LEVEL, -map_from_body[0, :3, 3]), is_loop=False)]
     for term in priors:
-        covariance = carried(np.linalg.inv(term.information), -term.map_from_body[:3, 3])
+        covariance = carried(_covariance(term), -term.map_from_body[:3, 3])
         edges.append(PoseEdge(count, term.k, term.map_from_body, covariance, is_loop=True))
     return np.concatenate([map_from_body, np.eye(4)[None]]), edges
 
@@ -88,6 +91,23 @@ def level(map_from_survey: Array, there: Array) -> Array:
     turn = so3_exp(np.array([0.0, 0.0, float(np.arctan2(map_from_survey[1, 0], map_from_survey[0, 0]))]))
     stays_m = map_from_survey[:3, :3].T @ (there[:3, 3] - map_from_survey[:3, 3])
     return se3(turn, there[:3, 3] - turn @ stays_m)
+
+
+def level_fit(there: Array, here: Array) -> Array:
+    """Return the rotation about z and the translation (4, 4) that bring positions `here` (N, 3) nearest to those `there`.
+
+    Source: Horn 1987, in the plane.
+    """
+    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
+    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
+    turn = so3_exp(np.array([0.0, 0.0, float(yaw)]))
+    return se3(turn, there.mean(axis=0) - turn @ here.mean(axis=0))
+
+
+def in_frame(term: PriorTerm, new_from_map: Array) -> PriorTerm:
+    """Return a prior in another frame; new_from_map (4, 4)."""
+    turn = np.kron(np.eye(2), new_from_map[:3, :3])
+    return replace(term, map_from_body=new_from_map @ term.map_from_body, information=turn @ term.information @ turn.T)
 
 
 def judged_priors(priors: Sequence[PriorTerm], map_from_body: Array) -> tuple[list[PriorTerm], bool]:
@@ -128,12 +148,16 @@ def _terms(
             first, last = sorted((frame, int(frames[k])))
             turned = np.kron(np.eye(2), map_from_k[:3, :3])
             covariance = covariance + turned @ edge_covariance(odometry, first, last) @ turned.T
-        found.append(PriorTerm(k, map_from_k, np.linalg.inv(covariance)))
+        found.append(PriorTerm(k, map_from_k, np.asarray(np.linalg.inv(covariance), np.float64)))
     return found
 
 
 def _has_heading(term: PriorTerm) -> bool:
-    return float(np.linalg.inv(term.information)[2, 2]) <= _HEADING_KNOWN_RAD**2
+    return float(_covariance(term)[2, 2]) <= _HEADING_KNOWN_RAD**2
+
+
+def _covariance(term: PriorTerm) -> Array:
+    return np.asarray(np.linalg.inv(term.information), np.float64)
 
 
 def _innovation(marginals: GraphMarginals, reference: PriorTerm, term: PriorTerm) -> float:
@@ -145,19 +169,9 @@ def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:
     """Return the pose of a term's keyframe relative to the reference's."""
     apart_m = term.map_from_body[:3, 3] - reference.map_from_body[:3, 3]
     i_from_map = np.kron(np.eye(2), reference.map_from_body[:3, :3].T)
-    both = np.linalg.inv(reference.information) + carried(np.linalg.inv(term.information), -apart_m)
+    both = _covariance(reference) + carried(_covariance(term), -apart_m)
     i_from_j = se3_inverse(reference.map_from_body) @ term.map_from_body
     return PoseEdge(reference.k, term.k, i_from_j, i_from_map @ both @ i_from_map.T, is_loop=True)
-
-
-def _by_positions(terms: Sequence[PriorTerm], survey_from_body: Array) -> Array:
-    """Return the rotation about z and the translation (4, 4) that bring positions nearest to each other (Horn 1987, in the plane)."""
-    there = np.array([term.map_from_body[:3, 3] for term in terms])
-    here = np.array([survey_from_body[term.k, :3, 3] for term in terms])
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
-    turn = so3_exp(np.array([0.0, 0.0, float(yaw)]))
-    return se3(turn, there.mean(axis=0) - turn @ here.mean(axis=0))
 
 
 def _finite(prior: PositionPrior) -> Array:

@@ -34,7 +34,12 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 BEYOND = float(chi2.ppf(0.9973, 6))
-SITES = ("five-aisles", "survey"), ("small-loop", "survey"), ("busy", "survey"), ("identical-aisles", "survey-both-ways")
+SITES = (
+    ("five-aisles", "survey"),
+    ("small-loop", "survey"),
+    ("busy", "survey"),
+    ("identical-aisles", "survey-both-ways"),
+)
 
 
 class Loop(NamedTuple):
@@ -58,7 +63,9 @@ def accepted(survey: SimulatedSurvey) -> list[Loop]:
         off, off_gate = (se3_log(true @ se3_inverse(each)) for each in (edge.i_from_j, predicted))
         gate = closer._marginals.relative_cov(edge.i, edge.j)
         found[edge.i, edge.j] = Loop(
-            _squared(off, edge.cov_rot_trans), _squared(off_gate, gate), float(np.linalg.norm((true - edge.i_from_j)[:3, 3]))
+            _squared(off, edge.cov_rot_trans),
+            _squared(off_gate, gate),
+            float(np.linalg.norm((true - edge.i_from_j)[:3, 3])),
         )
         accept(closer, edge)
 

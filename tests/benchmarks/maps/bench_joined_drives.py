@@ -13,9 +13,11 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 import argparse
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
@@ -32,9 +34,12 @@ from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings
 from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
+from mapserver.survey.merge import pipeline
+from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.joint_adjustment import JointSolution
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session, chained
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
-from mapserver.survey.survey_map import SurveyMap, history_of
+from mapserver.survey.survey_map import SurveyMap
 from support.recordings.realdata import DATA
 
 DRIVES, _RATE_HZ, _END_M = 4, 7.5, 2.7
@@ -96,12 +101,21 @@ def added(base: SurveyMap | None, surveys: Sequence[Surveyed]) -> MergedMap:
     return found
 
 
-def moved_m(before: SurveyMap, after: SurveyMap) -> Array:
-    """(K,) how far keyframes of a map that are still there were moved."""
-    _, old, new = np.intersect1d(history_of(before).keyframe_ids, history_of(after).keyframe_ids, return_indices=True)
-    centres = (each.map_from_body @ each.body_from_cam for each in (before, after))
-    a, b = (places[rows, :3, 3] for places, rows in zip(centres, (old, new), strict=True))
-    return np.asarray(np.linalg.norm(b - a, axis=1))
+@contextmanager
+def noted_moves() -> Iterator[list[Array]]:
+    """The distances (B,) by which each adjustment moves the map's keyframes; a published map itself keeps them where that is in doubt."""
+    moves = list[Array]()
+    adjust = pipeline.adjust_jointly
+
+    def noting(base: BaseMap, *rest: Any, finely: bool) -> JointSolution:
+        solution = adjust(base, *rest, finely=finely)
+        if finely:
+            before = base.map_from_body[solution.base_keyframes]
+            moves.append(np.linalg.norm((solution.base_from_body - before)[:, :3, 3], axis=1))
+        return solution
+
+    with patch.object(pipeline, "adjust_jointly", noting):
+        yield moves
 
 
 def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
@@ -111,18 +125,20 @@ def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
     print(json.dumps(row), flush=True)
     night = added(None, surveys)
     published = added(None, surveys[:1]).map
-    trajectories, shifts = [published.trajectory], []
-    for each in surveys[1:]:
-        found = added(published, [each])
-        shifts.append(moved_m(published, found.map))
-        published, trajectories = found.map, [*trajectories, *found.trajectories]
+    trajectories, changed = [published.trajectory], 0
+    with noted_moves() as moves:
+        for each in surveys[1:]:
+            found = added(published, [each])
+            published, trajectories = found.map, [*trajectories, *found.trajectories]
+            changed += sum(o.counts.keyframes_moved for o in found.outcomes if o.counts is not None)
     for name, places in (("night", night.trajectories), ("published", trajectories)):
         each_m = [ate_m([place], [survey]) for place, survey in zip(places, surveys, strict=True)]
         whole_m, ratio = ate_m(places, surveys), float(np.mean(each_m) / np.mean(alone))
         row[name] = {"each_m": each_m, "each_to_alone": ratio, "ate_m": whole_m, "to_alone": whole_m / np.mean(alone)}
     row["published"] |= {
-        "moved_max_m": [float(shift.max()) for shift in shifts],
-        "moved_rms_m": [float(np.sqrt(np.square(shift).mean())) for shift in shifts],
+        "keyframes_changed": changed,
+        "moved_max_m": [float(move.max()) for move in moves],
+        "moved_rms_m": [float(np.sqrt(np.square(move).mean())) for move in moves],
     }
     return row
 

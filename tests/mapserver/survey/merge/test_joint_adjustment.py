@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, bundle_rounds
+from mapserver.survey.finish.map_transform import transform_state
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
@@ -220,7 +221,7 @@ def test_a_dock_that_contradicts_the_survey_is_not_obeyed() -> None:
     points, at_edge = shelves(rng)
     first, later = (drive(points, at_edge, [(-2, 0), (8, 0)], rng) for _ in range(2))
     known, sightings = beside(first, later, len(points))
-    base: Any = None
+    known, base = replace(known, map_from_docks=np.eye(4)), cast(Any, None)
     found = {}
     for name, priors in (("none", []), ("right", docked(later, [0, 10])), ("wrong", docked(later, [0, 10], 0.3))):
         state = replace(later.state, priors=priors)
@@ -228,4 +229,23 @@ def test_a_dock_that_contradicts_the_survey_is_not_obeyed() -> None:
         found[name] = joint.map_from_body
         believed = [term.k - len(first.map_from_body) for term in joint.measured.problem.priors]
         assert believed == {"none": [], "right": [0, 10], "wrong": [0]}[name]
+        assert joint.priors_refused == (name == "wrong")
     assert np.abs(found["wrong"] - found["none"])[:, :3, 3].max() < 0.005
+
+
+def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
+    """The map lies as its first dock says, a degree off; the later drive's docks fit after one turn of all, and so are believed."""
+    rng = np.random.default_rng(5)
+    points, at_edge = shelves(rng)
+    first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 2, 0)], rng) for _ in range(2))
+    off = se3(so3_exp(np.array([0, 0, np.radians(1.0)])), np.zeros(3))
+    state = transform_state(replace(first.state, priors=docked(first, [0])), off)
+    known, sightings = beside(replace(first, state=state), later, len(points))
+    known, base = replace(known, map_from_docks=np.eye(4)), cast(Any, None)
+    start = off @ later.state.map_from_body
+    there = replace(later.state, priors=docked(later, [0, len(start) - 1]))
+    joint = adjust_jointly(base, known, there, start, sightings, SETTINGS, finely=True)
+    assert joint.priors_refused == 0
+    assert np.linalg.norm((joint.base_from_body - state.map_from_body)[:, :3, 3], axis=1).max() < 0.006
+    aside_m = (se3_inverse(off) @ joint.map_from_body - later.map_from_body)[:, 1, 3]  # along the way depth edges count
+    assert np.abs(aside_m).max() < 0.01
