@@ -9,13 +9,15 @@ import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import ImuSamples
+from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, bundle_rounds
 from mapserver.survey.finish.map_transform import transform_state
+from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
+from mapserver.survey.survey_map import SurveyMap
 
 CAMERA = StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 0.0]))
@@ -249,3 +251,45 @@ def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
     assert np.linalg.norm((joint.base_from_body - state.map_from_body)[:, :3, 3], axis=1).max() < 0.006
     aside_m = (se3_inverse(off) @ joint.map_from_body - later.map_from_body)[:, 1, 3]  # along the way depth edges count
     assert np.abs(aside_m).max() < 0.01
+
+
+def published(made: Drive) -> BaseMap:
+    """The drive's survey as a site's map."""
+    state, marks = made.state, made.state.landmarks
+    count = len(marks.points_map)
+    return BaseMap(
+        SurveyMap(
+            camera=CAMERA,
+            body_from_cam=BODY_FROM_CAM,
+            keyframe_stamps_ns=state.stamps_ns,
+            map_from_body=state.map_from_body,
+            landmark_ids=np.arange(count, dtype=np.uint32),
+            points_map=marks.points_map,
+            descriptors=np.zeros((count, 32), np.uint8),
+            point_sigma_m=np.full(count, 0.01),
+            obs_keyframe=marks.obs_keyframe,
+            obs_landmark=marks.obs_landmark,
+            obs_pixels=marks.obs_pixels,
+            obs_octave=np.zeros(len(marks.obs_keyframe), np.int8),
+            obs_sigma_px=marks.obs_sigma_px,
+            trajectory=Trajectory(state.stamps_ns, state.map_from_body),
+            trajectory_estimated=np.ones(len(state.stamps_ns), bool),
+            patches=np.zeros((count, 21, 21), np.uint8),
+        ),
+        CAMERA,
+        BODY_FROM_CAM,
+    )
+
+
+def test_a_published_map_is_held_by_all_that_it_knows_of_itself() -> None:
+    """Of what each keyframe of the map sees the later drive sees again a twelfth: alone, these few landmarks move it with their noise."""
+    rng = np.random.default_rng(6)
+    points, at_edge = shelves(rng)
+    first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 4, 0)], rng) for _ in range(2))
+    _, sightings = beside(first, later, len(points))
+    few = rng.random(len(points)) < 1 / 12
+    found = [None if s is None else s.only(few[s.rows]) for s in sightings]
+    base = published(first)
+    joint = adjust_jointly(base, None, later.state, later.map_from_body, found, SETTINGS, finely=True)
+    moved_m = np.linalg.norm((joint.base_from_body - base.map_from_body[joint.base_keyframes])[:, :3, 3], axis=1)
+    assert moved_m.max() < 0.005
