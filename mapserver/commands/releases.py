@@ -223,6 +223,8 @@ def publish(
         typer.echo(f"not judged, evidence missing: {', '.join(verdict.report['not_judged'])}")
     if one_way := one_way_words(directions):
         typer.echo(areas.name_tiles(one_way, size_m))
+    for warning in verdict.report.get("warnings", ()):
+        typer.echo(warning)
     if alike := lookalike_words(None if evidence is None else evidence.starts):
         typer.echo(alike)
 

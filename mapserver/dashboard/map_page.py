@@ -233,6 +233,7 @@ def _gate(maps: MapData, info: VersionInfo, verdict: VerdictRow | None) -> dict[
         "words": f"The gate {answers[not verdict.accepted]} it.",
         "failed": [_begun(reason) for reason in verdict.reasons],
         "passed": passed,
+        "warned": [_begun(warning) for warning in report.get("warnings", ())],
         "not_judged": unknown,
     }
 

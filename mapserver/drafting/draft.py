@@ -53,6 +53,7 @@ from mapserver.drafting.survey_recordings import (
     survey_recording,
 )
 from mapserver.drafting.trajectory import OtherTrajectory
+from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
 from mapserver.grid.survey_grid import GridGrower, GridSession, Grower, grow
@@ -69,11 +70,10 @@ from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.tiles.landmark_budget import choose_landmarks
-from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.tiles.tiling import TILE_SIZE_M
 from mapserver.trust.signing import check_base
 
-_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "starts")
+_NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "starts", "views")
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,11 +285,18 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     """Cut the map into tiles, measure them, store the draft and write the requested files."""
     site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
     wanted = None if parent is None else parent.wanted_ids(survey_map)
-    for_robots = choose_landmarks(survey_map, run.settings.budget, TILE_SIZE_M, wanted)
-    tiles = tiles_from_survey(survey_map, chosen=for_robots)
+    judged = [
+        JudgedSession(trajectory, s.probed, s.survey)
+        for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
+    ]
+    run.times.begin("choosing")
+    chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary())
+    tiles, views = chooser.choose(asked_views(judged))
     run.times.begin("grid and surfels")
-    places = [trajectory.frame_from_body for trajectory in map_trajectories(built.joined)]
-    sessions = [GridSession(s.entry.name, s.survey, place) for s, place in zip(built.taken, places, strict=True)]
+    sessions = [
+        GridSession(s.entry.name, s.survey, session.trajectory.frame_from_body)
+        for s, session in zip(built.taken, judged, strict=True)
+    ]
     grid_grower = GridGrower({} if parent is None else parent.grid, run.settings.stereo)
     growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
     if run.settings.surfel_map:
@@ -303,7 +310,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         surfels = encode_surfels(surfel_grower.surfels)
         surfels_said = surfel_report(surfels, len(surfel_grower.surfels), without["surfels"])
     run.times.begin("examining")
-    evidence = _evidence(run, built, tiles, parent)
+    evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
     archive = encode_archive(survey_map)
     report = make_report(
@@ -325,7 +332,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         libraries=library_versions(),
         # A robot downloads the manifest: its part about the build is short.
         report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
-        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None))},
+        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None, views=None))},
     )
     job = run.request.options.job
     content = DraftContent(
@@ -364,14 +371,14 @@ def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, 
     return {name: share for name, share in found.items() if share > 0}
 
 
-def _evidence(run: _Run, built: Built, tiles: list[Tile], before: Before | None) -> Evidence:
+def _evidence(
+    run: _Run, built: Built, sessions: list[JudgedSession], tiles: list[Tile], before: Before | None
+) -> Evidence:
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
     if before is not None:
         reading = options.frames, options.reading.opening, options.use
         replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
-    trajectories = map_trajectories(built.joined)
-    sessions = [JudgedSession(t, s.held_out, s.survey) for t, s in zip(trajectories, built.taken, strict=True)]
     drafted = DraftMap(tiles, default_vocabulary(), camera)
     with open_executor(options.threads, None) as executor:
         evidence = examine_draft(drafted, before, sessions, replayed, executor)

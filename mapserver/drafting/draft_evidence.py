@@ -1,7 +1,7 @@
 """Evidence about a draft: frames of recordings, relocalized in the tiles in their final form."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,13 +35,17 @@ PROBES = 40  # of each kind: one wrong or missing frame counts 2.5 %
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
-    """A frame of a recording not used by the build: its number among the selected ones, its camera and features."""
+class ProbedFrame:
+    """A frame of a surveyed recording: its number among the selected ones, its camera and features.
+
+    is_held_out: True if the build did not use it; else an end of the drive that is a keyframe.
+    """
 
     number: int
     camera: StereoCamera
     body_from_cam: Array
     features: FrameFeatures
+    is_held_out: bool = True
 
     def probe(self, map_from_body: Array) -> Probe:
         """Return it as a probe; map_from_body (F, 4, 4) of all selected frames."""
@@ -49,24 +53,34 @@ class HeldOut:
 
 
 class JudgedSession(NamedTuple):
-    """A recording in the map: poses of its frames in `map`, frames that the build left out, and its survey."""
+    """A recording in the map: poses of its frames in `map`, its probed frames, and its survey."""
 
     trajectory: Trajectory
-    held_out: Sequence[HeldOut]
+    probed: Sequence[ProbedFrame]
     survey: Survey
 
+    def held_out(self, recordings: int) -> list[ProbedFrame]:
+        """Return the share of held-out frames of one of so many recordings."""
+        return [frame for frame in self.probed if frame.is_held_out][::recordings]
 
-def held_out_of(
+    def asked(self, recordings: int) -> list[ProbedFrame]:
+        """Return these and both ends."""
+        return [*self.held_out(recordings), *self.probed[:1], *self.probed[-1:]]
+
+
+def probed_frames(
     recording: Recording,
     selected: Sequence[int],
     rectifier: Rectifier,
     survey: Survey,
     orb: OrbSettings,
-) -> list[HeldOut]:
-    """Return frames of a surveyed recording that did not become keyframes, read again. Damaged ones are left out."""
+) -> list[ProbedFrame]:
+    """Return frames of a surveyed recording that did not become keyframes, and both ends, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
     numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
-    return _read(recording, selected, numbers, rectifier, orb)
+    ends = spread(np.flatnonzero(survey.map.trajectory_estimated), 2)
+    found = _read(recording, selected, sorted({*numbers, *ends}), rectifier, orb)
+    return [replace(frame, is_held_out=frame.number not in keyframes) for frame in found]
 
 
 def _read(
@@ -75,7 +89,7 @@ def _read(
     numbers: Sequence[int],
     rectifier: Rectifier,
     orb: OrbSettings,
-) -> list[HeldOut]:
+) -> list[ProbedFrame]:
     found = []
     for number in numbers:
         try:
@@ -83,7 +97,7 @@ def _read(
         except RecordingError:
             continue
         features = probe_features(frame, rectifier.camera, orb)
-        found.append(HeldOut(number, rectifier.camera, rectifier.body_from_cam, features))
+        found.append(ProbedFrame(number, rectifier.camera, rectifier.body_from_cam, features))
     return found
 
 
@@ -181,7 +195,9 @@ def examine_draft(
 ) -> Evidence:
     """Return the findings of probes in the tiles as stored; `sessions` are the map's recordings."""
     held_out = [
-        x.probe(session.trajectory.frame_from_body) for session in sessions for x in session.held_out[:: len(sessions)]
+        frame.probe(session.trajectory.frame_from_body)
+        for session in sessions
+        for frame in session.held_out(len(sessions))
     ]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]

@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import GridReport
 from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
 from mapserver.quality.directions import one_way_words
-from mapserver.quality.figures import Evidence, Starts, TileDirections
+from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
 from mapserver.surfels.surfel_map import SurfelReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
@@ -59,6 +59,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     joins: dict[str, str]
     directions: list[TileDirections]
     starts: Starts | None = None
+    views: SurveyedViews | None = None
     lookalike_recall: float | None = None
     grid: GridReport | None = None
     surfels: SurfelReport | None = None
@@ -148,6 +149,7 @@ def make_report(
         joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},
         directions=evidence.directions or [],
         starts=evidence.starts,
+        views=evidence.views,
         lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
     )
 
@@ -202,7 +204,8 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     left = [s["recording"] for s in report.sessions if not s["joined"]]
     left_out = f"; left out, they could not be joined: {', '.join(left)}" if left else ""
     one_way = one_way_words(report.directions)
-    warned = "".join(f"; {words}" for words in (one_way, lookalike_words(report.starts)) if words)
+    blind = "" if report.views is None else report.views.warning
+    warned = "".join(f"; {words}" for words in (one_way, lookalike_words(report.starts), blind) if words)
     if report.scale == "unknown":
         return (
             f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "

@@ -28,7 +28,7 @@ from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
 from mapserver.drafting.admission import DECISIVE, SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
-from mapserver.drafting.draft_evidence import HeldOut, held_out_of
+from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.report import check_truth
 from mapserver.drafting.sensor_subset import reduced
@@ -52,7 +52,7 @@ class Surveyed:
     """One recording and its survey.
 
     map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements; checks: all of them in one line.
-    calibration: those on the calibration. corrections: of that, by parameter. held_out: frames not used by the survey.
+    calibration: those on the calibration. corrections: of that, by parameter. probed: frames to be localized in the map.
     """
 
     entry: RecordingEntry
@@ -66,7 +66,7 @@ class Surveyed:
     checks: str
     calibration: RigEvidence
     corrections: dict[str, float]
-    held_out: list[HeldOut]
+    probed: list[ProbedFrame]
 
     def remarks(self) -> list[str]:
         """Shortcomings of the recording, corrections and left-out parts, as text."""
@@ -362,7 +362,7 @@ def survey_recording(
             checks=summary(found.findings, DECISIVE),
             calibration=found.calibration,
             corrections=found.corrections,
-            held_out=held_out_of(recording, indices.tolist(), rectifier, done, options.settings.orb),
+            probed=probed_frames(recording, indices.tolist(), rectifier, done, options.settings.orb),
         )
 
 

@@ -15,6 +15,9 @@ EVIDENCE_KEY = "evidence"
 """Key of a manifest's report with the gate's evidence, which therefore stays with the version."""
 
 
+_NAMED = 3
+
+
 class ProbeFigures(msgspec.Struct, frozen=True):
     """Results of frames in one map. Errors and inliers are of the localised ones, None without any."""
 
@@ -62,6 +65,36 @@ class Starts(msgspec.Struct, frozen=True):
     lookalike_recall: float
     max_wrong_share: float
     lookalikes: list[LookAlike]
+
+
+class BlindView(msgspec.Struct, frozen=True):
+    """A view of a survey without a fix in the draft: (x, y) in `map`, and the path driven up to it in its recording."""
+
+    place: tuple[float, float]
+    path_m: float
+
+
+class SurveyedViews(msgspec.Struct, frozen=True):
+    """Held-out frames and both ends of every recording, localized in the tiles from a prior at their own place.
+
+    frames: their number. given_more: number of those for which the budget was chosen again. without_fix: those that have none yet.
+    """
+
+    frames: int
+    given_more: int
+    without_fix: list[BlindView]
+
+    @property
+    def warning(self) -> str:
+        """The views without a fix, as text; empty if there are none."""
+        if not self.without_fix:
+            return ""
+        named = "; ".join(
+            f"({view.place[0]:g}, {view.place[1]:g}), {view.path_m:g} m into its recording"
+            for view in self.without_fix[:_NAMED]
+        )
+        more = f"; and {len(self.without_fix) - _NAMED} more" if len(self.without_fix) > _NAMED else ""
+        return f"{len(self.without_fix)} of {self.frames} frames of the surveys get no fix in the map ({named}{more})"
 
 
 class TrajectoryBreaks(msgspec.Struct, frozen=True):
@@ -143,13 +176,14 @@ class Evidence(msgspec.Struct, frozen=True):
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
     starts: Starts | None = None
+    views: SurveyedViews | None = None
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None
     calibrations: list[RigEvidence] | None = None
 
 
 def carried_evidence(manifest: Manifest) -> Evidence | None:
-    """Return the evidence in a manifest, without directions and starts; None if absent. MapFormatError for a damaged entry."""
+    """Return the evidence in a manifest, without directions, starts and views; None if absent. MapFormatError for a damaged entry."""
     found = manifest.report.get(EVIDENCE_KEY)
     try:
         return None if found is None else msgspec.convert(found, Evidence)

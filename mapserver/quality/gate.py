@@ -50,7 +50,8 @@ class GateVerdict:
     """Result of the gate. reasons: against publishing, empty if accepted; hard ones stand even against --force.
 
     unjudged: the reasons removed by trust in the calibration. report: the checked figures; under `passed` the names of the
-    checks without a reason against the draft, under `not_judged` those without evidence; `unjudged`, too.
+    checks without a reason against the draft, under `not_judged` those without evidence; `unjudged`, too; under `warnings` the
+    surveyed views without a fix, which refuse nothing.
     """
 
     reasons: tuple[str, ...]
@@ -106,6 +107,8 @@ def judge(
         report |= {"compared_with": current.version, **shares}
         checked["size_against_last_version"] = list(_size_reasons(shares, current.version, settings))
     passed += [name for name, reasons in checked.items() if not reasons]
+    if examined.views is not None and examined.views.warning:
+        report["warnings"] = [examined.views.warning]
     report |= {"evidence": to_plain(examined), "passed": passed, "not_judged": not_judged, "unjudged": unjudged}
     reasons = tuple(words for found in checked.values() for words in found)
     return GateVerdict(reasons, _hard_reasons(draft, strangers), report, tuple(unjudged))

@@ -23,7 +23,7 @@ from mapserver.survey.survey_map import SurveyMap
 
 PRIOR_RADIUS_M = 3.0
 ELSEWHERE_M = 2 * PRIOR_RADIUS_M + 2.0  # the two neighbourhoods share no place
-_SAME_WAY_COSINE = 0.5
+SAME_WAY_COSINE = 0.5
 _ROBOTS = RelocalizerSettings()
 _ENOUGH_LANDMARKS = 4 * _ROBOTS.fix.min_inliers  # robots get some of them, and match a part
 
@@ -48,7 +48,7 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
 
     Only places around the prior are searched, so its accuracy does not matter.
     """
-    around = (prior_map_from_cam, PRIOR_RADIUS_M, _SAME_WAY_COSINE)
+    around = (prior_map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
     relocalizer = Relocalizer(view, probe.camera, _ROBOTS)
     fixes = finished(relocalizer.anywhere(probe.features, places_around(view.map_from_cam, *around)))
     near = (fix for fix in fixes if places_around(fix.map_from_cam[None], *around).all())

@@ -6,6 +6,9 @@ gets the landmarks for a certain fix before any gets more: at the end of a drive
 seen often, from many directions, and with small uncertainty count more, because they will be seen again.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,19 +46,31 @@ _WIDE_RAD = np.radians(20.0)
 _SAME_WAY_M, _SAME_WAY_AFTER_M, _SAME_WAY_COSINE = 1.0, 5.0, 0.5
 
 
+class Sighting(NamedTuple):
+    """A view besides the keyframes: map_from_cam (4, 4), its landmarks (P,), rows of the survey, and their pixels (P, 3)."""
+
+    map_from_cam: Array
+    landmarks: NDArray[np.int64]
+    pixels: Array
+
+
 def choose_landmarks(
-    survey: SurveyMap, settings: BudgetSettings, tile_size_m: float, published: NDArray[np.uint32] | None = None
+    survey: SurveyMap,
+    settings: BudgetSettings,
+    tile_size_m: float,
+    published: NDArray[np.uint32] | None = None,
+    sightings: Sequence[Sighting] = (),
 ) -> NDArray[np.bool_]:
     """Return (N,) which landmarks of the survey robots get.
 
     At most settings.landmarks_per_m for every metre of `covered_path_m` (min_landmarks are always allowed: a short survey
-    covers a whole room), and tile_landmarks in a tile. Landmarks with ids in `published` come before all others, so that
-    robots do not fetch another equally good choice every night. Among those and among the others, first come those that give every
-    keyframe view_distinctive_landmarks unlike any other in the survey, then those that give it view_landmarks, or as many as
-    it sees. Landmarks without observations are not chosen.
+    covers a whole room), and tile_landmarks in a tile. First come those that give view_landmarks to each of `sightings`. Then those
+    with ids in `published` come before all others, so that robots do not fetch another equally good choice every night. Among those
+    and among the others, first come those that give every keyframe view_distinctive_landmarks unlike any other in the survey,
+    then those that give it view_landmarks, or as many as it sees. Landmarks without observations are not chosen.
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
-    starts, bins, weights = _views(survey)
+    starts, bins, weights = _views(survey, sightings)
     cells, room = _cells(survey, tile_size_m, settings.tile_landmarks)
     counts = np.zeros(int(bins.max(initial=-1)) + 1, np.int64)
     chosen = np.zeros(len(survey.landmark_ids), bool)
@@ -63,16 +78,23 @@ def choose_landmarks(
     first = seen & np.isin(survey.landmark_ids, [] if published is None else published)
     distinct = distinctive_landmarks(survey.points_map, survey.descriptors)
     per_view = _ROWS * _COLUMNS * _DEPTHS
-    taken = np.zeros(len(survey.map_from_body), np.int64)
+    keyframes = len(survey.map_from_body)
+    taken = np.zeros(keyframes + len(sightings), np.int64)
+    matched = np.zeros(len(chosen), bool)
+    for each in sightings:
+        matched[each.landmarks] = True
+    of_sightings = np.where(np.arange(len(taken)) < keyframes, 0, settings.view_landmarks)
+    passes: list[tuple[NDArray[np.bool_], NDArray[np.int64] | int]] = [(matched, of_sightings)]
     for mask in (first, seen & ~first):
-        quotas = (settings.view_distinctive_landmarks, settings.view_landmarks, _NO_LIMIT)
-        for part, quota in zip((mask & distinct, mask, mask), quotas, strict=True):
-            left, needs = np.flatnonzero(part & ~chosen), quota - taken
-            if len(left) and limit > 0:
-                limit -= core.choose_landmarks(
-                    left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
-                )
-                taken = quota - needs
+        passes += [(mask & distinct, settings.view_distinctive_landmarks), (mask, settings.view_landmarks)]
+        passes.append((mask, _NO_LIMIT))
+    for mask, quota in passes:
+        left, needs = np.flatnonzero(mask & ~chosen), quota - taken
+        if len(left) and limit > 0:
+            limit -= core.choose_landmarks(
+                left, starts, bins, weights, cells, room, limit, counts, chosen, needs, per_view
+            )
+            taken = quota - needs
     return chosen
 
 
@@ -94,32 +116,39 @@ def covered_path_m(survey: SurveyMap) -> float:
     return total_m
 
 
-def _views(survey: SurveyMap) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _views(survey: SurveyMap, sightings: Sequence[Sighting]) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return the start of each landmark's bins (N + 1,), the bins (M,) of all observations by landmark, and weights (N,)."""
     count, camera = len(survey.landmark_ids), survey.camera
-    landmark, keyframe = survey.obs_landmark, survey.obs_keyframe
-    map_from_cam = survey.map_from_body @ survey.body_from_cam
+    map_from_keyframe = survey.map_from_body @ survey.body_from_cam
+    map_from_cam = np.concatenate([map_from_keyframe, *(each.map_from_cam[None] for each in sightings)])
+    landmark = np.concatenate([survey.obs_landmark, *(each.landmarks for each in sightings)])
+    pixels = np.concatenate([survey.obs_pixels, *(each.pixels for each in sightings)])
+    view = np.concatenate([
+        survey.obs_keyframe.astype(np.int64),
+        np.repeat(np.arange(len(map_from_keyframe), len(map_from_cam)), [len(each.landmarks) for each in sightings]),
+    ])  # fmt: skip
     points_cam = np.einsum(
         "mij,mj->mi",
-        se3_inverse(map_from_cam)[keyframe, :3, :3],
-        survey.points_map[landmark] - map_from_cam[keyframe, :3, 3],
+        se3_inverse(map_from_cam)[view, :3, :3],
+        survey.points_map[landmark] - map_from_cam[view, :3, 3],
     )
-    column = np.clip(survey.obs_pixels[:, 0] / camera.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.int64)
-    row = np.clip(survey.obs_pixels[:, 1] / camera.height_px * _ROWS, 0, _ROWS - 1).astype(np.int64)
+    column = np.clip(pixels[:, 0] / camera.width_px * _COLUMNS, 0, _COLUMNS - 1).astype(np.int64)
+    row = np.clip(pixels[:, 1] / camera.height_px * _ROWS, 0, _ROWS - 1).astype(np.int64)
     is_far = points_cam[:, 2] > _CLOSE_BASELINES * camera.baseline_m
-    bins = ((keyframe.astype(np.int64) * _ROWS + row) * _COLUMNS + column) * _DEPTHS + is_far
+    bins = ((view * _ROWS + row) * _COLUMNS + column) * _DEPTHS + is_far
     order = np.argsort(landmark, kind="stable")
     starts = np.searchsorted(landmark[order], np.arange(count + 1))
-    return starts.astype(np.int64), bins[order], _weights(survey, map_from_cam, np.diff(starts))
+    return starts.astype(np.int64), bins[order], _weights(survey, map_from_keyframe)
 
 
-def _weights(survey: SurveyMap, map_from_cam: Array, seen: NDArray[np.int64]) -> Array:
+def _weights(survey: SurveyMap, map_from_cam: Array) -> Array:
     """Return (N,) weights: probability that a landmark is seen again, times its information.
 
     Laplace's rule for n - 1 repeated observations; up to twice that for views 20 degrees apart; less the more pixels its own
     uncertainty spans.
     """
-    landmark, count = survey.obs_landmark, len(seen)
+    landmark, count = survey.obs_landmark, len(survey.landmark_ids)
+    seen = np.bincount(landmark, minlength=count)
     offsets = map_from_cam[survey.obs_keyframe, :3, 3] - survey.points_map[landmark]
     distances_m = np.maximum(np.linalg.norm(offsets, axis=1), 1e-6)
     rays = offsets / distances_m[:, None]

@@ -20,12 +20,13 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from fleetmap.time_sliced import TimeSliced
-from mapserver.drafting.draft_evidence import Before, DraftMap, HeldOut, JudgedSession, examine_draft
+from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, ProbedFrame, examine_draft
+from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.quality.probes import held_out_frames, lookalike_words, probe_features
-from mapserver.survey.settings import SurveySettings
+from mapserver.survey.settings import BudgetSettings, SurveySettings
 from mapserver.survey.stages import Survey, survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from mapserver.survey.survey_map import SurveyMap
@@ -48,7 +49,7 @@ def two_walls(t_s: float) -> Array:
     return se3(so3_exp(np.array([0, 0, yaw])), np.array([-1.2 + 2.4 * eased, 0.0, 0.05 * np.sin(6 * share)]))
 
 
-def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
+def surveyed(rig: RigCalibration) -> tuple[Survey, list[ProbedFrame]]:
     """The ride, surveyed as if `rig` had recorded it, and what the survey did not use of it."""
     sample = ride_sample(two_walls, FRAMES, FRAME_S)
     frames = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
@@ -60,14 +61,14 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[HeldOut]]:
     numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
     seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS.orb) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
-    return done, [HeldOut(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
+    return done, [ProbedFrame(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
 
 
 OBSERVED = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
 
 
 @lru_cache(maxsize=1)
-def sound() -> tuple[Survey, list[HeldOut]]:
+def sound() -> tuple[Survey, list[ProbedFrame]]:
     """The ride with the right calibration."""
     return surveyed(calibration())
 
@@ -85,7 +86,7 @@ def manifest(tiles: Sequence[Tile], version: int) -> Manifest:
 
 
 def verdict(
-    survey_map: SurveyMap, *, has_current: bool = True, held_out: list[HeldOut] | None = None,
+    survey_map: SurveyMap, *, has_current: bool = True, held_out: list[ProbedFrame] | None = None,
     trajectory: Trajectory | None = None,
 ) -> tuple[GateVerdict, Evidence]:  # fmt: skip
     """Of a draft with this map, built by the sound ride; the current version is the sound map."""
@@ -180,6 +181,32 @@ def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
     before = Before(manifest(tiles, 1), archive, tiles, [])
     session = JudgedSession(done.map.trajectory, own, done)
     return examine_draft(DraftMap(tiles, done.vocabulary, done.map.camera), before, [session], [])
+
+
+def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if_there_are_none() -> None:
+    """Robots have the first wall already and the budget is full: seen at the ends of drives, whose last view got too little."""
+    done, own = sound()
+    session, survey_map = JudgedSession(done.map.trajectory, own, done), done.map
+    views = asked_views([session])
+    assert len(views) == len(own)
+    is_old = at_first_wall(survey_map.points_map)
+    full = BudgetSettings(landmarks_per_m=0.0, min_landmarks=int(is_old.sum()))
+    chooser = TileChooser(survey_map, full, survey_map.landmark_ids[is_old], WORDS)
+    tiles, found = chooser.choose(views)
+    assert sum(len(tile) for tile in tiles) == is_old.sum()
+    assert found.given_more > 0
+    assert found.without_fix == []
+    kept = looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
+    unmapped = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+    _, found = chooser._replace(survey_map=unmapped).choose(views)
+    assert found.given_more == 0
+    at_second = [view for view in views if view.probe.map_from_cam[:3, 2] @ facing() < 0.0]
+    assert len(found.without_fix) == len(at_second)
+    assert found.without_fix[-1].path_m == round(at_second[-1].path_m, 1) > 3.0
+    evidence = Evidence(views=found)
+    said = judge(manifest(tiles, 2), None, GateSettings(), evidence)
+    assert f"{len(at_second)} of {len(views)} frames" in said.report["warnings"][0]
+    assert "m into its recording" in said.report["warnings"][0]
 
 
 def test_nights_that_changed_little_do_not_hold_the_next_one() -> None:

@@ -1,0 +1,93 @@
+"""Tiles for robots, checked by frames of the surveys: a view without a fix gets more landmarks."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fleetmap.bow import Vocabulary
+from fleetmap.mapformat import Tile, decode_tile, encode_tile
+from fleetmap.relocalization.landmark_visibility import places_around
+from fleetmap.relocalization.map_view import MapView
+from mapserver.drafting.draft_evidence import JudgedSession
+from mapserver.quality.figures import BlindView, SurveyedViews
+from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, relocalized
+from mapserver.survey.settings import BudgetSettings
+from mapserver.survey.survey_map import SurveyMap
+from mapserver.tiles.landmark_budget import Sighting, choose_landmarks
+from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+
+
+class AskedView(NamedTuple):
+    """A frame to be localized, and the path driven up to it in its recording."""
+
+    probe: Probe
+    path_m: float
+
+
+def asked_views(sessions: Sequence[JudgedSession]) -> list[AskedView]:
+    """Return held-out frames of all recordings, as many as the evidence has, and both ends of every recording."""
+    found = []
+    for session in sessions:
+        map_from_body, positions_m = session.trajectory.frame_from_body, session.trajectory.positions_m
+        path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1))])
+        frames = list({frame.number: frame for frame in session.asked(len(sessions))}.values())
+        found += [AskedView(frame.probe(map_from_body), float(path_m[frame.number])) for frame in frames]
+    return found
+
+
+class TileChooser(NamedTuple):
+    """A map, its budget for robots, and what their tiles need. published: landmarks with priority, None in a first version."""
+
+    survey_map: SurveyMap
+    settings: BudgetSettings
+    published: np.typing.NDArray[np.uint32] | None
+    vocabulary: Vocabulary
+
+    def choose(self, views: Sequence[AskedView]) -> tuple[list[Tile], SurveyedViews]:
+        """Return the tiles, and which views give no fix in them.
+
+        The budget is chosen for what keyframes observed. A view between them or beyond the last one may match few of those
+        landmarks: those that it matches among all landmarks then count as its observations, and the budget is chosen again.
+        """
+        tiles = self._tiles(())
+        missed = self._without_fix(tiles, views)
+        sightings = [found for view in missed if (found := self._sighting(view.probe)) is not None]
+        if sightings:
+            tiles = self._tiles(sightings)
+            missed = self._without_fix(tiles, views)
+        places = [BlindView(_xy(view), round(view.path_m, 1)) for view in missed]
+        return tiles, SurveyedViews(len(views), len(sightings), places)
+
+    def _tiles(self, sightings: Sequence[Sighting]) -> list[Tile]:
+        chosen = choose_landmarks(self.survey_map, self.settings, TILE_SIZE_M, self.published, sightings)
+        return tiles_from_survey(self.survey_map, chosen=chosen)
+
+    def _view(self, tiles: Sequence[Tile]) -> MapView:
+        stored = [decode_tile(encode_tile(tile)) for tile in tiles]
+        return MapView(stored, self.vocabulary, self.survey_map.camera.focal_px)
+
+    def _without_fix(self, tiles: Sequence[Tile], views: Sequence[AskedView]) -> list[AskedView]:
+        view = self._view(tiles)
+        return [each for each in views if relocalized(view, each.probe, each.probe.map_from_cam) is None]
+
+    def _sighting(self, probe: Probe) -> Sighting | None:
+        """Return the matches of a probe among all landmarks that were observed around it; None without a fix."""
+        survey = self.survey_map
+        map_from_cam = survey.map_from_body @ survey.body_from_cam
+        near = places_around(map_from_cam, probe.map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
+        around = np.zeros(len(survey.landmark_ids), bool)
+        around[survey.obs_landmark[near[survey.obs_keyframe]]] = True
+        view = self._view(tiles_from_survey(survey, chosen=around))
+        fix = relocalized(view, probe, probe.map_from_cam)
+        if fix is None or fix.matches is None:
+            return None
+        features, rows = fix.matches.T
+        order = np.argsort(survey.landmark_ids, kind="stable")
+        landmarks = order[np.searchsorted(survey.landmark_ids, view.landmark_ids[rows], sorter=order)]
+        return Sighting(fix.map_from_cam, landmarks, probe.features.pixels[features])
+
+
+def _xy(view: AskedView) -> tuple[float, float]:
+    x, y = view.probe.map_from_cam[:2, 3]
+    return round(float(x), 1), round(float(y), 1)
