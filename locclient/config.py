@@ -40,7 +40,7 @@ TIERS = {
         "localizer.odometry.filter": "use_wheels",
         "localizer.fix": "min_recall",
         "localizer.track": "fix_interval_s settled_interval_s strong_inliers is_whole_site_mapped telling_evidence "
-        "degraded_after_s degraded_radius_m lost_radius_m alias_step_m kidnap_fixes",
+        "degraded_after_s degraded_radius_m lost_radius_m kidnap_fixes",
         "localizer.image_quality": "dark_contrast glare_share blurred_share occluded_depth_share",
     },
 }

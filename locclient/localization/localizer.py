@@ -8,7 +8,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import Odometry, is_away
-from fleetmap.relocalization.map_view import LookAlikes, MapView
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -83,12 +83,14 @@ class Localizer:
         vocabulary: Vocabulary,
         survey_focal_px: float,
         lookalikes: LookAlikes | None = None,
+        alias_step_m: float = ALIAS_STEP_M,
     ) -> None:
         """Use these tiles, all of one version, from now on; cancel a running map query.
 
-        lookalikes: similarity of unmapped places to the map; None if not measured.
+        lookalikes: similarity of unmapped places to the map; None if not measured. alias_step_m: smallest distance at which its
+        places look alike.
         """
-        self._tracker.lookalikes = lookalikes
+        self._tracker.lookalikes, self._tracker.alias_step_m = lookalikes, alias_step_m
         self._map_version = version
         view = MapView(tiles, vocabulary, survey_focal_px)
         self._query.use(Relocalizer(view, self._camera, self._settings.relocalizer))

@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import OdometryEstimate
-from fleetmap.relocalization.map_view import LookAlikes
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Fix, is_reliable
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.time_sliced import TimeSliced
@@ -76,6 +76,7 @@ class PoseTracker:
         self.was_tracking = False
         self.is_carried = False  # it was lifted since it knew its pose
         self.lookalikes: LookAlikes | None = None
+        self.alias_step_m = ALIAS_STEP_M
         self.odom_from_body: Array | None = None  # of the last frame
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
@@ -188,7 +189,7 @@ class PoseTracker:
         """Turn a pose whose radius exceeds half of the site's smallest repetition into a prior: a fix of the next bay or aisle would be
         within the gate of its covariance, and must be confirmed like any other."""
         confirmed = self.confirmed
-        if confirmed is None or not radius_95_m(confirmed.now_cov) > 0.5 * self._track.alias_step_m:
+        if confirmed is None or not radius_95_m(confirmed.now_cov) > 0.5 * self.alias_step_m:
             return
         self.candidates.reset()
         self.candidates.abandoned, self.confirmed = confirmed, None

@@ -40,8 +40,6 @@ class TrackSettings(Section, frozen=True):
     degraded_after_s: float = 0.9
     degraded_radius_m: float = 0.3
     lost_radius_m: float = 3.0
-    # Smallest distance at which places of a site look alike: bays of shelves and racks are 2.5 m long and more, aisles as far apart
-    alias_step_m: float = 2.5
     kidnap_fixes: int = 3
     map_sigma_m: float = 0.02  # of the map itself, added to the estimate
     map_sigma_rad: float = 0.006  # of the map itself, added to the estimate

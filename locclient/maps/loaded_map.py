@@ -9,7 +9,7 @@ from fleetmap.config import Section
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import Status, WantedVersion
-from fleetmap.relocalization.map_view import LookAlikes
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from locclient.localization.estimate import Estimate
 
 Cell = tuple[int, int]
@@ -101,6 +101,12 @@ class LoadedMap:
     @property
     def version(self) -> int:
         return self.manifest.version
+
+    @property
+    def alias_step_m(self) -> float:
+        """Smallest distance at which places of the map look alike; ALIAS_STEP_M if its build did not measure it."""
+        step_m = self.manifest.report.get("alias_step_m")
+        return float(step_m) if isinstance(step_m, int | float) and step_m > 0 else ALIAS_STEP_M
 
     @property
     def lookalikes(self) -> LookAlikes | None:

@@ -53,7 +53,7 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
 
 def _use(localizer: Localizer, loaded: LoadedMap) -> None:
     tiles, focal_px = loaded.tiles.values(), loaded.manifest.camera.focal_px
-    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
+    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes, loaded.alias_step_m)
 
 
 @dataclass(frozen=True, slots=True)

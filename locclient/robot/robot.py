@@ -214,7 +214,9 @@ class Robot:
             self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
         self._place_in_building()
-        self.localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes)
+        self.localizer.handle_version(
+            loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes, loaded.alias_step_m
+        )
 
     def _place_in_building(self) -> None:
         frame = self._aligned or self._of_version

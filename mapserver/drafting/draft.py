@@ -58,6 +58,7 @@ from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
 from mapserver.grid.survey_grid import GridGrower, GridSession, Grower, grow
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
+from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.surfels.surfel_map import Surfels, encode_surfels, known_surfels, surfel_report
@@ -322,7 +323,11 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
     asked = covered_requests(maps, site, built.joined)
-    report = msgspec.structs.replace(report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked)
+    known_m = None if parent is None else parent.manifest.report.get("alias_step_m")
+    step_m = alias_step_m(evidence.repetition, known_m)
+    report = msgspec.structs.replace(
+        report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked, alias_step_m=step_m
+    )
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,

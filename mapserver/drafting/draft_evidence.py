@@ -25,7 +25,15 @@ from mapserver.drafting.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
-from mapserver.quality.probes import Probe, held_out_frames, probe_features, probes_of_map, spread, starts_without_prior
+from mapserver.quality.probes import (
+    Probe,
+    held_out_frames,
+    probe_features,
+    probes_of_map,
+    repetition,
+    spread,
+    starts_without_prior,
+)
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.stages import Survey
@@ -207,10 +215,13 @@ def examine_draft(
     draft = drafted.view()
     tasks: list[Callable[[], Any]] = [
         lambda: starts_without_prior(draft, probes.frames),
+        lambda: repetition(draft, probes.frames),
         lambda: examine(draft, current, probes, _breaks(sessions)),
     ]
-    starts, evidence = executor.map(lambda _, task: task(), None, tasks)
-    found: Evidence = msgspec.structs.replace(evidence, directions=tile_directions(stored), starts=starts)
+    starts, repeated, evidence = executor.map(lambda _, task: task(), None, tasks)
+    found: Evidence = msgspec.structs.replace(
+        evidence, directions=tile_directions(stored), starts=starts, repetition=repeated
+    )
     return found
 
 

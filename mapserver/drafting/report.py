@@ -61,6 +61,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     starts: Starts | None = None
     views: SurveyedViews | None = None
     lookalike_recall: float | None = None
+    alias_step_m: float | None = None
     grid: GridReport | None = None
     surfels: SurfelReport | None = None
     surveyed_requests: dict[str, float] = {}

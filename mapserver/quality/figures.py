@@ -67,6 +67,16 @@ class Starts(msgspec.Struct, frozen=True):
     lookalikes: list[LookAlike]
 
 
+class Repetition(msgspec.Struct, frozen=True):
+    """Frames asked for every place of the draft that they show: smallest distance from one to another place that robots accept.
+
+    step_m: None if no frame shows another place.
+    """
+
+    frames: int
+    step_m: float | None
+
+
 class BlindView(msgspec.Struct, frozen=True):
     """A view of a survey without a fix in the draft: (x, y) in `map`, and the path driven up to it in its recording."""
 
@@ -176,6 +186,7 @@ class Evidence(msgspec.Struct, frozen=True):
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
     starts: Starts | None = None
+    repetition: Repetition | None = None
     views: SurveyedViews | None = None
     motion: TrajectoryBreaks | None = None
     directions: list[TileDirections] | None = None

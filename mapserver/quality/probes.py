@@ -13,12 +13,12 @@ from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures, with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
-from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import finished
-from mapserver.quality.figures import LookAlike, Starts
+from mapserver.quality.figures import LookAlike, Repetition, Starts
 from mapserver.survey.survey_map import SurveyMap
 
 PRIOR_RADIUS_M = 3.0
@@ -111,6 +111,8 @@ def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
 
 
 _NAMED = 3
+_FIX_M = 0.5  # errors of fixes, and duplicates of one
+_ENOUGH_FRAMES = 19  # another place with an alias that none of so many shows has a probability of at most 5 % (see `starts_without_prior`)
 
 
 def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | None:
@@ -134,6 +136,32 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
             for probe, fix in taken
         ],
     )
+
+
+def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
+    """Measure the smallest distance at which a map looks like itself, as a robot without a prior would see it; None without probes.
+
+    Every place that robots accept for a probe's image, beyond the errors of fixes, is an alias of its place; the search finds those at
+    least 1.2 m away. Source: Ballard 1981 (the generalised Hough transform of `find_aliases`), each alias verified by its fix.
+    """
+    steps_m = []
+    for probe in probes:
+        for fix in finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features)):
+            step_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - probe.map_from_cam[:3, 3]))
+            if step_m > _FIX_M and is_reliable(fix, _ROBOTS.fix):
+                steps_m.append(round(step_m, 3))
+    return Repetition(len(probes), min(steps_m, default=None)) if probes else None
+
+
+def alias_step_m(found: Repetition | None, known_m: float | None) -> float | None:
+    """Return the step for robots: the smaller one of a measured and a known one; None if it is unknown, or there is none.
+
+    Too few frames prove a small step, and never that there is no smaller one than ALIAS_STEP_M.
+    """
+    steps_m = [] if known_m is None else [known_m]
+    if found is not None and found.step_m is not None:
+        steps_m.append(found.step_m if found.frames >= _ENOUGH_FRAMES else min(found.step_m, ALIAS_STEP_M))
+    return min(steps_m, default=None)
 
 
 def lookalike_words(starts: Starts | None) -> str:

@@ -34,6 +34,10 @@ _MIN_INLIER_SHARE = 0.35  # of the matches at a fix
 _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE = 3.0, 0.5
 
 
+ALIAS_STEP_M = 2.5
+"""Distance at which places may look alike if a map's build did not measure it: bays of shelves and racks are that long and more."""
+
+
 @dataclass(frozen=True, slots=True)
 class CovisibleLandmarks:
     """Landmarks expected in view from a fix, because the survey saw them from nearby.

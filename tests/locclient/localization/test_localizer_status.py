@@ -285,6 +285,17 @@ def test_a_pose_that_may_be_at_the_next_bay_is_confirmed_like_any_place(
         assert estimate.map_from_body is None or tracking.error_m(estimate) < radius_95_m(estimate.cov_rot_trans)
 
 
+@pytest.mark.parametrize(("alias_step_m", "status"), [(2.5, Status.DEGRADED), (5.0, Status.TRACKING)])
+def test_the_map_says_how_near_a_look_alike_place_is(tracking: Robot, alias_step_m: float, status: Status) -> None:
+    """A radius of 1.4 m includes a place 2.5 m away, and none 5 m away: then one weak fix within the gate is enough."""
+    tracking.load(2, alias_step_m=alias_step_m)
+    tracking.odometry.drift_share = 0.2
+    while radius_95_m(tracking.go(0.2, NO_FIX, 0.0).cov_rot_trans) < 1.4:
+        pass
+    tracking.inliers, tracking.relocalizer.alias_ratio = 16, 0.9
+    assert tracking.go(0.2, TRUE, 0.0).status is status
+
+
 @pytest.mark.parametrize("step_m", [0.2, 0.0])
 @pytest.mark.parametrize("radius_m", [1.4, 2.5])
 def test_a_doubted_pose_keeps_nobody_from_where_he_was_carried(tracking: Robot, radius_m: float, step_m: float) -> None:

@@ -1,8 +1,10 @@
 """Tiles around the robot are in memory, the others on the disk; bad ones are left out with their reasons."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -37,6 +39,17 @@ def row(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, MapSto
 
 def at(x_m: float) -> np.ndarray:
     return np.array([x_m, 8.0, 1.0])
+
+
+@pytest.mark.parametrize(("report", "step_m"), [({}, 2.5), ({"alias_step_m": None}, 2.5), ({"alias_step_m": 5.0}, 5.0)])
+def test_a_manifest_says_how_near_look_alikes_are(
+    row: tuple[Path, MapStore], report: dict[str, float | None], step_m: float
+) -> None:
+    """Those of older servers do not say it."""
+    link = LocalMapSource(row[0], "row")
+    loaded = TileLoader(link, SETTINGS).load(link.wanted(), PositionBound())
+    assert loaded is not None
+    assert replace(loaded, manifest=msgspec.structs.replace(loaded.manifest, report=report)).alias_step_m == step_m
 
 
 def test_memory_follows_the_robot(row: tuple[Path, MapStore]) -> None:

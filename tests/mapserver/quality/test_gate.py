@@ -279,6 +279,8 @@ def test_a_site_that_is_in_the_map_twice_is_refused() -> None:
     assert starts.taken_share > 0.5
     assert starts.lookalike_recall == max(alike.recall for alike in starts.lookalikes) > 0.3
     assert starts.max_wrong_share == pytest.approx(1 / (starts.frames + 1), abs=1e-4)
+    assert evidence.repetition is not None
+    assert evidence.repetition.step_m == pytest.approx(20.0, abs=0.1)
     for alike in starts.lookalikes:
         assert abs(np.hypot(*np.subtract(alike.place, alike.taken_for)) - 20.0) < 1.0
     assert "stays AMBIGUOUS" in lookalike_words(starts)
@@ -288,6 +290,8 @@ def test_a_site_that_is_in_the_map_once_has_no_look_alikes() -> None:
     _, evidence = verdict(sound()[0].map, has_current=False)
     assert evidence.starts is None  # the room is too small for another place
     assert lookalike_words(None) == ""
+    assert evidence.repetition is not None
+    assert evidence.repetition.step_m is None
 
 
 def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
-from fleetmap.relocalization.map_view import LookAlikes
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
@@ -115,8 +115,10 @@ class Robot:
         self.rng = np.random.default_rng(0)
         self.map_from_body = MAP_FROM_ODOM.copy()
 
-    def load(self, version: int = 1, lookalikes: LookAlikes | None = None) -> "Robot":
-        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0, lookalikes)
+    def load(
+        self, version: int = 1, lookalikes: LookAlikes | None = None, alias_step_m: float = ALIAS_STEP_M
+    ) -> "Robot":
+        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0, lookalikes, alias_step_m)
         return self
 
     def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:
