@@ -61,7 +61,7 @@ from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merge
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.surfels.surfel_map import Surfels, encode_surfels, known_surfels, surfel_report
+from mapserver.surfels.surfel_map import SurfelTiles, known_surfels, surfel_report
 from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
@@ -301,14 +301,14 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     grid_grower = GridGrower({} if parent is None else parent.grid, run.settings.stereo)
     growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
     if run.settings.surfel_map:
-        known = Surfels.joined([]) if parent is None else known_surfels(parent.manifest, maps.blob)
+        known = SurfelTiles() if parent is None else known_surfels(parent.manifest, maps.blob)
         growers["surfels"] = surfel_grower = SurfelGrower(known)
     without = grow(growers, sessions, run.settings.stereo)
     grid, surfels = encode_grid(grid_grower.tiles), list[bytes]()
     grid_said = grid_report(grid, without.get("grid", {})) if grid or without.get("grid") else None
     surfels_said = None
     if run.settings.surfel_map:
-        surfels = encode_surfels(surfel_grower.surfels)
+        surfels = surfel_grower.surfels.blobs()
         surfels_said = surfel_report(surfels, len(surfel_grower.surfels), without["surfels"])
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)

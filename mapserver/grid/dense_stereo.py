@@ -52,7 +52,7 @@ def dense_disparity(
 def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[np.float32]:
     """Return (H, W) the largest disparity around each pixel, 0 if unknown."""
     block = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
-    return np.asarray(cv2.dilate(np.nan_to_num(disparity_px), block), np.float32)
+    return np.asarray(cv2.dilate(np.fmax(disparity_px, np.float32(0.0)), block), np.float32)
 
 
 def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:

@@ -12,7 +12,7 @@ from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts, Tiles, whole_grid
-from mapserver.grid.dense_stereo import BLOCK_PX, nearest_around
+from mapserver.grid.dense_stereo import BLOCK_PX
 
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since rays also pass at its rim. An earlier state stays until two more views
@@ -35,16 +35,19 @@ class SessionViews:
     tiles: dict[tuple[int, int], tuple[Counts, Counts, Counts, Counts]] = field(default_factory=dict)
 
     def add(
-        self, disparity: tuple[NDArray[np.float32], float], camera: StereoCamera, map_from_cam: Array, floor_m: float
+        self,
+        disparity: tuple[NDArray[np.float32], NDArray[np.float32], float],
+        camera: StereoCamera,
+        map_from_cam: Array,
+        floor_m: float,
     ) -> None:
-        """Add one view. disparity: as of `dense_disparity`; floor_m: distance of the floor below the camera."""
+        """Add one view. disparity: as of `dense_disparity`, with that of `nearest_around` between; floor_m: distance of the floor below."""
         size = 2 * _RANGE_CELLS + 1
         at_cells = map_from_cam[:2, 3] / CELL_M
         corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
         place = np.array([*(at_cells - corner), floor_m])
         turn = np.ascontiguousarray(map_from_cam[:3, :3])
-        px, sigma_px = disparity
-        nearest_px = nearest_around(px, REACH_PX)
+        px, nearest_px, sigma_px = disparity
         parts, was_free = list(_parts(corner, size)), np.zeros((size, size), np.uint8)
         for tile, in_tile, in_window in parts:
             if tile in self.before:

@@ -1,6 +1,8 @@
 """Dense matching of a build's keyframes at their final poses, and the update of the previous version's grid by it."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -9,8 +11,8 @@ from numpy.typing import NDArray
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.version_grid import Counts, Tiles
-from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
-from mapserver.grid.site_grid import SessionViews, updated
+from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m, nearest_around
+from mapserver.grid.site_grid import REACH_PX, SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.stages import Survey
 from mapserver.survey.state import Keyframe
@@ -26,13 +28,19 @@ class GridSession(NamedTuple):
     map_from_body: Array
 
 
-class DepthView(NamedTuple):
+@dataclass(frozen=True)
+class DepthView:
     """A keyframe with its disparities (H, W), their standard deviation, and its pose (4, 4)."""
 
     keyframe: Keyframe
     disparity_px: NDArray[np.float32]
     sigma_px: float
     map_from_cam: Array
+
+    @cached_property
+    def nearest_px(self) -> NDArray[np.float32]:
+        """(H, W) disparities as of `nearest_around`, as far around each pixel as its depth may belong to."""
+        return nearest_around(self.disparity_px, REACH_PX)
 
 
 def measures_depth(survey: Survey) -> bool:
@@ -113,7 +121,7 @@ class GridGrower:
 
     def add(self, view: DepthView) -> None:
         camera = self._session.survey.state.camera
-        self._views.add((view.disparity_px, view.sigma_px), camera, view.map_from_cam, self._floor_m)
+        self._views.add((view.disparity_px, view.nearest_px, view.sigma_px), camera, view.map_from_cam, self._floor_m)
 
     def end(self) -> None:
         survey = self._session.survey

@@ -65,15 +65,15 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     design = scipy.sparse.csr_array((values.ravel(), (rows, columns.ravel())), (count, first))
     points = scipy.sparse.csr_array((np.ones(count), (np.arange(count), shown)))
     # Gauge: brighter views with darker points are equivalent. Unobserved values stay 0.
-    prior = _PRIOR**2 * np.eye(first)
+    prior = _PRIOR**2 * scipy.sparse.eye_array(first)
     weights, start = np.ones(count), np.zeros(first)
     for _ in range(_ROUNDS):
         weighted = design.T @ scipy.sparse.diags_array(weights)
         sums, sums_of_logs = (np.asarray(points.T @ column) for column in (weights, weights * every.logs))
         of_points = points.T @ weighted.T
         means = scipy.sparse.diags_array(np.reciprocal(sums)) @ of_points
-        left = (weighted @ design - of_points.T @ means).toarray()
-        start = np.linalg.solve(left + prior, weighted @ every.logs - means.T @ sums_of_logs)
+        left = weighted @ design - of_points.T @ means + prior
+        start = scipy.sparse.linalg.spsolve(left.tocsc(), weighted @ every.logs - means.T @ sums_of_logs)
         off = np.abs(every.logs - design @ start - (sums_of_logs / sums - means @ start)[shown])
         weights = np.minimum(1.0, _HUBER / np.maximum(off, 1e-9))
     logs = start[FALLOFF:]

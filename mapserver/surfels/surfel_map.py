@@ -1,9 +1,9 @@
 """The surfels of a version: as arrays, and as bytes (an index, and one blob for each tile; docs/map_format.md)."""
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -99,20 +99,56 @@ class SurfelReport(msgspec.Struct, frozen=True, kw_only=True):
     without: dict[str, str] = {}
 
 
+class SurfelTile(NamedTuple):
+    """The bytes of a tile, and its number of surfels."""
+
+    data: bytes
+    surfels: int
+
+
+@dataclass(frozen=True, slots=True)
+class SurfelTiles:
+    """The encoded surfels of a site by place of their tile, with the lens and the exposures of its drives as of `Surfels`."""
+
+    tiles: Mapping[tuple[int, int], SurfelTile] = field(default_factory=dict)
+    falloff: tuple[float, ...] = NO_FALLOFF
+    exposures: Array = field(default_factory=lambda: np.zeros((0, EXPOSURE)))
+
+    def __len__(self) -> int:
+        return sum(tile.surfels for tile in self.tiles.values())
+
+    def surfels(self, place: tuple[int, int]) -> Surfels:
+        """Return the surfels of a tile, none for one that is not there. MapFormatError or NewerFormatError for invalid bytes."""
+        if place not in self.tiles:
+            return Surfels.joined([])
+        found, surfels = _decode_tile(self.tiles[place].data)
+        if found != place or len(surfels) != self.tiles[place].surfels:
+            raise MapFormatError(f"surfel tile {found} is at the place of {place[0]}, {place[1]}; it is damaged")
+        return surfels
+
+    def joined(self) -> Surfels:
+        """Return all surfels."""
+        return replace(Surfels.joined(map(self.surfels, self.tiles)), falloff=self.falloff, exposures=self.exposures)
+
+    def blobs(self) -> list[bytes]:
+        """Return the index and then each tile; empty for no surfels."""
+        entries = [
+            TileEntry(x=x, y=y, sha256=sha256_hex(tile.data), bytes=len(tile.data), landmarks=tile.surfels)
+            for (x, y), tile in sorted(self.tiles.items())
+        ]
+        views = tuple(tuple(row) for row in self.exposures[:_MOST_EXPOSURES].round(4).tolist())
+        index = SurfelIndex(falloff=self.falloff, exposures=views, tiles=tuple(entries))
+        blobs = [self.tiles[place].data for place in sorted(self.tiles)]
+        return [to_json(index, order="deterministic"), *blobs] if blobs else []
+
+
 def encode_surfels(surfels: Surfels) -> list[bytes]:
     """Return the index and then each tile; empty for no surfels. The bytes do not depend on the order of the surfels."""
     places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
-    blobs, entries = [], []
-    order = np.lexsort((places[:, 1], places[:, 0]))
-    starts = np.flatnonzero((np.diff(places[order], axis=0, prepend=places[order][:1] - 1) != 0).any(axis=1))
-    for rows in np.split(order, starts[1:]) if len(order) else []:
-        x, y = places[rows[0]].tolist()
-        data = _encode_tile((x, y), surfels[rows])
-        entries.append(TileEntry(x=x, y=y, sha256=sha256_hex(data), bytes=len(data), landmarks=len(rows)))
-        blobs.append(data)
-    views = tuple(tuple(row) for row in surfels.exposures.round(4).tolist())
-    index = SurfelIndex(falloff=surfels.falloff, exposures=views, tiles=tuple(entries))
-    return [to_json(index, order="deterministic"), *blobs] if blobs else []
+    tiles = {}
+    for x, y in np.unique(places, axis=0).tolist():
+        tiles[x, y] = encode_tile((x, y), surfels[(places == (x, y)).all(axis=1)])
+    return SurfelTiles(tiles, surfels.falloff, surfels.exposures).blobs()
 
 
 def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:
@@ -139,25 +175,30 @@ def surfels_of(
 
     Raises StateError with the reason for a version without any, and MapFormatError or NewerFormatError for invalid bytes.
     """
-    where = f"version {manifest.version} of site {manifest.site}"
-    parts, index = [], _read_index(blob(index_address(manifest)))
-    for entry in index.tiles:
-        if near is not None:
-            off = np.array([entry.x, entry.y]) * TILE_SIZE_M - near[:2]
-            if np.linalg.norm(np.maximum(np.maximum(off, -off - TILE_SIZE_M), 0.0)) > near[2]:
-                continue
-        place, surfels = _decode_tile(blob(entry.sha256))
-        if place != (entry.x, entry.y) or len(surfels) != entry.landmarks:
-            raise MapFormatError(f"{where}: surfel tile {place} is at the place of {entry.x}, {entry.y}; it is damaged")
-        parts.append(surfels)
-    exposures = np.array(index.exposures, np.float64).reshape(-1, EXPOSURE)
-    return replace(Surfels.joined(parts), falloff=index.falloff, exposures=exposures)
+    index_address(manifest)
+    return known_surfels(manifest, blob, near).joined()
 
 
-def known_surfels(manifest: Manifest, blob: Callable[[str], bytes]) -> Surfels:
-    """As `surfels_of`; empty for a version without any."""
+def off_tile_m(place: tuple[int, int], positions_map: Array) -> Array:
+    """Return the horizontal distances (...,) of positions (..., 2 or 3) from a tile, 0 inside."""
+    off = np.array(place) * TILE_SIZE_M - positions_map[..., :2]
+    return np.asarray(np.linalg.norm(np.maximum(np.maximum(off, -off - TILE_SIZE_M), 0.0), axis=-1))
+
+
+def known_surfels(
+    manifest: Manifest, blob: Callable[[str], bytes], near: tuple[float, float, float] | None = None
+) -> SurfelTiles:
+    """Return the encoded surfels of a version; empty for a version without any. Arguments and errors as of `surfels_of`."""
     report = report_of(manifest)
-    return Surfels.joined([]) if report is None or report.sha256 is None else surfels_of(manifest, blob)
+    if report is None or report.sha256 is None:
+        return SurfelTiles()
+    index = _read_index(blob(report.sha256))
+    tiles = {
+        (entry.x, entry.y): SurfelTile(blob(entry.sha256), entry.landmarks)
+        for entry in index.tiles
+        if near is None or off_tile_m((entry.x, entry.y), np.array(near[:2])) <= near[2]
+    }
+    return SurfelTiles(tiles, index.falloff, np.array(index.exposures, np.float64).reshape(-1, EXPOSURE))
 
 
 def report_of(manifest: Manifest) -> SurfelReport | None:
@@ -181,7 +222,8 @@ def _read_index(data: bytes) -> SurfelIndex:
     return index
 
 
-def _encode_tile(place: tuple[int, int], surfels: Surfels) -> bytes:
+def encode_tile(place: tuple[int, int], surfels: Surfels) -> SurfelTile:
+    """Return the bytes of the surfels of a tile; they do not depend on the order of the surfels."""
     corner = np.array(place) * TILE_SIZE_M
     flat = np.clip((surfels.points_map[:, :2] - corner) / _FLAT_M, 0, 65535)
     height = np.round(surfels.points_map[:, 2].astype(np.float64) / _HEIGHT_M).astype(np.int64)
@@ -197,7 +239,7 @@ def _encode_tile(place: tuple[int, int], surfels: Surfels) -> bytes:
         for i in range(width):
             data = np.ascontiguousarray(column[order, i], np.dtype(kind))
             parts += [np.ascontiguousarray(b).tobytes() for b in data.view(np.uint8).reshape(len(data), -1).T]
-    return pack(SURFEL_MAGIC, SURFEL_FORMAT, parts, level=_ZSTD_LEVEL)
+    return SurfelTile(pack(SURFEL_MAGIC, SURFEL_FORMAT, parts, level=_ZSTD_LEVEL), len(surfels))
 
 
 def _decode_tile(data: bytes) -> tuple[tuple[int, int], Surfels]:

@@ -155,7 +155,7 @@ class SurveySettings(Section, frozen=True):
 
     seed: int = 0
     occupancy_grid: bool = True
-    surfel_map: bool = False
+    surfel_map: bool = True
     odometry: OdometrySettings = OdometrySettings()
     orb: OrbSettings = OrbSettings(count=1200)
     stereo: StereoSettings = StereoSettings()

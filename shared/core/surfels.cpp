@@ -9,8 +9,8 @@ namespace {
 
 constexpr double kMaxSigmaShare = 0.06;  // standard deviation of a depth, as a share of it
 constexpr double kFootprintShare = 1.5;  // least edge of a voxel, in steps from pixel to pixel that merge in it
-// Square around a pixel whose disparities give the normal: half size and step, largest difference to its own, least number.
-constexpr ptrdiff_t kFitPx = 6, kFitStepPx = 2;
+// Square around a pixel whose disparities give the normal: half size in pixels and in samples, largest difference to its own, least number.
+constexpr ptrdiff_t kFitPx = 6, kLeastReach = 2, kMostReach = 3, kFitLanes = 8;
 constexpr float kFitApartPx = 1.0f;
 constexpr double kMinFit = 12.0;
 constexpr int kBits = 20;
@@ -30,30 +30,39 @@ constexpr double kHidden = 1e-4;  // share of the light at which a pixel is full
 
 inline double edge_of(int level) { return kEdgeM * double(1 << level); }
 
+// The edge of voxels for each metre of depth.
+inline double edges_per_m(double focal) { return kFootprintShare * stride_px(focal) / focal; }
+
 // Of a voxel that a camera sees at this depth.
-inline int level_at(double depth, double focal) {
+inline int level_at(double depth, double per_m) {
   int level = 0;
-  while (level < kLevels - 1 && edge_of(level) < kFootprintShare * kStridePx * depth / focal) ++level;
+  while (level < kLevels - 1 && edge_of(level) < per_m * depth) ++level;
   return level;
 }
 
-// The normal, in the camera and towards it, of the plane through the disparities around a pixel; false without one. A plane is affine in
+// The normal, in the camera and towards it, of the plane through the disparities around the pixel (u, v); false without one. corner: upper
+// left one of the square around it, in a picture of every stride-th disparity with rows so far apart. A plane is affine in
 // (u, v, disparity), so that its gradient is its normal: least squares over disparities like the middle one.
-bool fit_normal(Picture<const float> disparity, ptrdiff_t u, ptrdiff_t v, StereoLens lens, Vec3& normal) {
-  const float middle = disparity.row(v)[u];
-  double n = 0, su = 0, sv = 0, sd = 0, suu = 0, svv = 0, suv = 0, sud = 0, svd = 0;
-  for (ptrdiff_t dv = -kFitPx; dv <= kFitPx; dv += kFitStepPx) {
-    if (v + dv < 0 || v + dv >= disparity.height) continue;
-    const float* row = disparity.row(v + dv) + u;
-    for (ptrdiff_t du = -kFitPx; du <= kFitPx; du += kFitStepPx) {
-      if (u + du < 0 || u + du >= disparity.width) continue;
-      const float apart = row[du] - middle;
-      if (!(std::abs(apart) <= kFitApartPx)) continue;
-      const double x = double(du), y = double(dv), d = apart;
-      n += 1.0, su += x, sv += y, sd += d;
-      suu += x * x, svv += y * y, suv += x * y;
-      sud += x * d, svd += y * d;
+bool fit_normal(const float* corner, ptrdiff_t row_step, int stride, ptrdiff_t reach, double u, double v, StereoLens lens, Vec3& normal) {
+  const float middle = corner[reach * row_step + reach];
+  // Sums of a column each, to be made at once; the last ones are no part of the square.
+  float ns[kFitLanes] = {}, ds[kFitLanes] = {}, yns[kFitLanes] = {}, yyns[kFitLanes] = {}, yds[kFitLanes] = {};
+  for (ptrdiff_t row = 0; row <= 2 * reach; ++row) {
+    const float y = float((row - reach) * stride);
+    const float* const here = corner + row * row_step;
+    for (ptrdiff_t lane = 0; lane < kFitLanes; ++lane) {
+      const float apart = here[lane] - middle;
+      const bool is_like = std::abs(apart) <= kFitApartPx;  // false for NaN
+      const float one = is_like ? 1.0f : 0.0f, d = is_like ? apart : 0.0f;
+      ns[lane] += one, ds[lane] += d, yns[lane] += y * one, yyns[lane] += y * y * one, yds[lane] += y * d;
     }
+  }
+  double n = 0, su = 0, sv = 0, sd = 0, suu = 0, svv = 0, suv = 0, sud = 0, svd = 0;
+  for (ptrdiff_t lane = 0; lane <= 2 * reach; ++lane) {
+    const double x = double((lane - reach) * stride);
+    n += ns[lane], su += x * ns[lane], sv += yns[lane], sd += ds[lane];
+    suu += x * x * ns[lane], svv += yyns[lane], suv += x * yns[lane];
+    sud += x * ds[lane], svd += yds[lane];
   }
   if (n < kMinFit) return false;
   suu -= su * su / n, svv -= sv * sv / n, suv -= su * sv / n;
@@ -61,7 +70,7 @@ bool fit_normal(Picture<const float> disparity, ptrdiff_t u, ptrdiff_t v, Stereo
   const double determinant = suu * svv - suv * suv;
   if (determinant <= 1e-6) return false;
   const double a = (sud * svv - svd * suv) / determinant, b = (svd * suu - sud * suv) / determinant;
-  const double off_u = double(u) - lens.cx, off_v = double(v) - lens.cy;
+  const double off_u = u - lens.cx, off_v = v - lens.cy;
   normal = {-a * lens.focal, -b * lens.focal, -(double(middle) - a * off_u - b * off_v)};
   const double length = norm(normal), towards = dot(normal, {off_u / lens.focal, off_v / lens.focal, 1.0});
   if (length <= 0.0 || towards >= 0.0) return false;
@@ -70,6 +79,12 @@ bool fit_normal(Picture<const float> disparity, ptrdiff_t u, ptrdiff_t v, Stereo
 }
 
 }  // namespace
+
+int stride_px(double focal) {
+  int stride = 2;
+  while (stride < 4 && kEdgeM * focal / kFootprintShare >= stride + 0.5) ++stride;
+  return stride;
+}
 
 int64_t voxel_key(double x, double y, double z, int level) {
   const double edge = edge_of(level);
@@ -81,10 +96,11 @@ int64_t voxel_key(double x, double y, double z, int level) {
   return int64_t(key);
 }
 
-// Where the table has a key, or has room for it. Source: open addressing, Knuth vol. 3, 6.4; the mixing of splitmix64.
+// Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4; the
+// mixing of splitmix64.
 size_t VoxelTable::slot_of(int64_t key) const {
-  const uint64_t mask = slots_.size() - 1, mixed = uint64_t(key) * 0x9E3779B97F4A7C15;
-  uint64_t place = (mixed ^ (mixed >> 29)) & mask;
+  const uint64_t mask = slots_.size() - 1, mixed = uint64_t(key >> 3) * 0x9E3779B97F4A7C15;
+  uint64_t place = ((mixed ^ (mixed >> 29)) << 3 | uint64_t(key & 7)) & mask;
   while (slots_[place] >= 0 && voxels_[size_t(slots_[place])].key != key) place = (place + 1) & mask;
   return place;
 }
@@ -98,19 +114,29 @@ void VoxelTable::make_room(size_t more) {
   for (size_t i = 0; i < voxels_.size(); ++i) slots_[slot_of(voxels_[i].key)] = int32_t(i);
 }
 
-void VoxelTable::add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam) {
-  make_room(size_t((disparity.height + kStridePx - 1) / kStridePx) * size_t((disparity.width + kStridePx - 1) / kStridePx));
+void VoxelTable::add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam, const double* low,
+                     const double* high) {
+  make_room(size_t(disparity.height) * size_t(disparity.width));
   const SE3 pose = se3(map_from_cam);
-  for (ptrdiff_t v = 0; v < disparity.height; v += kStridePx)
-    for (ptrdiff_t u = 0; u < disparity.width; u += kStridePx) {
-      const float px = disparity.row(v)[u];
+  const int stride = stride_px(lens.focal);
+  const double per_m = edges_per_m(lens.focal);
+  const ptrdiff_t reach = std::clamp<ptrdiff_t>(kFitPx / stride, kLeastReach, kMostReach);
+  const ptrdiff_t row_step = disparity.width + kFitLanes;  // with unknown disparities all around
+  around_.assign(size_t((disparity.height + 2 * reach) * row_step + kFitLanes), std::numeric_limits<float>::quiet_NaN());
+  for (ptrdiff_t row = 0; row < disparity.height; ++row)
+    std::copy_n(disparity.row(row), disparity.width, around_.begin() + (row + reach) * row_step + reach);
+  for (ptrdiff_t row = 0; row < disparity.height; ++row)
+    for (ptrdiff_t column = 0; column < disparity.width; ++column) {
+      const float px = disparity.row(row)[column];
       if (!(px > 0.0f)) continue;
       const double z = lens.focal_baseline / px, sigma = z * z / lens.focal_baseline * sigma_px;
       if (!(z >= kMinRangeM && z <= kMaxRangeM) || sigma > kMaxSigmaShare * z) continue;
+      const double u = double(column * stride), v = double(row * stride);
+      const Vec3 point = pose * Vec3{(u - lens.cx) * z / lens.focal, (v - lens.cy) * z / lens.focal, z};
+      if (!(point[0] >= low[0] && point[0] < high[0] && point[1] >= low[1] && point[1] < high[1])) continue;
       Vec3 normal;
-      if (!fit_normal(disparity, u, v, lens, normal)) continue;
-      const int level = level_at(z, lens.focal);
-      const Vec3 point = pose * Vec3{(double(u) - lens.cx) * z / lens.focal, (double(v) - lens.cy) * z / lens.focal, z};
+      if (!fit_normal(around_.data() + row * row_step + column, row_step, stride, reach, u, v, lens, normal)) continue;
+      const int level = level_at(z, per_m);
       const Vec3 turned = pose.rotation * normal;
       const int64_t key = voxel_key(point[0], point[1], point[2], level);
       int32_t& slot = slots_[slot_of(key)];
@@ -148,27 +174,70 @@ size_t VoxelTable::surfels(float* points, float* normals, uint8_t* levels, int64
   return count;
 }
 
-void look_at(const float* points, const uint8_t* levels, size_t count, Picture<const float> nearest_px, double step_px, double sigma_px,
-             StereoLens lens, const double* cam_from_map, double clear_sigmas, double clear_m, uint8_t* marks, float* weights,
-             float* pixels) {
-  const SE3 pose = se3(cam_from_map);
+namespace {
+
+struct Look {
+  Mark mark = kUnseen;
+  float weight = 0.0f;
+  double u = 0.0, v = 0.0;
+};
+
+Look look(Vec3 point_cam, int level, double per_m, const DepthPicture& view) {
+  Look found;
+  const StereoLens& lens = view.lens;
+  const double depth = point_cam[2];
+  if (!(depth > kMinRangeM && depth < kMaxRangeM)) return found;
+  found.u = lens.focal * point_cam[0] / depth + lens.cx, found.v = lens.focal * point_cam[1] / depth + lens.cy;
+  const ptrdiff_t column = whole_or_outside(std::floor(found.u / view.step_px + 0.5)),
+                  row = whole_or_outside(std::floor(found.v / view.step_px + 0.5));
+  const Picture<const float>& nearest = view.nearest_px;
+  if (column < 0 || column >= nearest.width || row < 0 || row >= nearest.height || !(nearest.row(row)[column] > 0.0f)) return found;
+  const double shown = lens.focal_baseline / nearest.row(row)[column];
+  const double clear = view.clear_sigmas * shown * shown / lens.focal_baseline * view.sigma_px + view.clear_m;
+  found.weight = float(1 << 2 * std::max(0, level - level_at(depth, per_m)));
+  if (depth < shown - clear)
+    found.mark = kSeenThrough;
+  else if (depth < shown + clear)
+    found.mark = kSeen;
+  return found;
+}
+
+double bilinear(Picture<const uint8_t> picture, double u, double v) {
+  const double right = std::clamp(u, 0.0, double(picture.width) - 1.001), below = std::clamp(v, 0.0, double(picture.height) - 1.001);
+  const ptrdiff_t column = ptrdiff_t(right), row = ptrdiff_t(below);
+  const double x = right - double(column), y = below - double(row);
+  const uint8_t *const upper = picture.row(row) + column, *const lower = picture.row(row + 1) + column;
+  return (upper[0] * (1.0 - x) + upper[1] * x) * (1.0 - y) + (lower[0] * (1.0 - x) + lower[1] * x) * y;
+}
+
+}  // namespace
+
+void look_at(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, uint8_t* marks, float* pixels) {
+  const SE3 pose = se3(view.cam_from_map);
+  const double per_m = edges_per_m(view.lens.focal);
   for (size_t i = 0; i < count; ++i) {
-    marks[i] = kUnseen, weights[i] = 0.0f;
-    float* const pixel = pixels + 2 * i;
-    pixel[0] = pixel[1] = 0.0f;
+    const Look found = look(pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, levels[i], per_m, view);
+    marks[i] = found.mark, pixels[2 * i] = float(found.u), pixels[2 * i + 1] = float(found.v);
+  }
+}
+
+void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture,
+           Vec3 falloff, double log_exposure, double* sums) {
+  if (picture.height < 2 || picture.width < 2) return;
+  const SE3 pose = se3(view.cam_from_map);
+  const double per_squared = 1.0 / (view.lens.focal * view.lens.focal), per_m = edges_per_m(view.lens.focal);
+  for (size_t i = 0; i < count; ++i) {
     const Vec3 point = pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-    const double depth = point[2];
-    if (!(depth > kMinRangeM && depth < kMaxRangeM)) continue;
-    pixel[0] = float(lens.focal * point[0] / depth + lens.cx), pixel[1] = float(lens.focal * point[1] / depth + lens.cy);
-    const ptrdiff_t u = whole_or_outside(std::floor(pixel[0] / step_px + 0.5)), v = whole_or_outside(std::floor(pixel[1] / step_px + 0.5));
-    if (u < 0 || u >= nearest_px.width || v < 0 || v >= nearest_px.height || !(nearest_px.row(v)[u] > 0.0f)) continue;
-    const double shown = lens.focal_baseline / nearest_px.row(v)[u];
-    const double clear = clear_sigmas * shown * shown / lens.focal_baseline * sigma_px + clear_m;
-    weights[i] = float(1 << 2 * std::max(0, levels[i] - level_at(depth, lens.focal)));
-    if (depth < shown - clear)
-      marks[i] = kSeenThrough;
-    else if (depth < shown + clear)
-      marks[i] = kSeen;
+    const Look found = look(point, levels[i], per_m, view);
+    double* const sum = sums + 4 * i;
+    if (found.mark == kSeenThrough) sum[1] += found.weight;
+    if (found.mark != kSeen) continue;
+    sum[0] += 1.0;
+    const double off_u = found.u - view.lens.cx, off_v = found.v - view.lens.cy, squared = (off_u * off_u + off_v * off_v) * per_squared;
+    const double light = std::exp(log_exposure + squared * (falloff[0] + squared * (falloff[1] + squared * falloff[2])));
+    const double distance = dot(point, point), weight = 1.0 / (distance * distance);
+    sum[2] += bilinear(picture, found.u, found.v) / light * weight;
+    sum[3] += weight;
   }
 }
 

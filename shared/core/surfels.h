@@ -16,8 +16,10 @@ namespace fleetmap {
 // A voxel's edge is a power of two times kEdgeM, as fine as the pixel that falls into it: distant points are kept coarsely.
 constexpr double kEdgeM = 0.01;
 constexpr int kLevels = 5;
-constexpr int kStridePx = 2;  // of the pixels that are merged
 constexpr double kMinRangeM = 0.3, kMaxRangeM = 12.0;
+
+// One of so many pixels in a row or column is merged, so that a surface at a metre has voxels of kEdgeM: finer ones cost as the square.
+int stride_px(double focal);
 
 // The voxel of a point at a level, in 63 bits: 5 km each way at the finest level. Points farther out are clamped to that border.
 int64_t voxel_key(double x, double y, double z, int level);
@@ -25,9 +27,10 @@ int64_t voxel_key(double x, double y, double z, int level);
 // Voxels of one recording, extended view by view.
 class VoxelTable {
  public:
-  // Adds the points of a view, disparities in px, NaN unknown, of standard deviation sigma_px. Points and normals are means by the
-  // inverse variance of the depth.
-  void add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam);
+  // Adds the points of a view that lie in the box from low to high (x, y) of the map. disparity: of every stride_px-th pixel, NaN unknown, of
+  // standard deviation sigma_px. Points and normals are means by the inverse variance of the depth.
+  void add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam, const double* low,
+           const double* high);
   // Fills mean points (N, 3) in map, unit normals (N, 3), levels (N,), and numbers of views, of those voxels whose normals do
   // not cancel out; returns their number.
   size_t surfels(float* points, float* normals, uint8_t* levels, int64_t* views) const;
@@ -45,17 +48,29 @@ class VoxelTable {
   std::vector<Voxel> voxels_;
   std::vector<int32_t> slots_;  // of a power of two, at most half of them taken: numbers of voxels, -1 none
   int32_t views_ = 0;
+  std::vector<float> around_;  // of the view that is added
 };
 
 enum Mark : uint8_t { kUnseen, kSeen, kSeenThrough };
 
-// Evidence of a view on `count` points (N, 3) in map of voxels of these levels (N,): marks (N,). nearest_px: of every step_px-th pixel the
-// largest disparity around it, 0 where its own is unknown. A point must lie clear_sigmas standard deviations of the depth, and clear_m,
-// before the pixel's depth to be seen through. weights (N,): weight, in views, of a view that sees more finely than the voxel
-// was seen, 0 without evidence; pixels (N, 2) of points in range, else 0.
-void look_at(const float* points, const uint8_t* levels, size_t count, Picture<const float> nearest_px, double step_px, double sigma_px,
-             StereoLens lens, const double* cam_from_map, double clear_sigmas, double clear_m, uint8_t* marks, float* weights,
-             float* pixels);
+// Depths of a view. nearest_px: of every step_px-th pixel the largest disparity around it, 0 where its own is unknown. A point must lie
+// clear_sigmas standard deviations of the depth, and clear_m, before the pixel's depth to be seen through.
+struct DepthPicture {
+  Picture<const float> nearest_px;
+  double step_px, sigma_px;
+  StereoLens lens;
+  const double* cam_from_map;
+  double clear_sigmas, clear_m;
+};
+
+// Evidence of a view on `count` points (N, 3) in map of voxels of these levels (N,): marks (N,), and pixels (N, 2) of points in range, else 0.
+void look_at(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, uint8_t* marks, float* pixels);
+
+// Adds what a view says of points, as of `look_at`, to sums (N, 4): 1 if it sees the point; its weight in views if it sees through it, as
+// a view that sees more finely than the voxel was seen counts more; and, of seen points, the grey level of the picture relative to the
+// exposure and to the lens, of these coefficients by powers of the squared tangent, over distance^4, and 1 over distance^4.
+void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture,
+           Vec3 falloff, double log_exposure, double* sums);
 
 // A lens that bends nothing, in pixels; fx is 0 for any other.
 struct Pinhole {

@@ -406,9 +406,11 @@ class BlockCholesky:
 # --- surfels: lengths in metres, points, normals and pixels (N, ...) in `map` or the camera, poses (4, 4), lens (4,) as of StereoCamera ---
 SURFEL_EDGE_M: float
 SURFEL_LEVELS: int
-SURFEL_STRIDE_PX: int
 SURFEL_RANGE_M: tuple[float, float]
 SPLAT_LEAST_ALPHA: float
+
+def surfel_stride_px(focal_px: float) -> int:
+    """One of so many pixels in a row or column is merged."""
 
 def voxel_keys(points_map: _Floats, levels: _Grey) -> _Indices:
     """(N,) voxel keys of points at these levels."""
@@ -417,8 +419,11 @@ class VoxelTable:
     """Voxels of one recording, extended view by view."""
 
     def __init__(self) -> None: ...
-    def add(self, disparity_px: _Floats, sigma_px: float, lens: _Reals, map_from_cam: _Reals) -> None:
-        """Merge the points of a view (H, W) into voxels; NaN is unknown."""
+    def add(self, disparity_px: _Floats, sigma_px: float, lens: _Reals, map_from_cam: _Reals, box_map: _Reals) -> None:
+        """Merge the points of a view within x and y of a box (2, 2) into voxels.
+
+        disparity_px (H, W): of every surfel_stride_px-th pixel, NaN unknown.
+        """
 
     def surfels(self) -> tuple[_Floats, _Floats, _Grey, _Indices]:
         """Points, normals and levels of the voxels, and the number of views of each."""
@@ -433,8 +438,28 @@ def look_at(
     cam_from_map: _Reals,
     clear_sigmas: float,
     clear_m: float,
-) -> tuple[_Grey, _Floats, _Pixels]:
-    """Marks (N,), 1 seen, 2 seen through, 0 neither; the weight of the view in views; pixels of the points."""
+) -> tuple[_Grey, _Pixels]:
+    """Marks (N,), 1 seen, 2 seen through, 0 neither; pixels of the points."""
+
+def weigh(
+    points_map: _Floats,
+    levels: _Grey,
+    nearest_px: _Floats,
+    step_px: int,
+    sigma_px: float,
+    lens: _Reals,
+    cam_from_map: _Reals,
+    clear_sigmas: float,
+    clear_m: float,
+    picture: _Grey,
+    falloff: _Reals,
+    log_exposure: float,
+    sums: _Reals,
+) -> None:
+    """Add a view, as of `look_at`, to sums (N, 4).
+
+    1 for a seen point, the weight in views for one seen through, the corrected grey level of a seen one over distance^4, 1 over distance^4.
+    """
 
 def discs_before(
     points_map: _Floats,

@@ -13,6 +13,7 @@ from fleetmap.geometry import Array
 NUMBERS = np.zeros(3, np.int32)
 POINTS, LEVELS, POSE, LENS = np.zeros((3, 3), np.float32), np.zeros(3, np.uint8), np.eye(4), np.ones(4)
 CENTRES, RAYS, DEPTHS = np.zeros((3, 3)), np.zeros((20, 30, 3)), np.ones((20, 30), np.float32)
+LOOKS = POINTS, LEVELS, DEPTHS, 4, 0.3, LENS, POSE, 3.0, 0.05
 CELLS, VOXELS = np.full((7, 8), 255, np.uint8), np.zeros((7, 8, 8), np.uint8)
 WINDOW = VOXELS.astype(np.uint16), VOXELS, np.zeros((7, 8, 2), np.uint8)
 TILE = *np.zeros((3, 5, 5, 8), np.uint8), np.zeros((5, 5, 4), np.uint8)
@@ -117,6 +118,7 @@ def test_products_are_rounded_before_they_are_added() -> None:
         (lambda: core.voxel_keys(POINTS, LEVELS + np.uint8(5)), "levels"),
         (lambda: core.look_at(POINTS, LEVELS[:2], DEPTHS, 4, 0.3, LENS, POSE, 3.0, 0.05), "levels"),
         (lambda: core.look_at(POINTS, LEVELS, DEPTHS, 0, 0.3, LENS, POSE, 3.0, 0.05), "step_px"),
+        (lambda: core.weigh(*LOOKS, CELLS, np.zeros(3), 0.0, np.zeros((2, 4))), "sums"),
         (lambda: core.discs_before(POINTS, POINTS[:2], POSE, 0.3, 9.0, LENS, 30, 20), "normals_map"),
         (lambda: drawn(numbers=NUMBERS + 3), "numbers"),
         (lambda: drawn(pixels=np.zeros((2, 2))), "pixels"),
@@ -152,10 +154,12 @@ def test_hostile_numbers_lead_nowhere(seed: int) -> None:
         return reals(*shape).astype(np.float32)
 
     table, points, normals, cam_from_map = core.VoxelTable(), floats(3, 3), floats(3, 3), reals(4, 4)
-    table.add(floats(12, 14), one(), reals(4), cam_from_map)
+    table.add(floats(12, 14), one(), reals(4), cam_from_map, reals(2, 2))
     assert len({len(column) for column in table.surfels()}) == 1
     assert len(core.voxel_keys(points, LEVELS)) == 3
-    core.look_at(points, LEVELS, floats(5, 6), 4, one(), reals(4), cam_from_map, one(), 0.05)
+    looks = points, LEVELS, floats(5, 6), 4, one(), reals(4), cam_from_map, one(), 0.05
+    core.look_at(*looks)
+    core.weigh(*looks, np.zeros((20, 24), np.uint8), reals(3), one(), np.zeros((3, 4)))
     core.discs_before(points, normals, cam_from_map, one(), one(), reals(4), 30, 20)
     window = core.cast_view(floats(12, 14), floats(12, 14), one(), reals(4), reals(3, 3), reals(3), CELLS)
     for row, column in rng.choice([-(1 << 31), -3, 0, 2, (1 << 31) - 1], (4, 2)).tolist():

@@ -44,10 +44,10 @@ auto voxel_keys_of(const Points& points_map, const Levels& levels) {
 // A table whose calls come one after the other, whichever threads they are from.
 class Table {
  public:
-  void add(const Image32& disparity_px, double sigma_px, const Lens& lens, const Pose& map_from_cam) {
+  void add(const Image32& disparity_px, double sigma_px, const Lens& lens, const Pose& map_from_cam, const Array<double, 2, 2>& box_map) {
     unlocked([&] {
       const std::lock_guard alone(mutex_);
-      table_.add(picture(disparity_px), sigma_px, lens_of(lens), map_from_cam.data());
+      table_.add(picture(disparity_px), sigma_px, lens_of(lens), map_from_cam.data(), box_map.data(), box_map.data() + 2);
     });
   }
   auto surfels() {
@@ -69,19 +69,33 @@ class Table {
   VoxelTable table_;
 };
 
+DepthPicture depth_picture(const Image32& nearest_px, int step_px, double sigma_px, const Lens& lens, const Pose& cam_from_map,
+                           double clear_sigmas, double clear_m) {
+  if (step_px < 1) throw nb::value_error("step_px: at least 1");
+  return {picture(nearest_px), double(step_px), sigma_px, lens_of(lens), cam_from_map.data(), clear_sigmas, clear_m};
+}
+
 auto look_at_of(const Points& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px, const Lens& lens,
                 const Pose& cam_from_map, double clear_sigmas, double clear_m) {
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
-  if (step_px < 1) throw nb::value_error("step_px: at least 1");
+  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
   auto marks = zeros<uint8_t>(count);
-  auto weights = zeros<float>(count), pixels = zeros<float>(2 * count);
+  auto pixels = zeros<float>(2 * count);
+  unlocked([&] { look_at(points_map.data(), levels.data(), count, view, marks.data(), pixels.data()); });
+  return std::tuple(as_numpy<uint8_t>(std::move(marks)), as_numpy<float, 2>(std::move(pixels), {count, 2}));
+}
+
+void weigh_of(const Points& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px, const Lens& lens,
+              const Pose& cam_from_map, double clear_sigmas, double clear_m, const Array<uint8_t, -1, -1>& seen,
+              const Array<double, 3>& falloff, double log_exposure, const MutableArray<double, -1, 4>& sums) {
+  const size_t count = points_map.shape(0);
+  check_levels(levels, count);
+  if (sums.shape(0) != count) throw nb::value_error("sums: a row for each point");
+  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
   unlocked([&] {
-    look_at(points_map.data(), levels.data(), count, picture(nearest_px), step_px, sigma_px, lens_of(lens), cam_from_map.data(),
-            clear_sigmas, clear_m, marks.data(), weights.data(), pixels.data());
+    weigh(points_map.data(), levels.data(), count, view, picture(seen), vec3(falloff.data()), log_exposure, sums.data());
   });
-  return std::tuple(as_numpy<uint8_t>(std::move(marks)), as_numpy<float>(std::move(weights)),
-                    as_numpy<float, 2>(std::move(pixels), {count, 2}));
 }
 
 auto discs_before_of(const Points& points_map, const Points& normals_map, const Pose& cam_from_map, double cosine, double far_m,
@@ -156,20 +170,22 @@ auto blend_backward_of(const Pairs& pixels, const Triples& conics, const Pairs& 
 void bind_surfels(nb::module_& module) {
   module.attr("SURFEL_EDGE_M") = kEdgeM;
   module.attr("SURFEL_LEVELS") = kLevels;
-  module.attr("SURFEL_STRIDE_PX") = kStridePx;
   module.attr("SPLAT_LEAST_ALPHA") = kLeastAlpha;
   module.attr("SURFEL_RANGE_M") = std::tuple(kMinRangeM, kMaxRangeM);
   const auto points_map = "points_map"_a.noconvert(), levels = "levels"_a.noconvert(), lens = "lens"_a.noconvert();
   const auto normals_map = "normals_map"_a.noconvert(), cam_from_map = "cam_from_map"_a.noconvert(), pixels = "pixels"_a.noconvert();
   const auto conics = "conics"_a.noconvert(), reaches_px = "reaches_px"_a.noconvert(), peaks = "peaks"_a.noconvert(),
              greys = "greys"_a.noconvert();
+  module.def("surfel_stride_px", &stride_px, "focal_px"_a);
   module.def("voxel_keys", &voxel_keys_of, points_map, levels);
   nb::class_<Table>(module, "VoxelTable")
       .def(nb::init<>())
-      .def("add", &Table::add, "disparity_px"_a.noconvert(), "sigma_px"_a, lens, "map_from_cam"_a.noconvert())
+      .def("add", &Table::add, "disparity_px"_a.noconvert(), "sigma_px"_a, lens, "map_from_cam"_a.noconvert(), "box_map"_a.noconvert())
       .def("surfels", &Table::surfels);
   module.def("look_at", &look_at_of, points_map, levels, "nearest_px"_a.noconvert(), "step_px"_a, "sigma_px"_a, lens, cam_from_map,
              "clear_sigmas"_a, "clear_m"_a);
+  module.def("weigh", &weigh_of, points_map, levels, "nearest_px"_a.noconvert(), "step_px"_a, "sigma_px"_a, lens, cam_from_map,
+             "clear_sigmas"_a, "clear_m"_a, "picture"_a.noconvert(), "falloff"_a.noconvert(), "log_exposure"_a, "sums"_a.noconvert());
   module.def("discs_before", &discs_before_of, points_map, normals_map, cam_from_map, "cosine"_a, "far_m"_a, "pinhole"_a.noconvert(),
              "width"_a, "height"_a);
   module.def("draw_discs", &draw_discs_of, "numbers"_a.noconvert(), "points_cam"_a.noconvert(), pixels, cam_from_map, normals_map, levels,

@@ -24,8 +24,8 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, occupancy
 from fleetsim.recorder import Order, Session, prepare
-from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m
-from mapserver.grid.site_grid import SessionViews, updated
+from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m, nearest_around
+from mapserver.grid.site_grid import REACH_PX, SessionViews, updated
 
 RADIUS_M = 0.3
 
@@ -43,7 +43,8 @@ def views_from_truth(session: Session, every: int, before: Tiles) -> SessionView
     assert floor_m is not None
     views = SessionViews(before)
     for disparity, place in seen:
-        views.add(disparity, rectifier.camera, place, floor_m)
+        px, sigma_px = disparity
+        views.add((px, nearest_around(px, REACH_PX), sigma_px), rectifier.camera, place, floor_m)
     views.add_path(np.array([place[:3, 3] for _, place in seen]), floor_m)
     return views
 

@@ -11,8 +11,8 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import FLOOR_M, SLICE_M, SLICES, Counts, occupancy
-from mapserver.grid.dense_stereo import floor_distance_m
-from mapserver.grid.site_grid import SessionViews, height_map, updated
+from mapserver.grid.dense_stereo import floor_distance_m, nearest_around
+from mapserver.grid.site_grid import REACH_PX, SessionViews, height_map, updated
 
 CAMERA = StereoCamera(60.0, 31.5, 23.5, 0.12, 64, 48)
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -102,7 +102,7 @@ def wall_views(
         depth = np.where(hits, np.minimum(depth, to_wall), depth)
         disparity = np.where(np.isfinite(depth), lens.focal_px * lens.baseline_m / depth, np.nan).astype(np.float32)
         map_from_cam = se3(OPTICAL, np.array([x, 0.02, 5.0 + HEIGHT_M]))
-        views.add((disparity, 0.3), lens, map_from_cam, HEIGHT_M)
+        views.add((disparity, nearest_around(disparity, REACH_PX), 0.3), lens, map_from_cam, HEIGHT_M)
     return views
 
 
@@ -155,7 +155,12 @@ def test_nothing_is_free_beside_the_edge_of_a_thing() -> None:
     views = SessionViews()
     for _ in range(8):
         disparity[:, 296:304] = px / 5.0  # an edge that lies 4 px within the post
-        views.add((disparity, 0.3), lens, se3(OPTICAL, np.array([0.0, 0.0, HEIGHT_M])), HEIGHT_M)
+        views.add(
+            (disparity, nearest_around(disparity, REACH_PX), 0.3),
+            lens,
+            se3(OPTICAL, np.array([0.0, 0.0, HEIGHT_M])),
+            HEIGHT_M,
+        )
     grid = occupancy(updated(views), 0.8)
     left_m = (319.5 - 302) * 2.0 / 420.0
     assert cell(grid, 1.5, left_m * 0.75) == 0

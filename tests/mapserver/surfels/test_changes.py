@@ -11,7 +11,7 @@ from fleetmap.geometry import se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.grid.survey_grid import GridSession
 from mapserver.surfels.changes import APPEARED, VANISHED, SeenSite, changes_between, changes_geojson, changes_png
-from mapserver.surfels.surfel_map import Surfels
+from mapserver.surfels.surfel_map import Surfels, SurfelTiles
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT
 from support.storage.room_sessions import Seen, grown_surfels, ride, session_at
 
@@ -40,12 +40,13 @@ def with_board(session: GridSession) -> GridSession:
 @pytest.fixture(scope="module")
 def rooms() -> tuple[Surfels, Surfels, Surfels]:
     """The room, the night in which the board came, and the one in which it went again."""
-    versions = [NONE]
+    versions = [SurfelTiles()]
     for number in range(3):
         session = session_at(PLACES, has_depth=True)
         session = with_board(session) if number == 1 else session
         versions.append(grown_surfels(versions[-1], [session])[0])
-    return versions[1], versions[2], versions[3]
+    bare, board, bare_again = (tiles.joined() for tiles in versions[1:])
+    return bare, board, bare_again
 
 
 def site(surfels: Surfels) -> SeenSite:

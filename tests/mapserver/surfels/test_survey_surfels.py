@@ -7,16 +7,16 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.grid.survey_grid import GridSession
 from mapserver.surfels.expected_view import expected_view, pinhole
 from mapserver.surfels.exposure import Sample, estimate_exposure, lens_factor
-from mapserver.surfels.surfel_map import Surfels, encode_surfels
+from mapserver.surfels.surfel_map import SurfelTiles
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.storage.room_sessions import CAMERA, Seen, grown_surfels, ride, session_at
 from support.worlds.box_room import ROOM_M, stereo_pair
 
-NONE = Surfels.joined([])
+NONE = SurfelTiles()
 PLACES = ride([0.8] * 16)
 
 
-def grown(session: GridSession, before: Surfels = NONE) -> Surfels:
+def grown(session: GridSession, before: SurfelTiles = NONE) -> SurfelTiles:
     surfels, without = grown_surfels(before, [session])
     assert without == {}
     return surfels
@@ -25,7 +25,8 @@ def grown(session: GridSession, before: Surfels = NONE) -> Surfels:
 @pytest.mark.parametrize("has_depth", [False, True])
 def test_a_room_is_shown_as_a_frame_that_was_left_out_saw_it(has_depth: bool) -> None:
     kept = [place for i, place in enumerate(PLACES) if i != 7]
-    surfels = grown(session_at(kept, has_depth=has_depth))
+    tiles = grown(session_at(kept, has_depth=has_depth))
+    surfels = tiles.joined()
     off = np.abs(surfels.points_map[:, None] - ROOM_M).min(axis=(1, 2))
     assert (off < 0.1).mean() > 0.97
     picture = stereo_pair(PLACES[7], 0).left.astype(float)
@@ -34,7 +35,7 @@ def test_a_room_is_shown_as_a_frame_that_was_left_out_saw_it(has_depth: bool) ->
     error = (view.picture - picture)[~view.unknown]
     flat = (picture - picture.mean())[~view.unknown]
     assert (error**2).mean() < 0.1 * (flat**2).mean()
-    assert encode_surfels(surfels) == encode_surfels(grown(session_at(kept, has_depth=has_depth)))
+    assert tiles.blobs() == grown(session_at(kept, has_depth=has_depth)).blobs()
 
 
 def with_box(session: GridSession, shown: range, depth_m: float = 1.2) -> GridSession:
@@ -47,9 +48,9 @@ def with_box(session: GridSession, shown: range, depth_m: float = 1.2) -> GridSe
     return session
 
 
-def in_the_way(surfels: Surfels) -> int:
+def in_the_way(surfels: SurfelTiles) -> int:
     """Surfels in the room's middle, where nothing of the room is."""
-    return int((np.abs(surfels.points_map[:, None] - ROOM_M).min(axis=(1, 2)) > 0.3).sum())
+    return int((np.abs(surfels.joined().points_map[:, None] - ROOM_M).min(axis=(1, 2)) > 0.3).sum())
 
 
 def test_what_later_views_see_through_is_gone_and_what_stands_stays() -> None:
@@ -89,11 +90,11 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
     first = grown(exposed(factors))
     second = grown(exposed(factors * 0.5), first)
     plain = stereo_pair(PLACES[6], 0).left
-    for surfels, factor in ((first, factors[6]), (second, 0.5 * factors[6])):
-        view = expected_view(surfels, pinhole(CAMERA), PLACES[6] @ BODY_FROM_CAM0)
+    for tiles, factor in ((first, factors[6]), (second, 0.5 * factors[6])):
+        view = expected_view(tiles.joined(), pinhole(CAMERA), PLACES[6] @ BODY_FROM_CAM0)
         ratio = np.median(view.picture[~view.unknown] / np.maximum(plain[~view.unknown] * factor, 1.0))
         assert abs(ratio - 1.0) < 0.12
-    shown = [np.median(surfels.greys) for surfels in (first, second)]
+    shown = [np.median(tiles.joined().greys) for tiles in (first, second)]
     assert abs(shown[1] / shown[0] - 1) < 0.1
 
 

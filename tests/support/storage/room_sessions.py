@@ -11,7 +11,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.version_grid import Tiles
 from mapserver.grid.survey_grid import GridGrower, GridSession, grow
-from mapserver.surfels.surfel_map import Surfels
+from mapserver.surfels.surfel_map import SurfelTiles
 from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
@@ -63,7 +63,7 @@ def grown_grid(before: Tiles, sessions: Sequence[GridSession]) -> tuple[Tiles, d
     return grower.tiles, without["grid"]
 
 
-def grown_surfels(before: Surfels, sessions: Sequence[GridSession]) -> tuple[Surfels, dict[str, str]]:
+def grown_surfels(before: SurfelTiles, sessions: Sequence[GridSession]) -> tuple[SurfelTiles, dict[str, str]]:
     """Surfels after these sessions, and why recordings add nothing."""
     grower = SurfelGrower(before)
     without = grow({"surfels": grower}, sessions, StereoSettings())
