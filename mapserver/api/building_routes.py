@@ -3,7 +3,8 @@
 A file is sent as the body; author and reason are then in the query.
 """
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -20,12 +21,28 @@ from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.store import MapStore
 
+_MOST_ALIGNMENTS = 2  # at once: each may hold a picture of many MB
+
 
 async def _body(request: Request) -> bytes:
     return await request.body()
 
 
+class _FewAtOnce:
+    """The body of a request that costs memory and CPU: 429 while as many others go on."""
+
+    def __init__(self, most: int) -> None:
+        self._free = asyncio.Semaphore(most)
+
+    async def __call__(self, request: Request) -> AsyncIterator[bytes]:
+        if self._free.locked():
+            raise HTTPException(429, "other alignments go on; try again when one has ended", {"Retry-After": "5"})
+        async with self._free:
+            yield await request.body()
+
+
 File = Annotated[bytes, Depends(_body)]
+PlanFile = Annotated[bytes, Depends(_FewAtOnce(_MOST_ALIGNMENTS))]
 _WHAT = "the ETag of the areas that are changed: 412 if somebody changed them since"
 IfMatch = Annotated[str | None, Header(pattern=r'^(\*|(W/)?"[0-9a-f]{64}")$', description=_WHAT, examples=["*"])]
 _PIN = "NAME=PX,PY:X,Y: pixels right and down in the plan, and metres in `map`; at least two"
@@ -75,7 +92,7 @@ def install_building_routes(app: FastAPI, store: MapStore) -> None:
 
     @app.put("/v1/sites/{site}/alignment", openapi_extra=_file("application/octet-stream"))
     def set_alignment(
-        site: p.Site, by: By, data: File, pin: Pins, plan: PlanName = None, metres_per_pixel: Scale = None
+        site: p.Site, by: By, data: PlanFile, pin: Pins, plan: PlanName = None, metres_per_pixel: Scale = None
     ) -> dict[str, Any]:
         """Align the map with the picture of a floor plan (PNG, JPEG, TIFF, BMP or PGM), or with pins alone, as `mapserver align`."""
         store.current(site)

@@ -104,9 +104,7 @@ def install_inbox_routes(app: FastAPI, store: MapStore, nights: NightRuns | None
         who = actor_of(request, act.actor, act.reason)
         if site not in sites_of(runs().inbox):
             raise StateError(f"nothing was ever uploaded for site {site}; upload a recording first")
-        job = runs().start(site)
-        log("build_started", f"job {job.id}", site, who)
-        return job
+        return runs().start(site, lambda: log("build_started", "of what waits in the inbox", site, who))
 
     @app.get("/v1/jobs/{job}/log", response_class=Response, responses={200: _TEXT})
     def job_log(job: Number) -> Response:

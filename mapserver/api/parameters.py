@@ -23,6 +23,7 @@ Item = TypeVar("Item")
 Site = Annotated[str, Path(pattern=NAME_PATTERN, examples=["hall"])]
 Robot = Annotated[str, Path(pattern=NAME_PATTERN, examples=["tug-7"])]
 Operator = Annotated[str, Path(pattern=OPERATOR_PATTERN, examples=["ada"])]
+TokenNumber = Annotated[str, Path(pattern="^[0-9a-f]{12}$", examples=["3fa9c1d25e7b"])]
 RequestId = Annotated[str, Path(pattern="^[0-9a-f]{8}$", examples=["3fa9c1d2"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]

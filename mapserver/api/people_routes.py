@@ -25,7 +25,9 @@ def operators_of(store: MapStore) -> list[views.OperatorView]:
     """Return operators and programs with their valid tokens, by name."""
     tokens: dict[str, list[views.TokenView]] = {}
     for token in store.operators.tokens(store.now_ns()):
-        tokens.setdefault(token.name, []).append(views.TokenView(token.scopes.split(), token.ends_ns))
+        tokens.setdefault(token.name, []).append(
+            views.TokenView(token.sha256[:12], token.scopes.split(), token.ends_ns)
+        )
     return [
         views.OperatorView(row.name, row.role, bool(row.is_disabled), row.sessions, tokens.get(row.name, []))
         for row in Operators(store).all()
@@ -91,6 +93,12 @@ def _install_operator_routes(app: FastAPI, store: MapStore, operators: Operators
         _check_has(request, act.scopes)
         response.headers.update(_ONCE)
         return views.Secret(act.name, operators.make_token(act.name, act.scopes, act.days, actor))
+
+    @app.post("/v1/tokens/{number}/revoke")
+    def revoke_token(request: Request, number: p.TokenNumber, act: views.Act) -> views.ServiceState:
+        """End one token at once; the other tokens of its owner stay."""
+        store.operators.revoke_token(number, actor_of(request, act.actor, act.reason))
+        return views.ServiceState("ok")
 
 
 def _install_robot_routes(app: FastAPI, store: MapStore, bus: Bus | None) -> None:

@@ -18,7 +18,8 @@ MAX_BODY_BYTES = 1 << 20  # an action has about 100 bytes
 _FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES, "inbox": UPLOAD_BYTES}
 _FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment|inbox)(/[^/]+)?")
 SIGN_IN_BYTES = 4 << 10  # accepted without authentication
-BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete; of an upload until its next piece
+BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
+UPLOAD_BYTES_IN_BODY_S = 300_000  # least of an upload: 64 GB by the slowest radio would hold its place for months
 
 
 class RequestLimits:
@@ -53,22 +54,28 @@ class RequestLimits:
         taken, is_whole, is_refused, is_answered = 0, False, False, False
         loop = asyncio.get_running_loop()
         until_s = loop.time() + within_s
+        due = UPLOAD_BYTES_IN_BODY_S  # taken by then
 
         async def limited() -> Message:
-            nonlocal taken, is_whole, is_refused
+            nonlocal taken, is_whole, is_refused, until_s, due
             if is_refused:
                 return {"type": "http.disconnect"}
             refusal = too_large
-            end_s = loop.time() + within_s if is_upload else until_s
             try:
                 # After the body this waits until the connection closes.
-                async with asyncio.timeout_at(None if is_whole or is_answered else end_s):
+                async with asyncio.timeout_at(None if is_whole or is_answered else until_s):
                     message = await receive()
             except TimeoutError:
                 refusal = 408, f"the body was not complete within {within_s:g} s"
+                if is_upload:
+                    brought = taken - due + UPLOAD_BYTES_IN_BODY_S
+                    words = f"{within_s:g} s brought {brought} bytes of the upload, less than {UPLOAD_BYTES_IN_BODY_S}"
+                    refusal = 408, f"{words}; use a faster connection"
             else:
                 taken += len(message.get("body", b""))
                 is_whole = is_whole or not message.get("more_body", False)
+                if is_upload and taken >= due:
+                    until_s, due = loop.time() + within_s, taken + UPLOAD_BYTES_IN_BODY_S
                 if taken <= most_bytes:
                     return message
             if not is_answered:

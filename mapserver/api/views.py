@@ -188,8 +188,9 @@ class CanaryView:
 
 @dataclass(frozen=True, slots=True)
 class TokenView:
-    """A valid token: its scopes and its end. The token itself is not stored."""
+    """A valid token: its number, its scopes and its end. The token itself is not stored."""
 
+    number: str
     scopes: list[str]
     ends_ns: int
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -23,20 +24,6 @@ _BEGIN_WITHIN_S = 60.0
 _STOP_WITHIN_S = 3.0
 _NICE = 10  # robots are served first
 _LOG_BYTES = 4000
-# A run whose server was killed ends, too: it then reads the end of its input. A shell's background process would ignore SIGINT.
-_RUN = """
-import os, signal, sys, threading
-
-def end_with_server():
-    os.read(0, 1)
-    os.kill(os.getpid(), signal.SIGINT)
-
-signal.signal(signal.SIGINT, signal.default_int_handler)
-threading.Thread(target=end_with_server, daemon=True).start()
-sys.argv[0] = "mapserver"
-from mapserver.cli import main
-main()
-"""
 _log = logging.getLogger(__name__)
 
 
@@ -49,22 +36,25 @@ class NightRuns:
         self._run: tuple[str, subprocess.Popen[bytes]] | None = None
         self._input, self._kept_open = os.pipe()
 
-    def start(self, site: str) -> JobInfo:
-        """Start a run of a site and return its job, once it has one.
+    def start(self, site: str, log: Callable[[], None] = lambda: None) -> JobInfo:
+        """Start a run of a site and return its job, once it has one. log: called right before the run begins.
 
         Raises StateError while a run of this server goes on, FleetmapError with the message of a run that ends without a job.
         """
         if not self._lock.acquire(blocking=False):
             raise StateError("another build is being started; try again in a minute")
         try:
-            return self._begun(site)
+            return self._begun(site, log)
         finally:
             self._lock.release()
 
-    def _begun(self, site: str) -> JobInfo:
+    def _begun(self, site: str, log: Callable[[], None]) -> JobInfo:
         if self._run is not None and self._run[1].poll() is None:
             raise StateError(f"a build of site {self._run[0]} runs already; start this one when it has ended")
-        with TemporaryFile() as errors:
+        with disk_errors("a build cannot be started", "see the space of the disk with temporary files"):
+            file = TemporaryFile()  # noqa: SIM115  closed below
+        with file as errors:
+            log()
             last = max((job.id for job in self._store.jobs(site, limit=1)), default=0)
             process = self._started(site, errors.fileno())
             self._run = site, process
@@ -104,7 +94,16 @@ class NightRuns:
     def _started(self, site: str, errors: int) -> "subprocess.Popen[bytes]":
         options = ["--site", site, "--inbox", str(self.inbox / site), "--store", str(self._store.folder)]
         config = [] if self._config is None else ["--config", str(self._config)]
-        command = [sys.executable, "-c", _RUN, *config, "nightly", *options, "--settle-s", f"{SETTLE_S:g}"]
+        command = [
+            sys.executable,
+            "-m",
+            "mapserver.end_with_server",
+            *config,
+            "nightly",
+            *options,
+            "--settle-s",
+            f"{SETTLE_S:g}",
+        ]
         with disk_errors("a build cannot be started", "see the memory of this machine", FleetmapError):
             process = subprocess.Popen(
                 command,

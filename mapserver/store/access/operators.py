@@ -36,12 +36,13 @@ class SessionRow:
 
 @dataclass(frozen=True, slots=True)
 class TokenRow:
-    """A token: its owner, its scopes (separated by spaces) and its end."""
+    """A token: its owner, its scopes (separated by spaces), its end and its hash."""
 
     name: str
     role: str
     scopes: str
     ends_ns: int
+    sha256: str = ""
 
 
 class OperatorQueries:
@@ -79,8 +80,8 @@ class OperatorQueries:
         """Return the tokens that are valid now, by name and end."""
         return self._transactions.rows(
             TokenRow,
-            """SELECT name, role, scopes, ends_ns FROM tokens JOIN operators USING (name)
-               WHERE ends_ns > ? ORDER BY name, ends_ns""",
+            """SELECT name, role, scopes, ends_ns, sha256 FROM tokens JOIN operators USING (name)
+               WHERE ends_ns > ? ORDER BY name, ends_ns, sha256""",
             (now_ns,),
         )
 
@@ -173,6 +174,16 @@ class OperatorQueries:
             values = (sha256, token.name, token.scopes, token.ends_ns)
             connection.execute("INSERT INTO tokens (sha256, name, scopes, ends_ns) VALUES (?, ?, ?, ?)", values)
             self._transactions.log(connection, "", LogEntry("token made", f"{token.name}: {token.scopes}", None, actor))
+
+    def revoke_token(self, number: str, actor: Actor) -> None:
+        """End a token, named by the beginning of its hash, at once. UsageError for an unknown one."""
+        with self._transactions.write() as connection:
+            named = "FROM tokens WHERE substr(sha256, 1, length(?1)) = ?1"
+            found = connection.execute(f"SELECT name, scopes {named}", (number,)).fetchone()
+            if found is None:
+                raise UsageError(f"no token has the number {number}; it may have been revoked already")
+            connection.execute(f"DELETE {named}", (number,))
+            self._transactions.log(connection, "", LogEntry("token revoked", f"{found[0]}: {found[1]}", None, actor))
 
     def token(self, sha256: str) -> TokenRow | None:
         """Return the token of this hash, unless its operator is disabled; the caller checks its end."""

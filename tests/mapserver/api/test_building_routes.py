@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import anyio
 import cv2
 import httpx
 import numpy as np
@@ -13,9 +14,10 @@ from typer.testing import CliRunner
 from mapserver.cli import app
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
-from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import Server, check_problem, raw_put, served_api
 
 AREAS, ALIGNMENT = "/v1/sites/lab/areas", "/v1/sites/lab/alignment"
+END = {"type": "http.request", "body": b"x"}
 ADA = {"actor": "ada", "reason": "racks were moved"}
 # The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
 PINS = ["a=200,400:0,0", "b=200,0:20,0", "c=0,400:0,10"]
@@ -106,6 +108,30 @@ def test_areas_of_the_building_stay_there(server: Server) -> None:
     assert after["properties"] == {"name": "north hall"}
     np.testing.assert_allclose(np.array(after["geometry"]["coordinates"][0]) - before, [[50.0, 0.0]] * 5, atol=1e-3)
     check_problem(server.client.request("DELETE", ALIGNMENT, params=ADA), 409, "need the map's pose")
+
+
+def test_alignments_are_few_at_once(server: Server) -> None:
+    answers: list[int] = []
+
+    async def ask() -> None:
+        others, begun = anyio.Event(), []
+
+        async def one() -> None:
+            begun.append(1)
+            answers.extend(await raw_put(server, ALIGNMENT, others, END, stated=1, query=b"&pin=a=0,0:0,0"))
+
+        async with anyio.create_task_group() as tasks:
+            for _ in range(2):
+                tasks.start_soon(one)
+            while len(begun) < 2:
+                await anyio.sleep(0.01)
+            await anyio.sleep(0.1)  # until their bodies are read
+            answers.extend(await raw_put(server, ALIGNMENT, END, stated=1, query=b"&pin=a=0,0:0,0"))
+            others.set()
+        answers.extend(await raw_put(server, ALIGNMENT, END, stated=1, query=b"&pin=a=0,0:0,0"))
+
+    anyio.run(ask)
+    assert answers == [429, 422, 422, 422]
 
 
 def test_a_map_is_aligned_with_a_plan_as_by_the_command(server: Server) -> None:

@@ -14,13 +14,16 @@ import psutil
 import pytest
 from starlette.types import Message
 
+from fleetmap.errors import StateError
+from mapserver.api import request_limits
 from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import put_away
 from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
 from mapserver.operators.operators import Operators
+from mapserver.serving import night_runs
 from mapserver.store import Actor, MapStore
 from support.fleet.quick_passwords import use_quick_passwords
-from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import Server, check_problem, raw_put, served_api
 
 INBOX = "/v1/sites/lab/inbox"
 ADA = {"actor": "ada", "reason": "aisle 3"}
@@ -68,26 +71,8 @@ def test_names_of_strangers_make_no_file(server: Server, lab: Path, name: str) -
     assert files(lab.parent) == []
 
 
-async def put(server: Server, name: str, *messages: Message | anyio.Event) -> list[int]:
-    """The status of an upload whose client sends these and waits for these events; empty if it is gone before the answer."""
-    scope = {
-        "type": "http", "method": "PUT", "path": f"{INBOX}/{name}", "raw_path": b"", "scheme": "http", "query_string": b"actor=ada",
-        "headers": [(b"host", b"127.0.0.1"), (b"content-length", b"2000000")], "client": ("127.0.0.1", 1),
-    }  # fmt: skip
-    left, answered = list(messages), []
-
-    async def receive() -> Message:
-        message = left.pop(0) if left else {"type": "http.disconnect"}
-        if isinstance(message, anyio.Event):
-            await message.wait()
-            return await receive()
-        return message
-
-    async def send(message: Message) -> None:
-        answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
-
-    await server.client.app(scope, receive, send)
-    return answered
+async def put(server: Server, name: str, *messages: Message | anyio.Event | float) -> list[int]:
+    return await raw_put(server, f"{INBOX}/{name}", *messages, stated=2_000_000)
 
 
 MIDDLE = {"type": "http.request", "body": bytes(1_000_000), "more_body": True}
@@ -114,6 +99,18 @@ def test_uploads_are_few_at_once(server: Server, lab: Path) -> None:
     anyio.run(ask)
     assert answers == [409, 429, 201, 201, 201, 201]
     assert files(lab) == [f"{number}.mcap" for number in range(4)]
+
+
+def test_an_upload_that_hardly_goes_on_loses_its_place(
+    server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(request_limits, "BODY_S", 0.5)
+    dripping = [0.05, MIDDLE | {"body": b"x"}] * 200
+    enough = [0.05, MIDDLE | {"body": bytes(100_000)}] * 19 + [END | {"body": bytes(100_000)}]
+    assert anyio.run(put, server, "slow.mcap", *dripping) == [408]
+    assert anyio.run(put, server, "stops.mcap", *enough[:20], *dripping) == [408]
+    assert anyio.run(put, server, "steady.mcap", *enough) == [201]
+    assert files(lab) == ["steady.mcap"]
 
 
 def test_half_an_upload_leaves_nothing(server: Server, lab: Path) -> None:
@@ -236,6 +233,32 @@ def test_who_may_only_look_changes_nothing(server: Server, lab: Path, monkeypatc
     assert client.put(put, content=b"x", headers=keys["olga"]).status_code == 201
     assert server.store.last_events("lab", 1)[0].actor == "olga"
     assert client.put(f"{put}?actor=ada", content=b"x", headers=keys["olga"]).status_code == 403
+
+
+def test_a_build_without_space_is_an_answer_and_in_no_log(
+    server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.mkdir()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(night_runs, "TemporaryFile", full)
+    check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 503, "No space left")
+    assert server.store.last_events("lab", 1)[0].kind == "saved"
+
+
+def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.mkdir()
+    known: list[str] = []
+
+    def started(*_: object) -> None:
+        known.extend(event.kind for event in server.store.last_events("lab", 1))
+        raise StateError("no process")
+
+    monkeypatch.setattr(night_runs.NightRuns, "_started", started)
+    check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 409, "no process")
+    assert known == ["build_started"]
 
 
 def test_a_build_ends_with_its_killed_server(tmp_path: Path) -> None:

@@ -177,6 +177,24 @@ def test_what_makes_no_sense_is_refused(server: Server, named: dict[str, dict[st
     check_problem(again, 409, "ci is disabled")
 
 
+def test_one_of_two_tokens_is_revoked(server: Server, named: dict[str, dict[str, str]]) -> None:
+    client, (first, second) = server.client, (token(server, "read", name="ci") for _ in range(2))
+
+    def tokens() -> list[str]:
+        rows = client.get("/v1/operators", headers=named["ada"]).json()["operators"]
+        return [one["number"] for row in rows if row["name"] == "ci" for one in row["tokens"]]
+
+    for number in tokens():
+        if client.get("/v1/sites", headers=first).status_code == 200:
+            address = f"/v1/tokens/{number}/revoke"
+            assert client.post(address, json=WHY, headers=named["ada"]).status_code == 200
+            check_problem(client.post(address, json=WHY, headers=named["ada"]), 404, f"number {number}")
+            break
+    left = [client.get("/v1/sites", headers=headers).status_code for headers in (first, second)]
+    assert (sorted(left), len(tokens())) == ([200, 401], 1)
+    assert [(line.kind, line.detail) for line in server.store.audit_lines()][-1] == ("token revoked", "ci: read")
+
+
 def test_secrets_are_in_one_answer_alone(
     server: Server, named: dict[str, dict[str, str]], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

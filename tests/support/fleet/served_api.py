@@ -5,8 +5,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import anyio
 import httpx
 from fastapi.testclient import TestClient
+from starlette.types import Message
 
 from mapserver import releases
 from mapserver.api.app import create_app
@@ -54,3 +56,30 @@ def check_problem(response: httpx.Response, status: int, words: str) -> None:
     assert body["title"]
     assert words in body["detail"]
     assert body["instance"] == response.request.url.path
+
+
+async def raw_put(
+    server: Server, path: str, *messages: Message | anyio.Event | float, stated: int, query: bytes = b""
+) -> list[int]:
+    """The status of a request whose client sends these and waits for events and seconds; empty if it is gone before the answer."""
+    scope = {
+        "type": "http", "method": "PUT", "path": path, "raw_path": b"", "scheme": "http", "query_string": b"actor=ada" + query,
+        "headers": [(b"host", b"127.0.0.1"), (b"content-length", b"%d" % stated)], "client": ("127.0.0.1", 1),
+    }  # fmt: skip
+    left, answered = list(messages), list[int]()
+
+    async def receive() -> Message:
+        message = left.pop(0) if left else {"type": "http.disconnect"}
+        if isinstance(message, anyio.Event):
+            await message.wait()
+            return await receive()
+        if isinstance(message, float):
+            await anyio.sleep(message)
+            return await receive()
+        return message
+
+    async def send(message: Message) -> None:
+        answered.extend([message["status"]] if message["type"] == "http.response.start" else [])
+
+    await server.client.app(scope, receive, send)
+    return answered
