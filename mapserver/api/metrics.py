@@ -195,12 +195,16 @@ def _disk(store: MapStore) -> Iterator[Metric]:
     """No figures from a disk that does not answer."""
     free = GaugeMetricFamily("fleetmap_store_disk_free_bytes", "Free space of the store's disk.")
     total = GaugeMetricFamily("fleetmap_store_disk_total_bytes", "Size of the store's disk.")
+    left = GaugeMetricFamily(
+        "fleetmap_store_disk_days_left", "Days until the store's disk is full at its growth of the last days."
+    )
     with suppress(StoreError):
         found = store.disk_space()
+        if found.days_left is not None:
+            left.add_metric([], found.days_left)
         free.add_metric([], found.free_bytes)
         total.add_metric([], found.total_bytes)
-    yield free
-    yield total
+    yield from (free, total, left)
 
 
 def _trust(store: MapStore, http: HttpCertificate | None) -> Iterator[Metric]:

@@ -8,7 +8,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, tzinfo
+from datetime import UTC, date, tzinfo
 from pathlib import Path
 from typing import TypeVar
 
@@ -95,7 +95,8 @@ class PageContext:
         """Ranges of one click: their words and `since`."""
         now_ns = time.time_ns()
         hour, today, week = self.written(now_ns - HOUR_NS), self.written(now_ns)[:10], self.written(now_ns - _WEEK_NS)
-        return [("Last hour", hour), ("Today", today), ("Last 7 days", week)]
+        monday = self.written(now_ns - 24 * HOUR_NS * date.fromisoformat(today).weekday())[:10]
+        return [("Last hour", hour), ("Today", today), ("Since Monday", monday), ("Last 7 days", week)]
 
     def written(self, stamp_ns: int) -> str:
         """A stamp as `since` and `until` of an address take it."""

@@ -30,7 +30,6 @@ from mapserver.surfels.surfel_map import index_address, surfels_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
-_KEPT = 8
 _GRID_HEIGHT_M = 1.1  # as the API's grid without a height
 _JOBS_SHOWN = 100
 
@@ -43,15 +42,15 @@ EVER: Span = (None, None)
 class _Kept(Generic[T]):
     """The last values that were made, by key: a second browser waits for the first one's instead of making it again."""
 
-    def __init__(self) -> None:
-        self._lock, self._values = threading.Lock(), OrderedDict[Hashable, T]()
+    def __init__(self, most: int = 8) -> None:
+        self._lock, self._values, self._most = threading.Lock(), OrderedDict[Hashable, T](), most
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
         with self._lock:
             if key not in self._values:
                 self._values[key] = make()
             self._values.move_to_end(key)
-            while len(self._values) > _KEPT:
+            while len(self._values) > self._most:
                 self._values.popitem(last=False)
             return self._values[key]
 
@@ -64,7 +63,7 @@ class MapData:
         self.store, self.inbox = store, inbox
         self._gate, self.trial_share = gate, trial_share
         self._plans, self._underlays = _Kept[Plan](), _Kept[tuple[bytes, Box] | None]()
-        self._differences, self._foretold = _Kept[Difference](), _Kept[VerdictRow]()
+        self._differences, self._foretold = _Kept[Difference](64), _Kept[VerdictRow]()
 
     def sites(self) -> list[str]:
         """Names of all sites, also of those that have only jobs or an inbox yet."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
+from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureKind
 from mapserver.api.moments import steps
 from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
@@ -63,12 +64,16 @@ ADVICE: dict[str, str] = {
 
 def install(console: Console) -> None:
     """Adds the page."""
-    knows = (*_AXES, "since", "until", "before")
+    knows = (*_AXES, "since", "until", "before", "sort")
     console.page("failures", "failures.html", lambda context: _page(console.services, context), knows=knows)
 
 
 def _page(services: Services, context: PageContext) -> dict[str, object]:
     kept = {name: value for name, value in context.query.items() if name not in {"site", "before"}}
+    if kept.get("sort") not in (None, "happened"):
+        raise UsageError(
+            f"sort={kept['sort'][:40]!r} is unknown; write sort=happened, or leave it out for the last to arrive first"
+        )
     version = number(kept.get("version"), "version")
     chosen = {axis: kept[axis] for axis in _AXES if kept.get(axis)}
     if version is not None:
@@ -77,16 +82,26 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
     in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
     named = {axis: value for axis, value in chosen.items() if axis != "version"}
     wanted = replace(in_time, version=version, **named)  # type: ignore[arg-type]  # texts, all of them
-    found = services.health.failures(wanted, number(context.query.get("before"), "failure"))
-    shown = found[:FAILURES_SHOWN]
+    before = number(context.query.get("before"), "failure")
     rows = services.health.failures(in_time, None, MANY_FAILURES)
     matching = [row for row in rows if _fits(row, chosen)]
+    if kept.get("sort") == "happened":
+        found = sorted(matching, key=lambda row: (-row.happened_ns, -row.number))
+        found = found[next((n + 1 for n, row in enumerate(found) if row.number == before), 0) :]
+    else:
+        found = services.health.failures(wanted, before)
+    shown = found[:FAILURES_SHOWN]
     facets = _facets(context, rows, chosen, kept, services.maps.areas(context.site).names)
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
     shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
     return {
         "answer": _answer(matching),
-        "is_chosen": any(kept.values()),
+        "is_chosen": any(value for name, value in kept.items() if name != "sort"),
+        "sorts": [
+            (words, is_chosen, context.to("failures", **{**kept, "sort": value}))
+            for value, words in ((None, "arrived"), ("happened", "happened"))
+            for is_chosen in [kept.get("sort") == value]
+        ],
         "chosen": chosen,
         "facets": facets,
         "shades": shades,

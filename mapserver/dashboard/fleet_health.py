@@ -136,17 +136,26 @@ class HealthData:
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
             self._trials(site, now_ns),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
-            tuple(self._area_trends(site, "area" if has_areas else "tile", next_hour)),
+            tuple(self._area_trends(site, next_hour - WEEK_H, next_hour)),
             has_areas,
             (next_hour - WEEK_H) * HOUR_NS,
         )
 
-    def _area_trends(self, site: str, axis: str, next_hour: int) -> list[AreaTrend]:
-        def week(end: int) -> dict[str, Counters]:
-            found = self._store.fleet.counters(site, axis, since_hour=end - WEEK_H, until_hour=end)
-            return {key: counts for (_, key), counts in found.items()}
+    def area_trends(self, site: str, since_ns: int | None, until_ns: int | None) -> list[AreaTrend]:
+        """Areas in whole hours of a time, or tiles where none is named, beside the 7 days before it; without a start its last 7 days."""
+        end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
+        return self._area_trends(site, end - WEEK_H if since_ns is None else hour_of(since_ns), end)
 
-        return area_trends(week(next_hour), week(next_hour - WEEK_H))
+    def _area_trends(self, site: str, first: int, end: int) -> list[AreaTrend]:
+        axis = "area" if self._store.areas(site) else "tile"
+        now, before = (
+            {
+                key: counts
+                for (_, key), counts in self._store.fleet.counters(site, axis, since_hour=a, until_hour=b).items()
+            }
+            for a, b in ((first, end), (first - WEEK_H, first))
+        )
+        return area_trends(now, before)
 
     def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
         rows = self._store.canaries(site)

@@ -168,34 +168,47 @@ def _acts(
             yield f"Roll back to version {before}", back, told, {"to": before}, "back", True
         return
     through = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
+    gets = ""
+    if current is not None:
+        gets = f" {_gets(maps.difference(site, current, version), maps.store.manifest(site, version).tile_size_m)}"
     if info.state == "draft":
-        told = f"{_begun(f'{through}{everybody}')} get it."
+        told = f"{_begun(f'{through}{everybody}')} get it.{gets}"
         yield f"Publish draft {version}", f"{to}/publish", told, {}, "forward", False
         if verdict is not None and verdict.reasons and set(verdict.reasons) <= set(verdict.report.get("unjudged", ())):
             told = (
                 f"You say that the calibration of draft {version} is right although no recording judged it: all later versions keep "
-                f"its metres. {_begun(everybody)} get it."
+                f"its metres. {_begun(everybody)} get it.{gets}"
             )
             trusts = {"trust_calibration": True}
             yield f"Trust its calibration, publish draft {version}", f"{to}/publish", told, trusts, "back", True
         elif verdict is not None and verdict.reasons:
-            told = f"The gate refused draft {version}. {_begun(everybody)} get it all the same, if they could use it at all."
+            told = f"The gate refused draft {version}. {_begun(everybody)} get it all the same, if they could use it at all.{gets}"
             yield f"Publish draft {version} by force", f"{to}/publish", told, {"force": True}, "back", True
     elif version != before or trial is not None:
         is_back = current is not None and version < current
         ends = ", ending its trial" if trial is not None and trial.version == version else ""
-        told = (
-            f"{_begun(everybody)} go from version {current} to version {version}.{' The trial ends.' if trial else ''}"
-        )
+        told = f"{_begun(everybody)} go from version {current} to version {version}.{gets}{' The trial ends.' if trial else ''}"
         words = f"{'Go back to' if is_back else 'Promote'} version {version}{ends}"
         yield words, f"{to}/promote", told, {}, "back" if is_back else "forward", is_back
     if current is not None and trial is None and version > current:
         some = f"{maps.trial_share:.0%} of the robots"
         told = (
             f"{through}{some} get version {version}. If they fail more often than the others, it is rolled back automatically; "
-            "otherwise all robots get it."
+            f"otherwise all robots get it.{gets}"
         )
         yield f"Try version {version} on {some}", f"{to}/canary", told, {}, "forward", False
+
+
+def _gets(found: Difference, tile_size_m: float) -> str:
+    """What a version changes for robots that have another one, in a sentence."""
+    tiles = found.tiles_added + found.tiles_changed + found.tiles_removed
+    if not tiles:
+        return "The map is the same."
+    of_tiles = f"{tiles} tiles of {tiles + found.tiles_kept}, {tiles * tile_size_m**2:.0f} m²"
+    landmarks = (
+        f"{found.landmarks_added} new and {found.landmarks_removed} removed landmarks, {found.landmarks_moved} moved"
+    )
+    return f"It changes {of_tiles}: {landmarks}. Each robot downloads {size(found.fetch_bytes)}."
 
 
 def verdict_words(verdict: VerdictRow | None, is_draft: bool) -> tuple[str, str]:

@@ -172,9 +172,10 @@ def _trends(services: Services, context: PageContext) -> dict[str, object]:
     """The figures of a day, or of the range in the address, and what they were before."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
     span_ns = context.time_range()
-    day, when, trend = health.day, "last 24 h", f"; {health.trend}"
+    day, when, trend, areas = health.day, "last 24 h", f"; {health.trend}", list(health.areas)
     if span_ns != EVER:
         day, when, trend = services.health.span(context.site, *span_ns), "chosen hours", ""
+        areas = services.health.area_trends(context.site, *span_ns)
     figures = [
         fleet_parts.localised_figure(f"Localised while driving, {when}", day),
         fleet_parts.rate_figure(f"Failures per robot-day, {when}", day.failures, trend),
@@ -185,11 +186,12 @@ def _trends(services: Services, context: PageContext) -> dict[str, object]:
     return {
         "tried": fleet_parts.trials_shown(health.trials, context.moment),
         "kpis": figures,
-        "areas": health.areas,
-        "worse": trend_sentence(list(health.areas)) if health.areas else "",
+        "areas": areas,
+        "worse": trend_sentence(areas) if areas else "",
+        "is_chosen": span_ns != EVER,
         "has_areas": health.has_areas,
         "outside": OUTSIDE,
-        "since": context.written(health.week_since_ns),
+        "kept": {"since": context.written(span_ns[0] or health.week_since_ns), "until": context.query.get("until")},
         "days": _bars(health.days),
         "last_day": _last_day(health),
         "cameras": cameras,

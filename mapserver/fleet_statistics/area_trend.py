@@ -1,4 +1,4 @@
-"""Trend of areas: failures of one week compared with the week before, per area. Pure."""
+"""Trend of areas: failures of a time compared with those of a time before, per area. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,9 +40,9 @@ class AreaTrend:
 
 
 def area_trends(now: Mapping[str, Counters], before: Mapping[str, Counters]) -> list[AreaTrend]:
-    """Return all areas of either week, the worsened first. All intervals together hold the true ratios with 95 %.
+    """Return all areas of either time, the worsened first. All intervals together hold the true ratios with 95 %.
 
-    Given all failures of both weeks, those of the last one are binomial (Przyborowski and Wilenski 1940); the exact interval of that share
+    Given all failures of both times, those of the last one are binomial (Przyborowski and Wilenski 1940); the exact interval of that share
     (Clopper and Pearson 1934) gives that of the ratio, and Bonferroni's correction accounts for the number of areas.
     """
     nothing = Counters()
@@ -82,5 +82,5 @@ def trend_sentence(trends: list[AreaTrend]) -> str:
     elif silent < len(trends):
         told = "Nothing got clearly worse"
     else:
-        return "Too little was driven in both weeks to say"
+        return "Too little was driven to say"
     return told + (f"; in {silent} of {len(trends)} too little was driven to say" if silent else "")

@@ -53,6 +53,7 @@ def server_tasks(
         BackgroundTask("keeping reports", _FLUSH_EVERY_S, fleet.flush),
         BackgroundTask("looking for robots", _PRESENCE_EVERY_S, bus_service.look_for_robots),
         BackgroundTask("removing old reports", _PRUNE_EVERY_S, fleet.prune),
+        BackgroundTask("measuring the disk", _PRUNE_EVERY_S, store.disk_space),
         BackgroundTask("searching for killed jobs", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
         BackgroundTask("looking at canaries", _CANARIES_EVERY_S, lambda: review(store, canary, time.time_ns())),
     ]

@@ -34,7 +34,7 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
-from mapserver.store.usage import DiskSpace, StoreUsage, UsageMeter, disk_space
+from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
 from mapserver.store.version_rows import canaries, mentioned, site_releases
 
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
@@ -61,6 +61,7 @@ class StoreQueries:
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
         self.operators = OperatorQueries(self._transactions)
+        self._disk = DiskMeter(root, self._transactions.now_ns)
         self._usage = UsageMeter(root, self._transactions, self._blobs)
 
     @property
@@ -68,7 +69,7 @@ class StoreQueries:
         return self._root
 
     def disk_space(self) -> DiskSpace:
-        return disk_space(self._root)
+        return self._disk.look()
 
     def usage(self) -> StoreUsage | None:
         """Return the size of the store, at most ten minutes old; None while it is measured for the first time."""

@@ -4,14 +4,17 @@ import logging
 import shutil
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 from fleetmap.errors import FleetmapError, disk_errors
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
 
-_EVERY_S = 600.0
+_EVERY_S, _DAY_S = 600.0, 86_400.0
 _WAIT_S = 0.5  # for a measurement under way: that of a small store is done by then
 _log = logging.getLogger(__name__)
 
@@ -71,14 +74,48 @@ class UsageMeter:
 
 @dataclass(frozen=True, slots=True)
 class DiskSpace:
-    """Space of the disk that holds the store; free: for this account."""
+    """Space of the disk that holds the store; free: for this account.
+
+    grows_bytes_per_day: of what is used, None until it was measured for a day. days_left: until it is full at that,
+    None if it does not fill.
+    """
 
     total_bytes: int
     free_bytes: int
+    grows_bytes_per_day: float | None = None
+    days_left: float | None = None
 
 
-def disk_space(root: Path) -> DiskSpace:
-    """Return the space of a folder's disk; StoreError if the disk does not answer."""
-    with disk_errors(f"{root} cannot be looked at", "check the disk"):
-        found = shutil.disk_usage(root)
-    return DiskSpace(found.total, found.free)
+class DiskMeter:
+    """Measures the disk of a folder, and its growth since the process began, over a week at most. Thread-safe."""
+
+    def __init__(self, root: Path, now_ns: Callable[[], int]) -> None:
+        self._root, self._now_ns = root, now_ns
+        self._lock = threading.Lock()
+        self._samples = deque[tuple[int, int]](maxlen=round(7 * _DAY_S / _EVERY_S))  # stamps and free bytes
+
+    def look(self) -> DiskSpace:
+        """Return the space; StoreError if the disk does not answer."""
+        with disk_errors(f"{self._root} cannot be looked at", "check the disk"):
+            found = shutil.disk_usage(self._root)
+        with self._lock:
+            now_ns = self._now_ns()
+            if self._samples and now_ns < self._samples[-1][0]:
+                self._samples.clear()  # the clock was set back
+            if not self._samples or now_ns - self._samples[-1][0] >= _EVERY_S * 1e9:
+                self._samples.append((now_ns, found.free))
+            grows = self._growth()
+        return DiskSpace(
+            found.total, found.free, grows, found.free / grows if grows is not None and grows > 0 else None
+        )
+
+    def _growth(self) -> float | None:
+        """Return bytes a day: of the first and the last quarter the medians, as a build's temporary files come and go."""
+        samples = list(self._samples)
+        if not samples or samples[-1][0] - samples[0][0] < _DAY_S * 1e9:
+            return None
+        quarter = max(1, len(samples) // 4)
+        (first_ns, before), (last_ns, after) = (
+            [median(column) for column in zip(*part, strict=True)] for part in (samples[:quarter], samples[-quarter:])
+        )
+        return float((before - after) / (last_ns - first_ns) * _DAY_S * 1e9)

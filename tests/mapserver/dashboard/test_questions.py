@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 
 import pytest
 from playwright.sync_api import Locator, Page, TimeoutError, expect
@@ -133,6 +134,34 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     listed_in(page, "aisle 2")
 
 
+def test_which_aisle_got_worse_since_a_day(operator: Operator) -> None:
+    """Beside the 7 days before it: the last 7 days give the table that the page begins with."""
+    page = operator.page
+    opened(page, operator.served, "trends")
+    usual = page.get_by_role("table", name="What got worse this week").get_by_role("row")
+    week = usual.all_inner_texts()
+    expect(page.get_by_role("link", name="Since Monday", exact=True)).to_be_visible()
+    operator.click(page.get_by_role("link", name="Last 7 days", exact=True))
+    chosen = page.get_by_role("table", name="What got worse in the chosen time").get_by_role("row")
+    expect(chosen.nth(1)).to_contain_text(re.compile(r"^aisle 2\s*worse"))
+    assert len(chosen.all_inner_texts()) == len(week)
+    since = page.locator("input[name=since]").input_value()
+    operator.click(chosen.get_by_role("link", name="aisle 2"))
+    expect(page.locator("input[name=since]")).to_have_value(since)
+    listed_in(page, "aisle 2")
+
+
+def test_what_happened_last(operator: Operator) -> None:
+    page = operator.page
+    opened(page, operator.served, "failures")
+    operator.click(page.get_by_role("link", name="happened", exact=True))
+    listed = page.get_by_role("list", name="Failures").locator("time")
+    expect(page.locator("strong", has_text="happened")).to_be_visible()
+    moments = [datetime.fromisoformat(when[:19]) for when in listed.evaluate_all("all => all.map(one => one.title)")]
+    assert len(moments) > 5
+    assert moments == sorted(moments, reverse=True)
+
+
 def test_is_it_one_robot_or_one_place(operator: Operator) -> None:
     """Seven robots failed twice each: none of them stands out, and none is named."""
     operator.click(operator.page.get_by_role("link", name="Failures", exact=True))
@@ -237,7 +266,9 @@ def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
     operator.click(page.get_by_role("button", name="Publish draft 3", exact=True))
     dialog, used = page.get_by_role("dialog"), page.get_by_role("status")
     expect(dialog).to_contain_text(
-        re.compile("Draft 3 goes through the gate. If the gate accepts it, all 20 robots of hall get it.")
+        re.compile(
+            "Draft 3 goes through the gate. If the gate accepts it, all 20 robots of hall get it. It changes .* tiles? of .* m²: .*landmarks"
+        )
     )
     dialog.get_by_label("Your name").fill("ada")
     dialog.get_by_role("button", name=re.compile("^Yes")).click()

@@ -28,7 +28,7 @@ def test_the_area_that_got_worse_is_named_first() -> None:
     assert found[3].times_words == "–"
     assert trend_sentence(found) == "Aisle 2 got worse; in 1 of 4 too little was driven to say"
     assert trend_sentence(found[1:3]) == "Nothing got clearly worse"
-    assert trend_sentence(found[3:]) == "Too little was driven in both weeks to say"
+    assert trend_sentence(found[3:]) == "Too little was driven to say"
 
 
 def test_without_any_failure_before_there_is_no_upper_bound() -> None:

@@ -1,10 +1,12 @@
 """The log of a store, verifying it, collecting garbage, carrying versions to another store."""
 
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -169,3 +171,25 @@ def test_a_damaged_version_is_not_exported(store: MapStore, tmp_path: Path) -> N
     with pytest.raises(FleetmapError, match="verify"):
         store.export_version("lab", 1, tmp_path / "lab.fmex")
     assert list(tmp_path.glob("*lab*")) == []
+
+
+def test_days_until_the_disk_is_full_are_known_after_a_day(
+    store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """1 GB a day of 100 free ones, and a build that takes half of them for an hour."""
+    free = [100e9]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(total=10**12, free=int(free[0])))
+    for hour in range(49):
+        found = store.disk_space()
+        assert (found.grows_bytes_per_day is None) == (hour < 24)
+        if found.days_left is not None and hour != 40:
+            assert found.days_left == pytest.approx(free[0] / 1e9, rel=0.05)
+        clock.now_ns += 3600 * 10**9
+        free[0] += -1e9 / 24 - (50e9 if hour == 39 else -50e9 if hour == 40 else 0)
+    free[0] = 100e9
+    for _ in range(7 * 24 * 6):
+        clock.now_ns += 600 * 10**9
+        found = store.disk_space()
+    assert (found.grows_bytes_per_day, found.days_left) == (0.0, None)
+    clock.now_ns -= 3600 * 10**9
+    assert store.disk_space().grows_bytes_per_day is None, "the clock was set back"
