@@ -20,9 +20,9 @@ from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-_MORE_SLICES = (
-    3  # per frame: in searches from an unchanged viewpoint, where a late estimate does no harm, and after lost tracks
-)
+# Per frame, where a late estimate does no harm: from an unchanged viewpoint, in the first searches without a prior, and after lost tracks.
+_MORE_SLICES = 3
+_FIRST_SEARCHES = 10  # then the robot probably drives where nothing is mapped, and keeps to the time of a frame
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,9 @@ class MapQuery:
         self._begun_ns = odometry.stamp_ns
         tracker.begin_query(odometry)
         is_at_rest = tracker.confirmed is None and not self._gate.is_new(odometry.odom_from_body)
-        self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_at_rest or is_urgent else 1
+        is_unknown = tracker.confirmed is None and tracker.prior is None
+        is_eager = is_at_rest or is_urgent or (is_unknown and self.failed < _FIRST_SEARCHES)
+        self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_eager else 1
         if not is_at_rest:
             self._failed_places.clear()
         self._job = self._run(percept.query, frame, relocalizer, is_sparse=self._is_sparse(odometry.stamp_ns))
