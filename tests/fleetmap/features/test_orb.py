@@ -12,6 +12,7 @@ from fleetmap.features.settings import OrbSettings
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
 WIDTH, HEIGHT = 320, 240
+SOME = OrbSettings(count=300)
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +84,38 @@ def test_features_are_deterministic_and_none_are_found_on_nothing(image: NDArray
 def test_settings_that_no_corner_can_have_are_refused_where_they_are_read(given: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError, match="Expected"):
         msgspec.convert(given, OrbSettings)
+
+
+def found_again(one: orb.Features, other: orb.Features) -> int:
+    """Number of features that match one within two pixels of the same place."""
+    pairs = match_mutual(one.descriptors, other.descriptors, 75, 0.9)
+    off_px = np.linalg.norm(one.pixels[pairs[:, 0]] - other.pixels[pairs[:, 1]], axis=1)
+    return int((off_px < 2.0).sum())
+
+
+def test_by_night_more_of_the_scene_is_found_again(image: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a dim picture whose noise makes corners of its own; with less noise nothing changes to the bit."""
+    scene = 60 + 0.3 * (image - 128.0)
+
+    def found(sigma: float) -> list[orb.Features]:
+        rng = np.random.default_rng(2)
+        noisy = [np.clip(np.rint(scene + rng.normal(0.0, sigma, scene.shape)), 0, 255).astype(np.uint8) for _ in "ab"]
+        return [orb.detect(picture, SOME) for picture in noisy]
+
+    aware = found(6.0), found(2.0)
+    monkeypatch.setattr(orb, "_NOISE_SHARE", np.inf)
+    unaware = found(6.0), found(2.0)
+    assert found_again(*aware[0]) > 1.3 * found_again(*unaware[0])
+    for one, other in zip(aware[1], unaware[1], strict=True):
+        np.testing.assert_array_equal(one.descriptors, other.descriptors)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 3.0, 12.0])
+def test_noise_is_measured_in_spite_of_the_scene(image: NDArray[np.uint8], sigma: float) -> None:
+    noisy = np.clip(np.rint(image + np.random.default_rng(3).normal(0.0, sigma, image.shape)), 0, 255).astype(np.uint8)
+    assert orb.noise_grey(noisy) == pytest.approx(sigma, abs=0.8)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 7), (2, 2), (3, 3)])
+def test_images_too_small_for_noise_have_none(shape: tuple[int, int]) -> None:
+    assert orb.noise_grey(np.zeros(shape, np.uint8)) == 0.0
