@@ -165,6 +165,21 @@ def test_units_keep_what_they_write_to_their_user(unit: Path) -> None:
 RULES = DEPLOY / "prometheus-alerts.yml"
 
 
+@pytest.mark.parametrize("unit", UNITS, ids=[unit.name for unit in UNITS])
+def test_units_have_few_rights(unit: Path) -> None:
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        pytest.skip(
+            "systemd-analyze is not installed (apt-get install systemd): the rights of the units are NOT judged"
+        )
+    told = subprocess.run(
+        [program, "security", "--offline=true", str(unit)], capture_output=True, text=True, check=True
+    )
+    found = re.search(r"exposure level for \S+: ([0-9.]+)", told.stdout)
+    assert found is not None, told.stdout
+    assert float(found[1]) <= 3.0
+
+
 def test_rules_and_board_ask_for_what_the_server_exports(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
         save_sample_draft(store)
