@@ -8,12 +8,12 @@ An object is uploaded once, however many snapshots name it. URL: a folder, or s3
 credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL, ...).
 """
 
-import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import obstore
@@ -22,6 +22,7 @@ from obstore.store import LocalStore, ObjectStore, from_url
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, UsageError
+from fleetmap.files import sync_path
 from fleetmap.mapformat import check_sha256, sha256_hex, verified
 
 FORMAT = 1
@@ -56,12 +57,13 @@ class BackupTarget:
     """Objects and snapshots under one URL or in one folder, created if needed. Raises StoreError if it cannot be reached."""
 
     def __init__(self, where: str, *, create: bool = False) -> None:
-        self.where, self._is_local = where, "://" not in where
+        self.where = where
+        self._folder = None if "://" in where else Path(where).absolute()
         with self._errors():
-            if self._is_local:
-                if not create and not (Path(where) / _SNAPSHOTS).is_dir():
+            if self._folder is not None:
+                if not create and not (self._folder / _SNAPSHOTS).is_dir():
                     raise UsageError(f"{where} holds no backups; `mapserver backup {where} --store DIR` makes one")
-                self._store: ObjectStore = LocalStore(Path(where).absolute(), mkdir=True)
+                self._store: ObjectStore = LocalStore(self._folder, mkdir=True)
             else:
                 self._store = from_url(where, client_options={"allow_http": True})
 
@@ -72,8 +74,7 @@ class BackupTarget:
 
     def put(self, data: bytes) -> None:
         """Upload bytes to their address."""
-        with self._errors():
-            obstore.put(self._store, _path(sha256_hex(data)), data)
+        self._put(_path(sha256_hex(data)), data)
 
     def get(self, address: str) -> bytes:
         """Return the bytes of an address, verified; StoreError if missing, MapFormatError if damaged."""
@@ -103,11 +104,8 @@ class BackupTarget:
 
     def write(self, snapshot: Snapshot, now: datetime) -> str:
         """Write a snapshot, whose objects are there, and return its name."""
-        self._sync()
         name = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}"
-        with self._errors():
-            obstore.put(self._store, f"{_SNAPSHOTS}/{name}.json", to_json(snapshot))
-        self._sync()
+        self._put(f"{_SNAPSHOTS}/{name}.json", to_json(snapshot))
         return name
 
     def prune(self, keep: int, now: datetime) -> tuple[list[str], int]:
@@ -128,8 +126,7 @@ class BackupTarget:
         """Return the number of this restoration, from 1 on; no other one gets it."""
         with self._errors():
             number = 1 + max((int(name) for name, _, _ in self._listed(_RESTORES) if name.isdecimal()), default=0)
-            obstore.put(self._store, f"{_RESTORES}/{number:06}", b"", mode="create")
-        self._sync()
+        self._put(f"{_RESTORES}/{number:06}", b"", mode="create")
         return number
 
     def _listed(self, prefix: str) -> Iterator[tuple[str, int, datetime]]:
@@ -137,9 +134,14 @@ class BackupTarget:
             for meta in batch:
                 yield meta["path"].rpartition("/")[2].removesuffix(".json"), meta["size"], meta["last_modified"]
 
-    def _sync(self) -> None:
-        if self._is_local:  # an object store answers once its bytes are durable
-            os.sync()
+    def _put(self, path: str, data: bytes, *, mode: Literal["create", "overwrite"] = "overwrite") -> None:
+        """Write an object durably: an object store answers once it is, files and their folders are synced."""
+        with self._errors():
+            obstore.put(self._store, path, data, mode=mode)
+            if self._folder is not None:
+                file = self._folder / path
+                for synced in (file, file.parent, file.parent.parent):
+                    sync_path(synced)
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
