@@ -17,6 +17,7 @@ from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
+from mapserver.survey.bundle.odometry_factors import floor_of
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
@@ -25,6 +26,11 @@ from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors,
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
 from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState
 from mapserver.survey.survey_map import SurveyMap, history_of
+
+_LONGEST_GAP_NS = 10_000_000_000
+# Of a step between keyframes of a published map: that of adjusted ones with an IMU. It has no share by errors of calibration: by these a
+# new survey would bend or scale the map.
+_STEP = floor_of(inertial=True)._replace(rotation_share=0.0, translation_share=0.0)
 
 
 @dataclass(frozen=True)
@@ -182,8 +188,9 @@ def _published(
 ) -> Measured:
     """Return the constraints of a published map: keyframes with landmarks seen by the survey, with an anchor for each.
 
-    All landmarks that two of these keyframes see take part, which is all that the map knows of their shape. By the survey's landmarks
-    alone a keyframe with few of them would move with their noise, up to 9 mm.
+    All landmarks that two of these keyframes see take part, and relative poses stand for what the map's surveys knew beyond: the
+    observations of earlier landmarks by a later survey are not kept. By the new survey's landmarks alone a keyframe with few of
+    them would move with their noise, up to 9 mm.
     """
     rows = np.unique(np.concatenate([s.rows for _, s in seen])) if seen else np.zeros(0, np.int64)
     used = np.zeros(len(base.points_map), bool)
@@ -206,9 +213,20 @@ def _published(
         obs_landmark=landmarks[base.map.obs_landmark[obs]],
         obs_pixels=base.obs_pixels[obs],
         obs_sigma_px=base.obs_sigma_px[obs],
+        relative=_steps(base, held),
         priors=[PriorTerm(n, base.map_from_body[k], np.diag(1.0 / sigma**2)) for n, k in enumerate(held)],
     )
     return Measured(problem, keyframes, landmarks)
+
+
+def _steps(base: BaseMap, held: Rows) -> list[RelativeTerm]:
+    """Return the relative poses of those of the map's keyframes held (H,) that follow each other in one survey."""
+    terms, stamps_ns = [], base.map.keyframe_stamps_ns[held]
+    for n, steps in enumerate(np.diff(held).tolist()):
+        if 0 < stamps_ns[n + 1] - stamps_ns[n] < _LONGEST_GAP_NS:
+            i_from_j = se3_inverse(base.map_from_body[held[n]]) @ base.map_from_body[held[n + 1]]
+            terms.append(RelativeTerm(n, n + 1, i_from_j, np.linalg.inv(steps * _STEP.covariance(i_from_j))))
+    return terms
 
 
 def _placed(priors: Sequence[PriorTerm], known: Measured) -> list[PriorTerm]:
