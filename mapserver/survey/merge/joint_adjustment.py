@@ -196,7 +196,7 @@ def _published(
     used = np.zeros(len(base.points_map), bool)
     landmarks, keyframes = np.full(len(base.points_map), -1), np.full(len(base.map_from_body), -1)
     used[rows] = True
-    held = np.unique(base.map.obs_keyframe[used[base.map.obs_landmark]])
+    held = np.unique(base.map.obs_keyframe[used[base.map.obs_landmark]]).astype(np.int64)
     keyframes[held] = np.arange(len(held))
     own = keyframes[base.map.obs_keyframe] >= 0
     used |= np.bincount(base.map.obs_landmark[own], minlength=len(used)) >= 2
