@@ -1,6 +1,7 @@
 """The modes of the odometry, one class each: vision alone, starting (vision until gravity is known), and stereo-inertial."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from fleetmap.core import longest_gap_ns
 from fleetmap.geometry import Array, interpolate_se3, length, rotation_angle_rad, se3_inverse, skew
+from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
@@ -19,7 +21,7 @@ from fleetmap.odometry.init.static_initialization import is_steady, polynomial_r
 from fleetmap.odometry.lift_check import LiftCheck
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause
-from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.odometry.tracking.tracker import Earlier, Tracked
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
@@ -30,6 +32,8 @@ _NEAR_REST_MPS = 0.2  # a fifth of the tolerated error of the first speed: the f
 _STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # largest step by images off the prediction
 _MAX_ELSEWHERE = 2  # consecutive frames whose descriptor matches contradict the IMU, until the matches are trusted
 _EXTRAPOLATED_NS = 1_000_000_000  # during which a robot without visual tracking continues at its last speed
+# Largest acceleration without an IMU to measure it: friction holds wheels and shoes to at most about their weight.
+_MAX_ACCEL_MPS2 = GRAVITY_MPS2
 
 
 class ImuInputs:
@@ -175,6 +179,15 @@ class WindowMode(Mode):
         )
 
 
+def _with_matches(tracked: Tracked, kept: Iterable[Earlier]) -> Tracked:
+    """The tracks with those of their descriptor matches."""
+    earlier = tuple(kept)
+    if len(earlier) == len(tracked.earlier):
+        return tracked
+    is_kept = any(each.cam_from_earlier is tracked.cam_from_previous for each in earlier)
+    return replace(tracked, earlier=earlier, cam_from_previous=tracked.cam_from_previous if is_kept else None)
+
+
 class VisualMode(WindowMode):
     """Vision alone: the state moves by the motion measured between frames, gravity is unknown."""
 
@@ -182,36 +195,36 @@ class VisualMode(WindowMode):
         """cam_from_previous (4, 4): the last motion, if known."""
         super().__init__(window)
         self._cam_from_previous = np.eye(4) if cam_from_previous is None else cam_from_previous
-        self._seen_ns = window.stamp_ns  # of the last frame whose motion was known from images
+        self._step_ns = 0  # duration of that motion, 0 if unknown
+        # Of the last frame whose motion was known from images: stamp, duration (0 without one) and variance of the motion.
+        self._seen_ns, self._seen_step_ns, self._seen_var_m2 = window.stamp_ns, 0, 0.0
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; the state is known only after tracking of the frame."""
-        is_dark = self.stamp_ns - self._seen_ns > _EXTRAPOLATED_NS
-        if is_dark or stamp_ns - self.stamp_ns > PAUSE_NS:
-            self._cam_from_previous = np.eye(
-                4
-            )  # a robot that was off, or in the dark for long, did not continue at its last speed
+        step_ns, is_dark = stamp_ns - self.stamp_ns, self.stamp_ns - self._seen_ns > _EXTRAPOLATED_NS
+        if is_dark or step_ns > PAUSE_NS:  # it did not continue at its last speed
+            self._cam_from_previous = np.eye(4)
+        elif self._step_ns:
+            self._cam_from_previous = interpolate_se3(np.eye(4), self._cam_from_previous, step_ns / self._step_ns)
+        self._step_ns = step_ns
         self.window.stamp_ns, self.window.rate_body_radps = stamp_ns, np.zeros(3)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        """See Mode: repeats the last motion."""
+        """See Mode: at the last speed."""
         return self._cam_from_previous if self.window.filter.clone_ids[-1:] == [frame_index] else None
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode. `odom` restarts if the images no longer show the motion; the covariance describes the error relative to this place."""
         change = None
         if self.window.filter.clone_ids:
+            tracked = _with_matches(tracked, filter(self._is_reached, tracked.earlier))
             if tracked.lost:
                 change = self.window.filter.begin_frame_anew()
-            else:
-                self._seen_ns = self.stamp_ns
             self._predict_random_walk(tracked)
-            if (
-                tracked.lost
-            ):  # these observations are not verified by a motion, and without an IMU nothing else reveals wrong ones
+            if tracked.lost:  # not verified by a motion, and without an IMU nothing else reveals wrong observations
                 tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0])
         used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
-        return Step(self, used, change)
+        return Step(self, used, change, is_lost=tracked.lost)
 
     def _predict_random_walk(self, tracked: Tracked) -> None:
         rig, settings, window = self._rig, self._rig.settings.filter, self.window
@@ -222,8 +235,36 @@ class VisualMode(WindowMode):
             self._cam_from_previous = cam_from_odom @ window.filter.odom_from_body() @ rig.body_from_cam
         body_from_next = rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ rig.cam_from_body
         duration_s = window.seconds_since(window.filter.clone_ids[-1])
-        sigmas = self._rotation_sigma_rad(body_from_next, duration_s), settings.free_translation_sigma_m
-        window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, self._measured_motion_cov(tracked))
+        sigmas = self._rotation_sigma_rad(body_from_next, duration_s), self._translation_sigma_m()
+        measured = self._measured_motion_cov(tracked)
+        window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, measured)
+        if not tracked.lost:
+            self._seen_ns, self._seen_step_ns, self._seen_var_m2 = self.stamp_ns, self._step_ns, 0.0
+            if measured is not None:
+                self._seen_var_m2 = float(np.trace(measured[3:, 3:])) / 3.0 / settings.seen_motion_scale**2
+
+    def _translation_sigma_m(self) -> float:
+        """Translation sigma of a predicted motion, without the images: each place within reach is as likely as another."""
+        settings = self._rig.settings.filter
+        if not self._seen_step_ns:
+            return settings.free_translation_sigma_m
+        before_m = self._reach_m(self.stamp_ns - self._step_ns, settings.seen_motion_scale)
+        now_m = self._reach_m(self.stamp_ns, settings.seen_motion_scale)
+        return min(settings.free_translation_sigma_m, float(np.sqrt((now_m**2 - before_m**2) / 3.0)))
+
+    def _reach_m(self, stamp_ns: int, sigmas: float) -> float:
+        """Largest distance from the place that the last seen speed, the mean over its step, predicts, with so many sigmas of that speed."""
+        unseen_s, mean_s = max(stamp_ns - self._seen_ns, 0) * 1e-9, self._seen_step_ns * 1e-9
+        by_speed_m = sigmas * np.sqrt(self._seen_var_m2) * unseen_s / mean_s
+        return float(np.hypot(0.5 * _MAX_ACCEL_MPS2 * unseen_s * (unseen_s + mean_s), by_speed_m))
+
+    def _is_reached(self, earlier: Earlier) -> bool:
+        """True if a robot may have followed the motion since an earlier frame, given its last seen speed."""
+        since = self.window.cam_from_earlier(earlier.frame_index)
+        if since is None or not self._seen_step_ns:
+            return True
+        off_m = se3_inverse(earlier.cam_from_earlier) - se3_inverse(self._cam_from_previous @ since)
+        return length(off_m[:3, 3]) <= self._reach_m(self.stamp_ns, _STEP_SIGMAS)
 
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
         """Rotation sigma of a predicted motion (4, 4), without the images."""
@@ -318,7 +359,7 @@ class StartingMode(GyroMode):
         if self._show(self._imu, self.stamp_ns, tracked):
             return step._replace(mode=_without_fault(self.window, self._imu, self._cam_from_previous))
         stamp_ns, old_odom_from_body = self.stamp_ns, self.window.filter.odom_from_body()
-        if tracked.lost:
+        if step.is_lost:
             self._trajectory.clear()
         self._trajectory.append((stamp_ns, old_odom_from_body))
         start = self._static_start(stamp_ns) or self._dynamic_start()
@@ -470,12 +511,9 @@ class InertialMode(WindowMode):
         if not tracked.earlier:
             self._elsewhere_frames = self._elsewhere_frames if tracked.lost else 0
             return tracked
-        possible = tuple(e for e in tracked.earlier if not self._off_mps(e.frame_index, e.cam_from_earlier))
+        possible = [e for e in tracked.earlier if not self._off_mps(e.frame_index, e.cam_from_earlier)]
         self._elsewhere_frames = 0 if possible else self._elsewhere_frames + 1
-        if self._elsewhere_frames > _MAX_ELSEWHERE:
-            return tracked
-        is_possible = any(e.cam_from_earlier is tracked.cam_from_previous for e in possible)
-        return replace(tracked, earlier=possible, cam_from_previous=tracked.cam_from_previous if is_possible else None)
+        return tracked if self._elsewhere_frames > _MAX_ELSEWHERE else _with_matches(tracked, possible)
 
     def _bridge_gap(self, end_ns: int) -> None:
         """Move the state over a gap in the samples by the motion of all points of the last two frames, as uncertain as without an IMU.
