@@ -100,8 +100,8 @@ class MapQuery:
     def _step(self, percept: Percept, frame: RectifiedFrame | None) -> QueryResult:
         odometry, is_at_once = percept.odometry, False
         is_urgent = percept.has_broken and not self.failed
-        if is_urgent and not self._is_urgent:
-            self._cancel()  # a frame before the break is unrelated to the robot's present pose
+        if (is_urgent and not self._is_urgent) or odometry.after_gap:
+            self._cancel()  # a frame before the break, or before the gap, says little of the robot's present pose
         if self._job is None and self.relocalizer is not None:
             is_due = is_urgent or self._is_due(odometry)
             begins = percept.query is not None if frame is None else is_due
