@@ -96,8 +96,14 @@ def assemble(
     # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
     if radius_95_m(prior.now_cov) <= settings.lost_radius_m:
         status = Status.DEGRADED
-    estimate = replace(estimate, status=status, cause=estimate.cause or Cause.UNMATCHED)
+    estimate = replace(estimate, status=status, cause=_cause(estimate, has_failed=True))
     return _with_pose(estimate, prior, settings)
+
+
+def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
+    if estimate.cause or estimate.odometry.status is OdometryStatus.DEGRADED:
+        return estimate.cause or Cause.ODOMETRY
+    return Cause.UNMATCHED if has_failed else Cause.NONE
 
 
 def _of_confirmed(
@@ -110,8 +116,7 @@ def _of_confirmed(
     is_known = not np.isnan(confirmed.now_map_from_body).any()
     radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
-    is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
-    cause = estimate.cause or (Cause.ODOMETRY if is_lost else Cause.UNMATCHED if has_failed else Cause.NONE)
+    cause = _cause(estimate, has_failed=has_failed)
     is_doubted = (
         confirmed.has_broken and has_failed
     )  # its tracks were lost, and the map has not confirmed its place since

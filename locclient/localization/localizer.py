@@ -158,7 +158,7 @@ class Localizer:
             hypotheses=(),
             odometry=odometry,
             stage_s={},
-            cause=Cause.CARRIED if tracker.is_carried else percept.image.cause,
+            cause=percept.image.cause or (Cause.CARRIED if tracker.is_carried else Cause.NONE),
             image=percept.image,
             **result._asdict(),
         )

@@ -98,8 +98,8 @@ class PoseTracker:
             self.prior = None
         self.confirmed = self._query_frame = None
         self.candidates.reset()
-        self.is_carried = is_carried
         self.was_tracking &= is_carried
+        self.is_carried = self.was_tracking
 
     def start(self, failed_queries: int) -> Start:
         """Return the state with which another tracker of the same odometry can start."""

@@ -20,6 +20,7 @@ _EVERY_NS, _KEPT = 250_000_000, 10  # pictures of the last 2.5 s, four a second
 _BREAK_NS = 3_000_000_000  # from lost tracks to a failure caused by them; fixes and status need up to 2 s
 _AGREEING_FIXES = 3  # that make another place significant, as for a kidnapped robot
 _RECENT_FIX_NS = 2_000_000_000
+_DROPPED_STEPS = 1.5  # shortest steps between frames; frames are missing in a longer one
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,15 +97,17 @@ class OnsetRecorder:
         self._fix: tuple[int, float] = (-(1 << 62), 0.0)
         self._break: Onset | None = None
         self._was_odometry_lost = True
+        self._least_step_ns = 1 << 62  # between two frames
         self._last: tuple[Estimate, Array] | None = None
 
     def handle(
         self, estimate: Estimate, left: Image, odom_from_body: Array, begun_ns: Mapping[FailureKind, int]
     ) -> None:
         """Add a frame. begun_ns: start of conditions that may become a failure, by kind; odom_from_body as of `Belief`."""
-        stamp_ns, self._last = estimate.stamp_ns, (estimate, odom_from_body)
+        stamp_ns, last, self._last = estimate.stamp_ns, self._last, (estimate, odom_from_body)
+        step_ns = 0 if last is None else stamp_ns - last[0].stamp_ns
         self._note_belief(estimate, odom_from_body)
-        if self._breaks(estimate):
+        if self._breaks(estimate, step_ns):
             self._break = self._onset(stamp_ns, left, odom_from_body)
         for kind, began_ns in begun_ns.items():
             if kind not in self._open or self._open[kind].stamp_ns != began_ns:
@@ -146,11 +149,14 @@ class OnsetRecorder:
     def _is_break_of(self, began_ns: int) -> bool:
         return self._break is not None and self._break.stamp_ns >= began_ns - _BREAK_NS
 
-    def _breaks(self, estimate: Estimate) -> bool:
-        """Return True if the odometry lost its tracks in this frame although the image is good."""
+    def _breaks(self, estimate: Estimate, step_ns: int) -> bool:
+        """Return True if the odometry lost its tracks in this frame although the image is good and no frame before it is missing."""
+        if step_ns:
+            self._least_step_ns = min(self._least_step_ns, step_ns)
         is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
         begins, self._was_odometry_lost = is_lost and not self._was_odometry_lost, is_lost
-        return begins and estimate.image.cause is Cause.NONE
+        is_next = step_ns <= _DROPPED_STEPS * self._least_step_ns
+        return begins and is_next and estimate.image.cause is Cause.NONE
 
     def _note_belief(self, estimate: Estimate, odom_from_body: Array) -> None:
         """Store a claimed pose: one without competitors that is not an unconfirmed candidate."""

@@ -94,7 +94,8 @@ def with_calibration(
     if not state.is_wrong:
         return replace(estimate, calibration=state, cov_rot_trans=_widened(estimate, state, rig))
     status = Status.DEGRADED if estimate.status is Status.TRACKING else estimate.status
-    cause = Cause.CALIBRATION if estimate.cause in {Cause.NONE, Cause.UNMATCHED} else estimate.cause
+    is_result = estimate.cause in {Cause.NONE, Cause.UNMATCHED, Cause.ODOMETRY}
+    cause = Cause.CALIBRATION if is_result else estimate.cause
     estimate = replace(estimate, status=status, cause=cause, calibration=state)
     if last_fix_ns is not None and (estimate.odometry.stamp_ns - last_fix_ns) * 1e-9 <= _HELD_S:
         return replace(estimate, cov_rot_trans=_widened(estimate, state, rig))

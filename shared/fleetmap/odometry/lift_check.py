@@ -54,9 +54,10 @@ class LiftCheck:
         up_body = odom_from_body[2, :3]
         up = self._base_from_body[:3, :3] @ up_body
         step_m = (self._base_from_body @ earlier_from_body @ self._body_from_base)[:3, 3]
-        climb_m, speed_mps = float(up @ step_m), length(self._wheel.velocity_base_mps)
+        climb_m, rolling = float(up @ step_m), [*wheel, self._wheel]
+        speed_mps = max(length(sample.velocity_base_mps) for sample in rolling)
         rolled_m = speed_mps * (stamp_ns - self._steps[-1].stamp_ns) * 1e-9 if self._steps else 0.0
-        is_rolling = speed_mps > 0.0 or abs(self._wheel.yaw_rate_radps) > 0.0
+        is_rolling = speed_mps > 0.0 or any(sample.yaw_rate_radps for sample in rolling)
         self._steps.append(_Step(stamp_ns, climb_m, (step_m - climb_m * up)[:2], rolled_m, is_rolling))
         while stamp_ns - self._steps[0].stamp_ns > _WINDOW_NS:
             self._steps.popleft()

@@ -88,3 +88,18 @@ def test_a_turn_on_the_spot_is_no_lift_and_a_robot_set_down_on_a_slope_is_told_o
         before = now
     assert len(told_s) == 1
     assert 8.0 < told_s[0] < 8.6
+
+
+def test_wheels_that_turned_while_frames_were_missing_have_turned() -> None:
+    """Up a slope of 15 degrees for 0.3 s without a frame, and at rest at its end."""
+    check, slope = LiftCheck(np.eye(4)), se3(so3_exp(np.array([0.0, -np.radians(15.0), 0.0])), np.zeros(3))
+    speeds_mps, begin_ns = [1.0, 1.0, 0.0], 600_000_000
+    for k in range(10):
+        assert not check.is_lifted(k * 66_000_000, [_rolling(k * 66_000_000, 0.0)], slope, np.eye(4), 0.01)
+    wheel = [_rolling(begin_ns + 100_000_000 * n, speed) for n, speed in enumerate(speeds_mps, start=1)]
+    step = se3(np.eye(3), np.array([0.25, 0.0, 0.0]))
+    assert not check.is_lifted(begin_ns + 300_000_000, wheel, slope @ step, step, 0.001)
+
+
+def _rolling(stamp_ns: int, speed_mps: float) -> WheelSample:
+    return WheelSample(stamp_ns, np.array([speed_mps, 0.0, 0.0]), 0.0, 0.02, 0.02)

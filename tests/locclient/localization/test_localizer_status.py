@@ -223,6 +223,29 @@ def test_a_robot_that_is_lifted_knows_at_once_that_it_is_lost(tracking: Robot) -
     assert tracking.go(0.0).cause is Cause.NONE
 
 
+def test_a_lifted_robot_in_the_dark_needs_light_first(tracking: Robot) -> None:
+    """Darkness is what an operator must end before it can find itself; that it was carried is said again in the light."""
+    tracking.odometry.lifts = tracking.is_dark = True
+    assert [tracking.go(0.0, NO_FIX).cause for _ in range(4)][1:] == [Cause.DARK] * 3
+    tracking.is_dark = False
+    assert (tracking.go(0.0, NO_FIX).status, tracking.go(0.0, NO_FIX).cause) == (Status.LOST, Cause.CARRIED)
+
+
+def test_a_robot_that_knew_no_place_was_not_carried_from_one(robot: Robot) -> None:
+    """Lifted while it searches, it does not say for ever that it was carried."""
+    robot.odometry.lifts = True
+    said = [robot.go(0.0, NO_FIX) for _ in range(3)]
+    assert {(e.status, e.cause) for e in said} == {(Status.INITIALISING, Cause.NONE)}
+
+
+def test_lost_tracks_come_before_a_map_that_does_not_match(tracking: Robot) -> None:
+    tracking.odometry.drift_share = 0.3
+    far = [tracking.go(0.5, NO_FIX) for _ in range(12)][-1]
+    assert (far.status, far.cause) == (Status.LOST, Cause.UNMATCHED)
+    tracking.odometry.breaks = True
+    assert tracking.go(0.5, NO_FIX).cause is Cause.ODOMETRY
+
+
 def test_wrong_fixes_that_disagree_kidnap_nobody(tracking: Robot) -> None:
     rng = np.random.default_rng(8)
     for number in range(12):

@@ -107,6 +107,14 @@ def test_tracks_that_end_in_the_dark_are_no_sign_of_hands() -> None:
     assert not recorder.evidence(dark, BLIND, dark.stamp_ns, dark.odometry.odom_from_body).broke
 
 
+def test_tracks_that_end_where_frames_are_missing_are_no_sign_of_hands() -> None:
+    recorder = OnsetRecorder()
+    played(recorder, [estimate(0.1 * n, fix=True) for n in range(30)])
+    late = broken(estimate(3.1, Status.DEGRADED))
+    played(recorder, [late])
+    assert not recorder.evidence(late, BLIND, late.stamp_ns, late.odometry.odom_from_body).broke
+
+
 @pytest.mark.parametrize(
     ("cause", "evidence", "refined"),
     [

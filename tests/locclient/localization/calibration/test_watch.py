@@ -204,6 +204,8 @@ def test_a_wrong_calibration_is_published() -> None:
     assert (lost.status, lost.cause, lost.map_from_body) == (Status.LOST, Cause.CALIBRATION, None)
     dark = published(monitor, replace(tracking, cause=Cause.DARK), tracking.stamp_ns)
     assert dark.cause is Cause.DARK
+    lost = published(monitor, replace(tracking, cause=Cause.ODOMETRY), tracking.stamp_ns)
+    assert lost.cause is Cause.CALIBRATION, "it ends tracks, too"
 
 
 def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
