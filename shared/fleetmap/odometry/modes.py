@@ -32,6 +32,7 @@ _NEAR_REST_MPS = 0.2  # a fifth of the tolerated error of the first speed: the f
 _STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # largest step by images off the prediction
 _MAX_ELSEWHERE = 2  # consecutive frames whose descriptor matches contradict the IMU, until the matches are trusted
 _EXTRAPOLATED_NS = 1_000_000_000  # during which a robot without visual tracking continues at its last speed
+_BY_IMU_NS = 1_000_000_000  # during which an IMU alone carries the speed of one camera
 # Largest acceleration without an IMU to measure it: friction holds wheels and shoes to at most about their weight.
 _MAX_ACCEL_MPS2 = GRAVITY_MPS2
 
@@ -67,7 +68,7 @@ class ImuInputs:
 class Step(NamedTuple):
     """Result of one frame: the next mode, and the result of its update (see `InvariantFilter.update`).
 
-    new_odom_from_old_odom, revised and is_lifted are as in OdometryEstimate. is_lost: no track is trusted.
+    new_odom_from_old_odom, revised and is_lifted are as in OdometryEstimate. is_lost: no track is trusted, or none shows a length.
     """
 
     mode: "Mode"
@@ -428,6 +429,7 @@ class InertialMode(WindowMode):
         self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
         self._seen: Array | None = None  # the last motion by images
         self._lift = LiftCheck(self._rig.base_from_body)
+        self._measured_ns = window.stamp_ns  # of the last frame with motion in the images, or at rest
         self._elsewhere_frames = 0  # consecutive frames whose descriptor matches contradicted the prediction
         self._is_pause = False
 
@@ -488,7 +490,8 @@ class InertialMode(WindowMode):
             float(np.sqrt(window.filter.covariance[5, 5])),
         )
         is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)
-        return Step(self, used, is_lost=tracked.lost, is_lifted=is_lifted)
+        is_by_imu = self._rig.camera.baseline_m == 0 and window.stamp_ns - self._measured_ns > _BY_IMU_NS
+        return Step(self, used, is_lost=tracked.lost or is_by_imu, is_lifted=is_lifted)
 
     def _off_mps(self, frame_index: int, seen: Array) -> float:
         """Difference in speed between cam_from_earlier (4, 4), by images since a frame, and the state; 0 within its covariance.
@@ -534,17 +537,21 @@ class InertialMode(WindowMode):
         window.rate_body_radps = np.zeros(3)
 
     def _update_zero_velocity(self, tracked: Tracked) -> None:
-        """Apply zero velocity and rotation if neither images nor IMU moved for a while."""
+        """Apply zero velocity and rotation if neither images nor IMU moved for a while. Still images of one camera alone show no length:
+        far points look the same, and what moves with the robot does."""
         now_ns, samples = self.window.stamp_ns, self._imu.samples.imu
         still = self._zero_velocity.since(now_ns, tracked.ids, tracked.pixels)
         if still is None:
+            self._measured_ns = now_ns
             return
         window, since = samples.between(still[0], now_ns), samples.between(still[1], now_ns)
         if len(window) < 20 or not len(since) or not is_steady(window, self._rig.settings.start):
             return
         duration_s = (now_ns - still[1]) * 1e-9
         sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
-        self.window.filter.correct_by_rest(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6)
+        mean_radps = since.gyro_radps.mean(axis=0)
+        if self.window.filter.correct_by_rest(mean_radps, float(sigma_radps), _GATE_6) <= _GATE_6:
+            self._measured_ns = now_ns
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
         """Continue from the last frame without the accelerometer, until gravity is known again.

@@ -149,6 +149,21 @@ def standing() -> tuple[Odometry, RectifiedFrame]:
     return odometry, RectifiedFrame(FRAME_NS, stereo_frame(FRAME_NS).left, None, None)
 
 
+@pytest.mark.parametrize("vibration_mps2", [0.0, 1.0])
+def test_at_rest_an_imu_that_vibrates_measures_no_speed(vibration_mps2: float) -> None:
+    """Far things look as still as near ones: where the IMU does not rest, nothing shows how far the robot moves, and it says so."""
+    odometry, frame = standing()
+    stamps_ns = np.arange(int(6e9), int(9e9), 5_000_000)
+    forces = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
+    forces += vibration_mps2 * np.random.default_rng(0).normal(size=forces.shape)
+    odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(forces), forces))
+    said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(1, 175)]
+    rest, after = said[60:120], said[145:]
+    assert {e.status for e in rest} == {OdometryStatus.TRACKING}
+    assert all(e.scale_known for e in [*rest, *after])
+    assert {e.status for e in after} == {OdometryStatus.DEGRADED if vibration_mps2 else OdometryStatus.TRACKING}
+
+
 def test_an_imu_that_is_left_out_is_named_while_vision_goes_on_alone() -> None:
     odometry, frame = standing()
     said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(1, 20)]
