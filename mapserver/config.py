@@ -35,7 +35,7 @@ TIERS = {
         "ingest": "*",
         "canary": "*",
         "resurvey": "*",
-        "survey": "seed occupancy_grid surfel_map",
+        "survey": "seed occupancy_grid surfel_map survey_pictures",
         "survey.orb": "extractor count",
         "survey.stereo": "min_depth_m depth_sigma_px",
         "survey.keyframes": "policy every_nth min_overlap max_rotation_deg max_parallax max_interval_s",

@@ -19,12 +19,14 @@ from fleetmap.occupancy_grid import map_server_files
 from fleetmap.version_grid import grid_of, occupancy
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.guard import address_of
-from mapserver.api.parameters import Number, RobotHeight, Site, Version, ViewPose
+from mapserver.api.parameters import NearPlace, Number, RobotHeight, Sha256, Site, Version, ViewPose
+from mapserver.api.views import PictureList, PictureView
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.expected_views import ExpectedViews, SurfelChanges, failure_camera, looking
 from mapserver.store import MapStore
 from mapserver.surfels.changes import Changes, changes_geojson, changes_png
 from mapserver.surfels.expected_view import ExpectedView
+from mapserver.surfels.survey_pictures import SurveyPicture, nearest_pictures, pictures_of
 
 _DIGESTS_KEPT = 256
 _VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a tenth of a second of CPU
@@ -100,6 +102,22 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
         place = looking((camera.x_m, camera.y_m, camera.z_m), camera.yaw_deg, camera.pitch_deg)
         return answer(request, lambda: views.view(site, version, place, width_px=camera.width_px))
 
+    @app.get("/v1/sites/{site}/versions/{version}/pictures")
+    def pictures(site: Site, version: Version, near: Annotated[NearPlace, Query()]) -> PictureList:
+        """Pictures of the surveys, nearest to a place first; 409 for a version that keeps none."""
+        looks = None if near.yaw_deg is None else looking((0, 0, 0), near.yaw_deg, 0)[:3, 2]
+        found = nearest_pictures(
+            pictures_of(store.manifest(site, version), store.blob), np.array([near.x_m, near.y_m, near.z_m]), looks
+        )
+        return PictureList([_picture_view(*one) for one in found[: near.limit]])
+
+    @app.get("/v1/sites/{site}/versions/{version}/pictures/{sha256}", response_class=Response)
+    def picture(request: Request, site: Site, version: Version, sha256: Sha256) -> Response:
+        """One of these pictures, a grey JPEG of at most 320 pixels."""
+        if not any(one.sha256 == sha256 for one in pictures_of(store.manifest(site, version), store.blob)):
+            raise HTTPException(404, f"version {version} of site {site} has no picture {sha256}")
+        return bytes_response(request, store.blob(sha256), sha256, "image/jpeg", immutable=True)
+
     changes, compared = SurfelChanges(store, _MOST_VIEWS), RateLimit(_VIEWS_AT_ONCE, _PAIRS_PER_S, store.now_ns)
 
     def changed(request: Request, site: str, before: int, after: int) -> Changes:
@@ -131,3 +149,11 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
         sha256 = offered(site, version)[1].hex()
         link = str(request.url.replace(path=f"/v1/sites/{site}/versions/{version}/file", query=""))
         return {"mapId": site, "mapVersion": str(version), "mapDownloadLink": link, "mapHash": sha256}
+
+
+def _picture_view(one: SurveyPicture, distance_m: float) -> PictureView:
+    (x, y, z), axis = one.place_map_m, np.array(one.looks_map)
+    yaw_deg = float(np.degrees(np.arctan2(axis[1], axis[0])))
+    pitch_deg = float(np.degrees(np.arcsin(np.clip(-axis[2], -1.0, 1.0))))
+    pose = x, y, z, round(yaw_deg, 1), round(pitch_deg, 1)
+    return PictureView(one.sha256, *pose, round(distance_m, 3), one.stamp_ns, one.recording)

@@ -63,6 +63,18 @@ class ViewPose(BaseModel):
     width_px: int = Field(320, ge=16, le=640, description="of the picture", examples=[320])
 
 
+class NearPlace(BaseModel):
+    """A place in `map`, and the viewing direction there."""
+
+    x_m: float = Field(ge=-1e5, le=1e5, description="of the place", examples=[1.5])
+    y_m: float = Field(ge=-1e5, le=1e5, description="of the place", examples=[2.0])
+    z_m: float = Field(0.0, ge=-1e3, le=1e3, description="of the place", examples=[0.5])
+    yaw_deg: float | None = Field(
+        None, ge=-360, le=360, description="pictures that look elsewhere come last", examples=[90.0]
+    )
+    limit: int = Field(1, ge=1, le=100, description="number of pictures", examples=[1])
+
+
 _TIME = "ISO 8601; without an offset the server's local time; a date alone is the whole day"
 Since = Annotated[
     str | None, Query(max_length=40, description=f"not before: {_TIME}", examples=["2026-01-02T03:04:05Z"])

@@ -27,6 +27,7 @@ from mapserver.serving.expected_views import failure_camera
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import JobInfo, MapStore, VerdictRow, VersionInfo
 from mapserver.surfels.surfel_map import index_address, surfels_of
+from mapserver.surfels.survey_pictures import pictures_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -37,6 +38,15 @@ _JOBS_SHOWN = 100
 Span = tuple[int | None, int | None]
 """From when and until before when, nanoseconds since 1970; None: without an end."""
 EVER: Span = (None, None)
+
+
+def _fault(read: Callable[[], object]) -> str | None:
+    """The message of what cannot be read, None where it can."""
+    try:
+        read()
+    except FleetmapError as error:
+        return str(error)
+    return None
 
 
 class _Kept(Generic[T]):
@@ -171,20 +181,15 @@ class MapData:
 
     def lacks_view(self, report: FailureReport) -> str | None:
         """Why it cannot be drawn what a robot should have seen when its failure began; None where it can."""
-        try:
-            version, _, _ = failure_camera(report)
-            index_address(self.store.manifest(report.site, version))
-        except FleetmapError as error:
-            return str(error)
-        return None
+        return _fault(lambda: index_address(self.store.manifest(report.site, failure_camera(report)[0])))
 
     def lacks_surfels(self, site: str, version: int) -> str | None:
         """Why a version has no map that renders; None where it has one."""
-        try:
-            index_address(self.store.manifest(site, version))
-        except FleetmapError as error:
-            return str(error)
-        return None
+        return _fault(lambda: index_address(self.store.manifest(site, version)))
+
+    def lacks_pictures(self, site: str, version: int) -> str | None:
+        """Why a version keeps no pictures of its surveys; None where it does."""
+        return _fault(lambda: pictures_of(self.store.manifest(site, version), self.store.blob))
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

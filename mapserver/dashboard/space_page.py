@@ -22,7 +22,8 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
     if version is None:
         raise StateError(f"site {site} has no published version; publish one, or name a draft")
     camera = maps.store.manifest(site, version).camera  # a version that is not there is named here
-    lacks, loops, views = maps.lacks_surfels(site, version), maps.loops(site, version), services.health.cameras(site)
+    lacks, lacks_pictures = maps.lacks_surfels(site, version), maps.lacks_pictures(site, version)
+    loops, views = maps.loops(site, version), services.health.cameras(site)
     cameras = {name: [*view.tangents, *view.base_from_cam] for name, view in robot_views(views).items()}
     return {
         "version": version,
@@ -30,6 +31,7 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
             "address": f"{context.root}/spaces/{site}/{version}.bin",
             "surfels": None if lacks else f"{context.root}/surfels/{site}/{version}.bin",
             "view": None if lacks else f"../v1/sites/{site}/versions/{version}/view.png",
+            "pictures": None if lacks_pictures else f"../v1/sites/{site}/versions/{version}/pictures",
             "tangents": [side / 2 / camera.focal_px for side in (camera.width_px, camera.height_px)],
             "cameras": cameras,
             "loops": [[*loop.start_map_m, *loop.end_map_m, int(loop.is_accepted)] for loop in loops],
@@ -37,6 +39,7 @@ def _space(services: Services, context: PageContext) -> dict[str, object]:
         },
         "plan": scene_of(services, context, version, [Layer("Where you stand")]),
         "lacks": lacks,
+        "lacks_pictures": lacks_pictures,
         "own": len(cameras),
         "absent": {"loops", "refused loops", "surfels"}
         - {"loops" if loop.is_accepted else "refused loops" for loop in loops}

@@ -62,6 +62,7 @@ from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.surfels.surfel_map import SurfelTiles, known_surfels, surfel_report
+from mapserver.surfels.survey_pictures import PICTURES_KEY, kept_pictures, pictures_of
 from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
@@ -310,6 +311,14 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     if run.settings.surfel_map:
         surfels = surfel_grower.surfels.blobs()
         surfels_said = surfel_report(surfels, len(surfel_grower.surfels), without["surfels"])
+    pictures, pictures_said = list[bytes](), None
+    if run.settings.survey_pictures:
+        before = (
+            ()
+            if parent is None or PICTURES_KEY not in parent.manifest.report
+            else pictures_of(parent.manifest, maps.blob)
+        )
+        pictures, pictures_said = kept_pictures(sessions, before, maps.blob)
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
@@ -326,7 +335,12 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     known_m = None if parent is None else parent.manifest.report.get("alias_step_m")
     step_m = alias_step_m(evidence.repetition, known_m)
     report = msgspec.structs.replace(
-        report, grid=grid_said, surfels=surfels_said, surveyed_requests=asked, alias_step_m=step_m
+        report,
+        grid=grid_said,
+        surfels=surfels_said,
+        pictures=pictures_said,
+        surveyed_requests=asked,
+        alias_step_m=step_m,
     )
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -342,7 +356,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     job = run.request.options.job
     content = DraftContent(
         tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive, grid=grid, surfels=surfels,
-        evidence=evidence, job=job,
+        pictures=pictures, evidence=evidence, job=job,
     )  # fmt: skip
     version = maps.save(site, content, actor=run.request.options.actor).version
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)

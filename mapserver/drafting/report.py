@@ -20,6 +20,7 @@ from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
 from mapserver.surfels.surfel_map import SurfelReport
+from mapserver.surfels.survey_pictures import PicturesReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.survey_map import SurveyMap
@@ -64,6 +65,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     alias_step_m: float | None = None
     grid: GridReport | None = None
     surfels: SurfelReport | None = None
+    pictures: PicturesReport | None = None
     surveyed_requests: dict[str, float] = {}
 
 

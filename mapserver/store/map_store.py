@@ -139,7 +139,7 @@ class MapStore(StoreQueries):
             entries = sorted((self._put_tile(tile) for tile in content.tiles), key=lambda entry: (entry.x, entry.y))
             vocabulary = BlobEntry(sha256=self._blobs.put(content.vocabulary), bytes=len(content.vocabulary))
             archive_sha256 = None if content.archive is None else self._blobs.put(content.archive)
-            every = {"grid": content.grid, "surfel": content.surfels}
+            every = {"grid": content.grid, "surfel": [*content.surfels, *content.pictures]}
             kept = {kind: [self._blobs.put(data) for data in blobs] for kind, blobs in every.items()}
             with self._transactions.write() as connection:
                 connection.execute("INSERT OR IGNORE INTO sites (site) VALUES (?)", (site,))

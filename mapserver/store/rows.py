@@ -128,7 +128,8 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DraftContent:
-    """A new draft. archive: the whole survey; grid, surfels: as of `encode_grid`, `encode_surfels`; evidence: for the gate.
+    """A new draft. archive: the whole survey; grid, surfels, pictures: as of `encode_grid`, `SurfelTiles.blobs`, `kept_pictures`;
+    evidence: for the gate.
 
     job: number of the job that built it.
     """
@@ -139,6 +140,7 @@ class DraftContent:
     archive: bytes | None = None
     grid: Sequence[bytes] = ()
     surfels: Sequence[bytes] = ()
+    pictures: Sequence[bytes] = ()
     evidence: Evidence | None = None
     job: int | None = None
 

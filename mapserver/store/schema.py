@@ -42,7 +42,7 @@ CREATE TABLE version_blobs (
 
 CREATE INDEX version_blobs_by_address ON version_blobs(sha256)
 
--- What no robot fetches: the grid of planners and the surfels, each an index and tiles
+-- What no robot fetches: the grid of planners, and the surfels with the pictures of surveys, each an index and tiles or pictures
 CREATE TABLE grid_blobs (
     site TEXT NOT NULL,
     version INTEGER NOT NULL,

@@ -9,7 +9,7 @@ from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VersionInfo
 
 EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
-"""By kind: table of the bytes of a version not needed by its robots."""
+"""By kind: table of the bytes of a version not needed by its robots; pictures of surveys are among the surfels."""
 
 # The newest row of an earlier current version.
 _ROLLBACK_TARGET = """

@@ -156,6 +156,7 @@ class SurveySettings(Section, frozen=True):
     seed: int = 0
     occupancy_grid: bool = True
     surfel_map: bool = True
+    survey_pictures: bool = True
     odometry: OdometrySettings = OdometrySettings()
     orb: OrbSettings = OrbSettings(count=1200)
     stereo: StereoSettings = StereoSettings()

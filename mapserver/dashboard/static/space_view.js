@@ -13,7 +13,7 @@ const TURN_DEG = 15, STEP_EVERY_MS = 700, FAR_M = 3;
 const VIEW_EVERY_MS = 1200, STILL_MS = 250; // the server draws one a second for an address
 const BAR_PX = 140, REACH_PX = 12, STILL_PX = 4;
 const BEHIND = 1.05; // times as far away: another surface
-const RAD = Math.PI / 180;
+const RAD = Math.PI / 180, CLOCKS_BEGIN_MS = Date.UTC(2000); // earlier stamps count from a start, not from 1970
 // Keys of the walk, as its buttons are called.
 const KEYS = {
   ArrowUp: "forward", w: "forward", ArrowDown: "back", s: "back", ArrowLeft: "left", a: "left", ArrowRight: "right", d: "right",
@@ -21,7 +21,7 @@ const KEYS = {
 };
 
 const element = document.querySelector(".space-view");
-const [canvas, where, bar, picture, caption] = ["canvas", ".where", ".bar", ".expected img", "figcaption"].map((part) => element.querySelector(part));
+const [canvas, where, bar, picture, caption, taken, takenCaption] = ["canvas", ".where", ".bar", ".expected img", "figcaption", ".taken img", ".taken figcaption"].map((part) => element.querySelector(part));
 const scene = JSON.parse(element.dataset.space);
 const world = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(FIELD_DEG, 1, 0.05, 2000);
@@ -328,7 +328,7 @@ function stand(jump_m = 0) {
   const here = { kind: "mark", x, y, tone: "accent", shape: "arrow", words: "you", name: "you", address: null };
   here.heading_rad = ((((heading + 180) % 360) + 360) % 360 - 180) * RAD;
   document.getElementById("plan").map.show("Where you stand", [here]);
-  if (scene.view) expect({ x_m: x, y_m: y, z_m: z, yaw_deg: ((heading % 360) + 360) % 360, pitch_deg: pitch });
+  expect({ x_m: x, y_m: y, z_m: z, yaw_deg: ((heading % 360) + 360) % 360, pitch_deg: pitch });
 }
 
 // The last place that one stands still at, and no more of them than the server draws.
@@ -337,6 +337,8 @@ function expect(pose) {
   const place = at + 1;
   viewTimer = setTimeout(() => {
     viewAsked = Date.now();
+    if (scene.pictures) recall(pose);
+    if (!scene.view) return;
     const next = new Image();
     next.onload = () => {
       picture.src = next.src;
@@ -345,6 +347,19 @@ function expect(pose) {
     next.onerror = () => (caption.textContent = "The server did not draw this view; step on to ask again");
     next.src = `${scene.view}?${Object.entries(pose).map(([name, value]) => `${name}=${value.toFixed(3)}`).join("&")}`;
   }, Math.max(STILL_MS, viewAsked + VIEW_EVERY_MS - Date.now()));
+}
+
+// The picture that a survey took next to a place, looking the same way where there is one.
+async function recall({ pitch_deg: _, ...pose }) {
+  const answer = await fetch(`${scene.pictures}?${new URLSearchParams(pose)}`).catch(() => undefined);
+  const found = await answer?.json().catch(() => undefined);
+  const [near] = found?.pictures ?? [];
+  taken.hidden = !near;
+  if (!near) return (takenCaption.textContent = found?.detail ?? "The server does not answer; step on to ask again");
+  taken.src = `${scene.pictures}/${near.sha256}`;
+  const taken_ms = near.taken_ns / 1e6;
+  const when = taken_ms > CLOCKS_BEGIN_MS ? `, ${new Date(taken_ms).toLocaleString()}` : "";
+  takenCaption.textContent = `Taken ${near.distance_m.toFixed(1)} m away by the survey ${near.recording}${when}`;
 }
 
 function look(chosen) {

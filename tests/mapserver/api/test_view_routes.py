@@ -12,8 +12,16 @@ from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, FailureReport, Placement
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter
-from support.fleet.served_api import Server, served_api
-from support.storage.map_samples import save_grid_draft, save_sample_draft, save_surfel_draft, seen_wall, wall
+from support.fleet.served_api import Server, check_problem, served_api
+from support.storage.map_samples import (
+    save_grid_draft,
+    save_picture_draft,
+    save_sample_draft,
+    save_surfel_draft,
+    seen_wall,
+    wall,
+)
+from support.storage.room_sessions import session_at
 
 POSE = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "yaw_deg": 0.0, "width_px": 188}
 
@@ -41,6 +49,29 @@ def test_the_wall_is_shown_where_it_is_looked_at(server: Server, address: str) -
     assert (cv2.imdecode(np.frombuffer(away, np.uint8), cv2.IMREAD_UNCHANGED)[..., 3] == 0).all()
     down = server.client.get(address, params=POSE | {"pitch_deg": 20.0}).content
     assert cv2.imdecode(np.frombuffer(down, np.uint8), cv2.IMREAD_UNCHANGED)[19, 94, 0] == 250
+
+
+def test_the_nearest_picture_of_a_survey_is_given(server: Server) -> None:
+    places = [se3(np.eye(3), np.array([x, 0.0, 0.5])) for x in np.arange(0.0, 9.0, 0.6)]
+    version = save_picture_draft(server.store, [session_at(places, has_depth=True)])
+    address = f"/v1/sites/lab/versions/{version}/pictures"
+    (near,) = server.client.get(address, params={"x_m": 2.3, "y_m": 0.0, "z_m": 0.5}).json()["pictures"]
+    assert (near["recording"], near["x_m"], near["distance_m"]) == (
+        "ride",
+        pytest.approx(2.5),
+        pytest.approx(0.21, abs=0.02),
+    )
+    answer = server.client.get(f"{address}/{near['sha256']}")
+    assert answer.headers["Content-Type"] == "image/jpeg"
+    assert cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED).shape == (240, 320)
+    every = server.client.get(address, params={"x_m": 0, "y_m": 0, "yaw_deg": 0, "limit": 100}).json()["pictures"]
+    assert [one["distance_m"] for one in every] == sorted(one["distance_m"] for one in every)
+    check_problem(server.client.get(f"{address}/{'0' * 64}"), 404, "has no picture")
+    secret = server.store.version("lab", version).archive_sha256
+    check_problem(server.client.get(f"{address}/{secret}"), 404, "has no picture")
+    old = server.client.get("/v1/sites/lab/versions/1/pictures", params={"x_m": 0, "y_m": 0})
+    check_problem(old, 409, "by an earlier fleetmap")
+    check_problem(server.client.get(address), 422, "x_m")
 
 
 @pytest.mark.parametrize(

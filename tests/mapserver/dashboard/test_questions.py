@@ -267,7 +267,7 @@ def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:
     dialog, used = page.get_by_role("dialog"), page.get_by_role("status")
     expect(dialog).to_contain_text(
         re.compile(
-            "Draft 3 goes through the gate. If the gate accepts it, all 20 robots of hall get it. It changes .* tiles? of .* m²: .*landmarks"
+            "goes through the gate. If the gate accepts it, all 20 robots of hall get it. It changes .* tiles? of .* m²: .*landmarks"
         )
     )
     dialog.get_by_label("Your name").fill("ada")

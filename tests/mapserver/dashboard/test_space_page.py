@@ -22,7 +22,8 @@ from mapserver.surfels.surfel_map import EDGE_M
 from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
-from support.storage.map_samples import random_tile, save_surfel_draft, seen_wall
+from support.storage.map_samples import random_tile, save_picture_draft, save_sample_draft, save_surfel_draft, seen_wall
+from support.storage.room_sessions import session_at
 
 SEEN = "document.querySelector('.space-view').seen()"
 
@@ -104,6 +105,29 @@ def test_surfaces_are_seen_and_measured(page: Page, tmp_path: Path) -> None:
         told = float(page.locator(".where").inner_text().split(" m apart")[0])
         assert told == pytest.approx(float(np.linalg.norm(ends[1] - ends[0])), abs=0.3)
     assert seen.faults == []
+
+
+def test_the_picture_of_a_survey_is_shown_at_a_place(page: Page, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        places = [se3(np.eye(3), np.array([x, 0.0, 0.5])) for x in np.arange(0.0, 9.0, 0.5)]
+        version = save_picture_draft(store, [session_at(places, has_depth=True)])
+        old = save_sample_draft(store)
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "space", site="lab", version=version)
+        wait_until(page, "document.querySelector('.space-view').seen")
+        expect(page.locator(".taken img")).to_be_hidden()
+        page.get_by_role("button", name="Walk through it").click()
+        expect(page.get_by_alt_text("What a survey's camera saw near here")).to_be_visible()
+        expect(page.locator(".taken figcaption")).to_have_text(re.compile(r"^Taken \d+\.\d m away by the survey ride$"))
+        wait_until(page, "document.querySelector('.taken img').naturalWidth === 320")
+        assert_whole(page)
+        assert seen.faults == []
+        seen = opened(page, served, "space", site="lab", version=old)
+        wait_until(page, "document.querySelector('.space-view').seen")
+        expect(page.get_by_text(f"Version {old} of site lab keeps no pictures of its surveys")).to_be_visible()
+        page.get_by_role("button", name="Walk through it").click()
+        expect(page.locator(".taken")).to_be_hidden()
+        assert seen.faults == []
 
 
 def test_an_empty_version_is_empty() -> None:

@@ -26,7 +26,7 @@ KEYS = [
     *("recordings", "duration_s", "seconds", "realtime_factor", "path_m", "keyframes", "landmarks", "map_bytes"),
     *("loops", "ate_rmse_m", "ate_sim3_rmse_m", "evaluated_share", "scale", "scale_error"),
     *("peak_rss_mb", "findings", "corrections", "culled", "sessions", "joins", "directions"),
-    *("starts", "views", "lookalike_recall", "alias_step_m", "grid", "surfels", "surveyed_requests"),
+    *("starts", "views", "lookalike_recall", "alias_step_m", "grid", "surfels", "pictures", "surveyed_requests"),
 ]
 NOT_FOR_ROBOTS = {"map_bytes", "culled", "sessions", "directions", "starts", "views"}
 

@@ -1,5 +1,6 @@
 """Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
@@ -12,8 +13,10 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
+from mapserver.grid.survey_grid import GridSession
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.surfels.surfel_map import EDGE_M, Surfels, encode_surfels, surfel_report
+from mapserver.surfels.survey_pictures import kept_pictures
 from mapserver.survey.survey_map import SurveyMap
 
 
@@ -146,6 +149,15 @@ def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -
     details = draft_details(path_m=12.5, surfels=msgspec.to_builtins(surfel_report(blobs, len(surfels), {})))
     tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
     content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", surfels=blobs)
+    return store.save(site, content).version
+
+
+def save_picture_draft(store: MapStore, sessions: Sequence[GridSession], *, site: str = "lab") -> int:
+    """A draft with the pictures of these sessions."""
+    blobs, said = kept_pictures(sessions, (), {}.__getitem__)
+    details = draft_details(path_m=12.5, pictures=msgspec.to_builtins(said))
+    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
+    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", pictures=blobs)
     return store.save(site, content).version
 
 
