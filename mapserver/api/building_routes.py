@@ -16,7 +16,7 @@ from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.guard import By
-from mapserver.fleet.building import align, forget_alignment, keep_areas, replace_areas
+from mapserver.fleet.building import align, estimate_alignment, forget_alignment, keep_areas, replace_areas
 from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.store import MapStore
@@ -102,6 +102,14 @@ def install_building_routes(app: FastAPI, store: MapStore) -> None:
             drawing = None if plan is None else decode_plan(plan, data)
             found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
         return dict(to_plain(found))
+
+    @app.get("/v1/sites/{site}/alignment/estimate")
+    def estimate(site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
+        """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
+        store.current(site)
+        with _refused_with(422):
+            found, fit = estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
+        return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
 
     @app.delete("/v1/sites/{site}/alignment")
     def forget(site: p.Site, by: By) -> views.ServiceState:

@@ -9,6 +9,7 @@ from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import share, size
+from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
@@ -97,6 +98,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "version_facts": _facts(maps, info, plan),
         "one_way": one_way(plan, maps.areas(site)),
         "changes": changes,
+        "alignment": _aligned(maps.store.alignment(site)),
         "areas": sorted(maps.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "kept": {"version": asked},
@@ -197,6 +199,15 @@ def _acts(
             f"otherwise all robots get it.{gets}"
         )
         yield f"Try version {version} on {some}", f"{to}/canary", told, {}, "forward", False
+
+
+def _aligned(found: Alignment | None) -> str:
+    """What the map is aligned with and how well; empty without an alignment."""
+    if found is None:
+        return ""
+    plan = f"with {found.plan} " if found.plan else ""
+    left = f", at most {max(found.off_m.values()):.2f} m left at one" if found.off_m else ""
+    return f"The map is aligned {plan}by {len(found.off_m)} points{left}."
 
 
 def _gets(found: Difference, tile_size_m: float) -> str:

@@ -43,10 +43,10 @@ def replace_areas(store: MapStore, site: str, data: bytes, actor: Actor, *, tag:
     return keep_areas(store, site, data, "; ".join(words)[:2000] or "changed", actor, tag=tag)
 
 
-def align(
-    store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None, actor: Actor
+def estimate_alignment(
+    store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None
 ) -> tuple[Alignment, Fit]:
-    """Estimate the pose of a site's map in the drawing of its building from pins, and keep it with the drawing (None: pins alone).
+    """Return the pose of a site's map in the drawing of its building (None: of pins alone), from pins.
 
     metres_per_pixel: of the drawing, None to estimate it. StateError without a current version, UsageError for pins that give no pose.
     """
@@ -59,6 +59,14 @@ def align(
         plan=None if plan is None else plan.name,
         off_m=fit.off_m,
     )
+    return found, fit
+
+
+def align(
+    store: MapStore, site: str, pins: Sequence[Pin], plan: PlanFile | None, metres_per_pixel: float | None, actor: Actor
+) -> tuple[Alignment, Fit]:
+    """As `estimate_alignment`, and keep it with the drawing."""
+    found, fit = estimate_alignment(store, site, pins, plan, metres_per_pixel)
     files = {ALIGNMENT: encode_alignment(found), PLAN: None if plan is None else plan.data}
     store.keep_site_files(site, files, alignment_words(found), actor=actor)
     return found, fit

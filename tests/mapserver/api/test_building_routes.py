@@ -138,7 +138,12 @@ def test_a_map_is_aligned_with_a_plan_as_by_the_command(server: Server) -> None:
     picture = cv2.imencode(".png", np.full((500, 600), 255, np.uint8))[1].tobytes()
     check_problem(server.client.get(ALIGNMENT), 404, "is not aligned")
     asked = ADA | {"pin": PINS, "plan": "plan.png"}
+    estimated = server.client.get(f"{ALIGNMENT}/estimate", params={"pin": PINS}).json()
+    check_problem(server.client.get(ALIGNMENT), 404, "is not aligned")
+    check_problem(server.client.get(f"{ALIGNMENT}/estimate", params={"pin": PINS[:1]}), 422, "give 2 to 100")
     kept = server.client.put(ALIGNMENT, params=asked, content=picture)
+    assert estimated["off_m"] == kept.json()["off_m"]
+    assert (estimated["metres_per_unit"], estimated["is_checked"]) == (pytest.approx(0.05), True)
     assert kept.json() == server.client.get(ALIGNMENT).json()
     shown = CliRunner().invoke(
         app, ["align", "--show", "--json", "--site", "lab", "--store", str(server.folder)], catch_exceptions=False

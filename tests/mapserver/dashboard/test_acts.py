@@ -4,7 +4,9 @@ import re
 import time
 from pathlib import Path
 
+import cv2
 import httpx
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 from typer.testing import CliRunner
@@ -22,6 +24,8 @@ from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
 from support.fleet.webhook_receiver import receiver
+from support.pages.browser import box_of
+from support.pages.whole_page import assert_whole
 from support.storage.map_samples import draft_details
 
 
@@ -81,6 +85,60 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     change(page, page.get_by_role("button", name=re.compile("^Survey .* is done")).inner_text())
     expect(asked).to_have_count(0)
     assert seen.faults == []
+
+
+def test_a_map_is_aligned_with_its_plan_by_clicks_in_both(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    plan = tmp_path / "hall plan.png"
+    plan.write_bytes(cv2.imencode(".png", np.full((300, 600), 200, np.uint8))[1].tobytes())
+    with serving(tmp_path) as served, MapStore.open(tmp_path) as store:
+        seen = opened(page, served, "map")
+        page.get_by_text("Align the map with a floor plan").click()
+        keep, dialog = page.get_by_role("button", name="Keep this alignment"), page.get_by_role("dialog")
+        keep.click()
+        expect(dialog).to_contain_text("Give at least two points first")
+        dialog.get_by_role("button", name="No, change nothing").click()
+        page.get_by_label("Picture of the plan").set_input_files(plan)
+        paper, written, told = (
+            page.locator(".paper .site-map"),
+            page.get_by_label("Points: pixels"),
+            page.locator("#aligning output"),
+        )
+        for n, share in enumerate(((0.1, 0.2), (0.9, 0.2))):
+            paper.scroll_into_view_if_needed()
+            page.wait_for_timeout(300)  # the map fits itself into its frame
+            sheet, drawn = box_of(paper), box_of(paper.locator("img"))
+            x, y = (
+                drawn[axis] - sheet[axis] + part * drawn[side]
+                for axis, side, part in zip("xy", ("width", "height"), share, strict=True)
+            )
+            paper.click(position={"x": x, "y": y})
+            expect(told).to_contain_text("Now the same point in the map.")
+            page.locator("#map").click(position={"x": 150 + 300 * n, "y": 200})
+        points = [[float(v) for v in re.split("[,:]", point)] for point in written.input_value().split(";")]
+        np.testing.assert_allclose([point[:2] for point in points], [(60, 60), (540, 60)], atol=3)
+        expect(told).to_contain_text("a third would show a mistake")
+        scale = (points[1][2] - points[0][2]) / (points[1][0] - points[0][0])
+        third = [points[0][0], points[0][1] + 100, points[0][2], points[0][3] - 100 * scale + 0.2]
+        written.fill("; ".join(f"{px}, {py}: {x}, {y}" for px, py, x, y in [*points, third]))
+        expect(told).to_have_text(
+            re.compile(r"m for each pixel\. Left at the points: 1: 0\.\d\d m, 2: 0\.\d\d m, 3: 0\.\d\d m\. $")
+        )
+        assert_whole(page)
+        keep.click()
+        dialog.get_by_label("Your name").fill("ada")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(page.locator("#aligning")).to_contain_text(
+            "The map is aligned with hall plan.png by 3 points, at most 0."
+        )
+        found = store.alignment(SITE)
+        assert (found.plan, found.metres_per_unit) == ("hall plan.png", pytest.approx(scale, rel=0.1))
+        assert store.last_events(SITE, 1)[0].actor == "ada"
+        page.get_by_text("Align the map with a floor plan").click()
+        change(page, "Forget the alignment")
+        expect(page.locator("#aligning")).to_contain_text("The map is not aligned yet.")
+        assert store.alignment(SITE) is None
+        assert seen.faults == []
 
 
 def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) -> None:

@@ -51,7 +51,8 @@ export class SiteMap {
     }
     map.fitBounds(corners(scene.box), { padding: [6, 6] });
     const marks = new Marks();
-    map.addLayer(new Axes()).addLayer(marks);
+    if (scene.hasAxes !== false) map.addLayer(new Axes());
+    map.addLayer(marks);
     map.on("click", ({ containerPoint, latlng }) => {
       const mark = marks.nearest(containerPoint)?.item;
       if (!mark?.address) onPick(latlng.lng, latlng.lat, mark);
