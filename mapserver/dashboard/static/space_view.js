@@ -94,6 +94,9 @@ async function fetchMap() {
   box = new THREE.Box3().setFromArray(count ? points : [-5, -5, 0, 5, 5, 2]);
 }
 
+// What three.js makes of a grey level of a picture.
+const LINEAR = Uint16Array.from({ length: 256 }, (_, grey) => 65535 * new THREE.Color().setRGB(grey / 255, 0, 0, THREE.SRGBColorSpace).r);
+
 // A Points for each level, as wide as its voxels.
 async function drawSurfels() {
   const answer = await fetch(scene.surfels);
@@ -105,7 +108,7 @@ async function drawSurfels() {
   counts.forEach((count, level) => {
     const shape = new THREE.BufferGeometry(), greys = new Uint8Array(bytes, first + 12 * total + begun, count);
     shape.setAttribute("position", new THREE.BufferAttribute(new Float32Array(bytes, first + 12 * begun, 3 * count), 3));
-    shape.setAttribute("color", new THREE.BufferAttribute(Uint8Array.from({ length: 3 * count }, (_, n) => greys[Math.floor(n / 3)]), 3, true));
+    shape.setAttribute("color", new THREE.BufferAttribute(Uint16Array.from({ length: 3 * count }, (_, n) => LINEAR[greys[Math.floor(n / 3)]]), 3, true));
     groups.surfels.add(new THREE.Points(shape, new THREE.PointsMaterial({ size: 1.5 * edges[level], vertexColors: true })));
     begun += count;
   });
