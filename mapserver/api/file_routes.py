@@ -155,5 +155,5 @@ def _picture_view(one: SurveyPicture, distance_m: float) -> PictureView:
     (x, y, z), axis = one.place_map_m, np.array(one.looks_map)
     yaw_deg = float(np.degrees(np.arctan2(axis[1], axis[0])))
     pitch_deg = float(np.degrees(np.arcsin(np.clip(-axis[2], -1.0, 1.0))))
-    pose = x, y, z, round(yaw_deg, 1), round(pitch_deg, 1)
-    return PictureView(one.sha256, *pose, round(distance_m, 3), one.stamp_ns, one.recording)
+    angles = round(yaw_deg, 1), round(pitch_deg, 1)
+    return PictureView(one.sha256, x, y, z, *angles, round(distance_m, 3), one.stamp_ns, one.recording)

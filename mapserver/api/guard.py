@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote, urlsplit
 
@@ -33,12 +34,7 @@ _RIGHTS = (  # needed for reading, too
     (re.compile(r"/v1/sites/[^/]+/(enrolled(/|$)|robots/[^/]+/remove(/|$))"), Right.ROBOTS),
 )
 _FORWARDED = {"forwarded", "x-forwarded-for", "x-real-ip"}
-_FORBIDDEN = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Not allowed – fleetmap</title><link rel="icon" href="data:,"><link rel="stylesheet" href="{style}"></head>
-<body class="print"><main class="sign-in"><h1>Not allowed</h1><p class="notice bad" role="alert">{words}</p>
-<p><a href="/">To the Overview</a></p></main></body></html>
-"""
+_FORBIDDEN = Path(__file__).with_name("forbidden.html").read_text("utf-8")
 _POLICY = (
     b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; base-uri 'none'; "
     b"form-action 'self'; frame-ancestors 'none'"

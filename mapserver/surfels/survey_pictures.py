@@ -93,10 +93,10 @@ def kept_pictures(
     for session in sessions:
         survey, taken, last = session.survey, list[SurveyPicture](), None
         for keyframe in survey.odometry.keyframes:
-            pose = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
-            if last is not None and np.linalg.norm(pose[:3, 3] - last) < _EVERY_M:
+            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+            if last is not None and np.linalg.norm(map_from_cam[:3, 3] - last) < _EVERY_M:
                 continue
-            place, looks = pose[:3, 3], pose[:3, 2]
+            place, looks = map_from_cam[:3, 3], map_from_cam[:3, 2]
             if _is_among(place, looks, taken):
                 continue
             last, jpeg = place, _jpeg(keyframe.frame.left)

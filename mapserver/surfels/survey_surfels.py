@@ -79,8 +79,8 @@ class SurfelGrower:
         smooth = np.asarray(cv2.blur(view.keyframe.frame.left, (stride + 1, stride + 1)), np.uint8)
         sparse = np.ascontiguousarray(disparity_px[step, step])
         arrays: list[Any] = self._images.keep([sparse, nearest, smooth])
-        pose = np.ascontiguousarray(view.map_from_cam)
-        look = _Look(arrays[0], arrays[1], arrays[2], view.sigma_px, pose, se3_inverse(pose))
+        map_from_cam = np.ascontiguousarray(view.map_from_cam)
+        look = _Look(arrays[0], arrays[1], arrays[2], view.sigma_px, map_from_cam, se3_inverse(map_from_cam))
         flat = _points(look, self._camera, _KEPT_STEP_PX)[:, :2]
         shifts = np.array([(x, y) for x in (-_HALO_M, _HALO_M) for y in (-_HALO_M, _HALO_M)])
         places = np.floor((flat[:, None] + shifts) / TILE_SIZE_M).astype(np.int32).reshape(-1, 2)

@@ -96,8 +96,8 @@ int64_t voxel_key(double x, double y, double z, int level) {
   return int64_t(key);
 }
 
-// Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4; the
-// mixing of splitmix64.
+// Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4;
+// the mixing of splitmix64.
 size_t VoxelTable::slot_of(int64_t key) const {
   const uint64_t mask = slots_.size() - 1, mixed = uint64_t(key >> 3) * 0x9E3779B97F4A7C15;
   uint64_t place = ((mixed ^ (mixed >> 29)) << 3 | uint64_t(key & 7)) & mask;
@@ -221,8 +221,8 @@ void look_at(const float* points, const uint8_t* levels, size_t count, const Dep
   }
 }
 
-void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture,
-           Vec3 falloff, double log_exposure, double* sums) {
+void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture, Vec3 falloff,
+           double log_exposure, double* sums) {
   if (picture.height < 2 || picture.width < 2) return;
   const SE3 pose = se3(view.cam_from_map);
   const double per_squared = 1.0 / (view.lens.focal * view.lens.focal), per_m = edges_per_m(view.lens.focal);

@@ -27,8 +27,8 @@ int64_t voxel_key(double x, double y, double z, int level);
 // Voxels of one recording, extended view by view.
 class VoxelTable {
  public:
-  // Adds the points of a view that lie in the box from low to high (x, y) of the map. disparity: of every stride_px-th pixel, NaN unknown, of
-  // standard deviation sigma_px. Points and normals are means by the inverse variance of the depth.
+  // Adds the points of a view that lie in the box from low to high (x, y) of the map. disparity: of every stride_px-th pixel, NaN unknown,
+  // of standard deviation sigma_px. Points and normals are means by the inverse variance of the depth.
   void add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam, const double* low,
            const double* high);
   // Fills mean points (N, 3) in map, unit normals (N, 3), levels (N,), and numbers of views, of those voxels whose normals do
@@ -63,14 +63,15 @@ struct DepthPicture {
   double clear_sigmas, clear_m;
 };
 
-// Evidence of a view on `count` points (N, 3) in map of voxels of these levels (N,): marks (N,), and pixels (N, 2) of points in range, else 0.
+// Evidence of a view on `count` points (N, 3) in map of voxels of these levels (N,): marks (N,), and pixels (N, 2) of points in range, else
+// 0.
 void look_at(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, uint8_t* marks, float* pixels);
 
 // Adds what a view says of points, as of `look_at`, to sums (N, 4): 1 if it sees the point; its weight in views if it sees through it, as
 // a view that sees more finely than the voxel was seen counts more; and, of seen points, the grey level of the picture relative to the
 // exposure and to the lens, of these coefficients by powers of the squared tangent, over distance^4, and 1 over distance^4.
-void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture,
-           Vec3 falloff, double log_exposure, double* sums);
+void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture, Vec3 falloff,
+           double log_exposure, double* sums);
 
 // A lens that bends nothing, in pixels; fx is 0 for any other.
 struct Pinhole {

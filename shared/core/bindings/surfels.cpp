@@ -93,9 +93,7 @@ void weigh_of(const Points& points_map, const Levels& levels, const Image32& nea
   check_levels(levels, count);
   if (sums.shape(0) != count) throw nb::value_error("sums: a row for each point");
   const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
-  unlocked([&] {
-    weigh(points_map.data(), levels.data(), count, view, picture(seen), vec3(falloff.data()), log_exposure, sums.data());
-  });
+  unlocked([&] { weigh(points_map.data(), levels.data(), count, view, picture(seen), vec3(falloff.data()), log_exposure, sums.data()); });
 }
 
 auto discs_before_of(const Points& points_map, const Points& normals_map, const Pose& cam_from_map, double cosine, double far_m,
