@@ -222,7 +222,12 @@ class ServerSync:
     def _send_again(self) -> None:
         """After the server's store was restored: what it had acknowledged before may be lost."""
         for outbox in (self._outbox, self.replays):
-            if outbox is not None and (count := outbox.send_again(self.client.restored_ns)):
+            try:
+                count = 0 if outbox is None else outbox.send_again(self.client.restored_ns)
+            except StoreError as error:  # an unusable spool delays no map
+                _log.warning("what the map server may have lost waits: %s", error)
+                continue
+            if count:
                 _log.warning(
                     "the map server was restored from a backup: %d reports or recordings are sent again", count
                 )

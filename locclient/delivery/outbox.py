@@ -107,7 +107,10 @@ class Outbox:
             old_ns = self._wall_ns() - _KEPT_NS
             database.execute("DELETE FROM report WHERE delivered_ns BETWEEN 1 AND ?", (old_ns,))
             known = database.execute("SELECT value FROM count WHERE name = ?", (_RESTORED,)).fetchone()
-            if restored_ns <= (0 if known is None else known[0]):
+            if restored_ns in (
+                0,
+                None if known is None else known[0],
+            ):  # not "before": its clock may have been set back
                 return 0
             database.execute("INSERT OR REPLACE INTO count VALUES (?, ?)", (_RESTORED, restored_ns))
             return database.execute("UPDATE report SET delivered_ns = 0 WHERE delivered_ns").rowcount

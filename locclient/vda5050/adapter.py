@@ -342,7 +342,8 @@ class FleetAdapter:
         """Return what the topic visualization shows, without its header; None before the first pose."""
         with self._lock:
             place = self._localization.mobile_robot_position(self.map_id, self._lost_radius_m)
-            velocity = None if self._part is None else self._part.velocity
+            part = self._part if self._clock_s() - self._part_s <= self._section.robot_silent_s else None
+            velocity = None if part is None else part.velocity
             if place is None:
                 return None
             return {"mobileRobotPosition": place} | ({} if velocity is None else {"velocity": to_plain(velocity)})

@@ -122,7 +122,7 @@ class MqttLink:
             handle(message.payload)
 
     def _run(self) -> None:
-        state_at_s, seen = 0.0, None
+        state_at_s, shown_at_s, seen = 0.0, 0.0, None
         while not self._stop.is_set():
             is_changed = self.adapter.changed.wait(_VISUALIZATION_S)
             if not self._client.is_connected() or self._stop.is_set():
@@ -136,7 +136,8 @@ class MqttLink:
                 state_at_s = time.monotonic() + self._section.state_interval_s
                 self._publish("state", self.adapter.state(), qos=0, retain=False)
             position = self.adapter.position()
-            if position is not None and position != seen:
+            if position is not None and position != seen and time.monotonic() >= shown_at_s:
+                shown_at_s = time.monotonic() + _VISUALIZATION_S
                 last = {"referenceStateHeaderId": (self._sent["state"] - 1) & 0xFFFFFFFF}
                 self._publish("visualization", {**last, **position}, qos=0, retain=False)
                 seen = position

@@ -9,21 +9,21 @@ import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pyrage
 
-from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
+from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.mapformat import sha256_hex
-from mapserver.backup.snapshots import BackupTarget, Snapshot
+from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import MapStore
 from mapserver.store.database import format_of
 from mapserver.store.files import is_plain_file, locked
 
 _TRIES = 3  # copies of the database, each after another garbage collection
-_PIECE_BYTES = 4 << 20  # of the database, whose unchanged pages stay where they are
 _LEFT_OVER = ".backup-"
 
 
@@ -65,33 +65,32 @@ def back_up(
     progress: called with the numbers of blobs done and in all. Raises StoreError if either side cannot be read or written, or if another
     backup of this store is under way.
     """
-    folder, upload = store.folder, _Upload(target)
+    folder = store.folder
     with (
         disk_errors(f"{folder} cannot be read", "check its rights and space"),
         locked(folder / "backup.lock", shared=False),
     ):
         for path in folder.glob(f"{_LEFT_OVER}*"):  # of a killed backup
             shutil.rmtree(path)
-        keys = "" if recipient is None else upload.put(pyrage.encrypt(_packed(folder / "keys"), [recipient]))
-        files = _lists(folder / "trust", upload)
+        upload = _Upload(target)
+        files, keys = _trusted(folder, upload, recipient)
         for _ in range(_TRIES):
             with tempfile.TemporaryDirectory(prefix=_LEFT_OVER, dir=folder) as temporary:
                 copy = Path(temporary) / "store.sqlite3"
                 content = store.copy_database(copy)
                 files["store.sqlite3"] = [upload.put(piece) for piece in _pieces(copy)]
                 store_format = format_of(copy)
-            missing = upload.blobs(store, content.blobs, progress)
+            blobs, missing = upload.blobs(store, content.blobs, progress)
             if not missing & content.blobs - store.named_blobs():  # none of them was dropped since the copy
                 break
         else:
             raise StateError(f"garbage was collected during each of {_TRIES} tries; back up at another time of day")
         snapshot = Snapshot(
-            store_format=store_format, versions=content.versions, files=files, blobs=sorted(content.blobs - missing),
-            keys=keys, missing=sorted(missing),
+            store_format=store_format, versions=content.versions, files=files, blobs=blobs, keys=keys, missing=sorted(missing),
         )  # fmt: skip
         now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
         name = target.write(snapshot, now)
-        removed, _ = target.prune(keep, now)
+        removed = [] if missing else target.prune(keep, now)  # an older one may have what is missing
     total = sum(upload.sizes[address] for address in snapshot.objects())
     return BackupReport(name, total, upload.count, upload.bytes, bool(keys), tuple(snapshot.missing), tuple(removed))
 
@@ -110,31 +109,39 @@ class _Upload:
             self.count, self.bytes, self.sizes[address] = self.count + 1, self.bytes + len(data), len(data)
         return address
 
-    def blobs(self, store: MapStore, addresses: set[str], progress: Callable[[int, int], None]) -> set[str]:
-        """Upload blobs; return those that the store has lost or damaged and the target does not have either."""
-        missing = set()
+    def blobs(
+        self, store: MapStore, addresses: set[str], progress: Callable[[int, int], None]
+    ) -> tuple[dict[str, int], set[str]]:
+        """Upload blobs. Return their sizes, and those that the store has lost or damaged and the target does not have either."""
+        found, missing = dict[str, int](), set[str]()
         for number, address in enumerate(sorted(addresses), start=1):
             progress(number, len(addresses))
-            if address in self.sizes:
-                continue
-            try:
-                self.put(store.blob(address))
-            except FleetmapError:
+            path = store.blob_file(address)
+            size = None if path is None else path.stat().st_size
+            if address in self.sizes and size in (None, self.sizes[address]):
+                found[address] = self.sizes[address]
+            elif path is None or size is None or not store.is_whole(address):
                 missing.add(address)
-        return missing
+            else:
+                self._target.put(path, address)
+                self.count, self.bytes = self.count + 1, self.bytes + size
+                found[address] = self.sizes[address] = size
+        return found, missing
 
 
-def _lists(folder: Path, upload: _Upload) -> dict[str, list[str]]:
-    """Upload the signed lists, which are older than the database then: the restored store signs what is missing."""
-    if not folder.is_dir():
-        return {}
-    with locked(folder / "lock", shared=False):  # old lists are removed under it
-        return {f"trust/{path.name}": [upload.put(path.read_bytes())] for path in _plain_files(folder, ".json")}
+def _trusted(
+    folder: Path, upload: _Upload, recipient: "pyrage.x25519.Recipient | None"
+) -> tuple[dict[str, list[str]], str]:
+    """Upload signed lists and, for a recipient, keys. They are older than the database then: the restored store signs what is missing."""
+    lists = folder / "trust"
+    with locked(lists / "lock", shared=False) if lists.is_dir() else nullcontext():  # keys and lists change under it
+        keys = "" if recipient is None else upload.put(pyrage.encrypt(_packed(folder / "keys"), [recipient]))
+        return {f"trust/{path.name}": [upload.put(path.read_bytes())] for path in _plain_files(lists, ".json")}, keys
 
 
 def _pieces(path: Path) -> Iterator[bytes]:
     with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
+        while piece := file.read(PIECE_BYTES):
             yield piece
 
 

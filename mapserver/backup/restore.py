@@ -1,37 +1,44 @@
 """Restoring of a store from a snapshot, and verification of snapshots."""
 
 import io
+import logging
 import shutil
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import pyrage
 
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import blob_path
-from mapserver.backup.snapshots import BackupTarget, Snapshot
+from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import Actor, MapStore
-from mapserver.store.files import make_folder
+from mapserver.store.files import locked, make_folder
 from mapserver.trust import SignedLists
 from mapserver.trust.signing import sign_ahead
 
-_MOST_KEY_BYTES = 16 << 20
+_NO_STORE = {"lock", "lost+found", _PART := ".restore"}
 _VERSIONS_AHEAD = 1000  # more than a site gets between a backup and the next restoration
 _LISTS_AHEAD = 100_000  # the same, of a timestamp each six hours and with each release
+_log = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class RestoreReport:
-    """Result of a restoration. keys: names of the restored ones. is_signed: robots of before accept the lists that the store serves now."""
+    """Result of a restoration. keys: names of the restored ones.
+
+    lists: "none" without signed ones; "new": signed by new keys, all robots accept them; "ahead": robots accept them unless sites or keys
+    were added after the backup; "old": signed by nobody, for lack of a key.
+    """
 
     snapshot: str
     versions: int
     keys: tuple[str, ...]
-    is_signed: bool
+    lists: Literal["none", "new", "ahead", "old"]
     missing: tuple[str, ...]
 
 
@@ -68,52 +75,78 @@ def restore(
     identities: "Iterable[pyrage.x25519.Identity]" = (),
     progress: Progress = lambda done, total: None,
 ) -> RestoreReport:
-    """Make a store of a snapshot, the newest by default, in a folder that must not exist or be empty; a failure leaves it so.
+    """Make a store of a snapshot, the newest by default, in a folder without a store; a failure leaves it as it was.
 
     Robots of the lost store may know later versions and lists. So numbers go on some way behind those of the snapshot, farther with each
     restoration; the lists are signed anew if the keys are at hand; and robots send again what the lost store had acknowledged lately.
     Errors as of `BackupTarget.read` and `BackupTarget.get`, StoreError for the disk, UsageError for an unfit folder or key.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder} is not empty; name a new folder with --store, so that nothing is overwritten")
-    name, snapshot = target.read(name)
-    keys = _keys(target, snapshot, list(identities))
-    part = folder.with_name(f"{folder.name}.part")
-    with disk_errors(f"{part} cannot be written", "check its rights and space"):
-        shutil.rmtree(part, ignore_errors=True)
-        make_folder(part)
-        try:
-            _write(target, snapshot, part, keys, progress)
-            number = target.count_restore()
-            with MapStore.open(part) as store:
-                store.note_restored(
-                    f"snapshot {name}, of {snapshot.versions} versions", number * _VERSIONS_AHEAD, actor
+    folder = folder.absolute()
+    with disk_errors(f"{folder} cannot be written", "check its rights and space"):
+        make_folder(folder)
+        with locked(folder / "lock", shared=False):
+            if others := sorted(path.name for path in folder.iterdir() if path.name not in _NO_STORE):
+                raise UsageError(
+                    f"{folder} holds {others[0]!r} already; name a new folder, so that nothing is overwritten"
                 )
-                is_signed = not SignedLists(part).are_there or sign_ahead(store, number * _LISTS_AHEAD)
-            if folder.exists():
-                folder.rmdir()
-            part.rename(folder)
-        except BaseException:
-            shutil.rmtree(part, ignore_errors=True)
-            raise
-        sync_path(folder.parent)
-    return RestoreReport(name, snapshot.versions, tuple(sorted(keys)), is_signed, tuple(snapshot.missing))
+            name, snapshot = target.read(name)
+            _check_room(folder, sum(snapshot.objects().values()))
+            keys, number, part = _keys(target, snapshot, list(identities)), target.count_restore(), folder / _PART
+            shutil.rmtree(part, ignore_errors=True)  # of a killed restoration
+            try:
+                _write(target, snapshot, part, keys, progress)
+                with MapStore.open(part) as store:
+                    words = f"snapshot {name}, of {snapshot.versions} versions"
+                    store.note_restored(words, number * _VERSIONS_AHEAD, actor)
+                    lists = _sign(store, number * _LISTS_AHEAD)
+                # The database last: until it is there, the folder is no store.
+                for path in sorted(part.iterdir(), key=lambda path: path.name.startswith("store.sqlite3")):
+                    path.replace(folder / path.name)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+            sync_path(folder)
+    return RestoreReport(name, snapshot.versions, tuple(sorted(keys)), lists, tuple(snapshot.missing))
+
+
+def _check_room(folder: Path, needed: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise StoreError(
+            f"the snapshot has up to {needed} bytes, the disk of {folder} {free}; name a folder with more room"
+        )
+
+
+def _sign(store: MapStore, ahead: int) -> Literal["none", "new", "ahead", "old"]:
+    if not SignedLists(store.folder).are_there:
+        return "none"
+    try:
+        return sign_ahead(store, ahead)
+    except FleetmapError as error:  # such as a key whose passphrase only the server's unit has
+        _log.warning("the lists are not signed: %s", error)
+        return "old"
 
 
 def verify(target: BackupTarget, progress: Progress = lambda done, total: None) -> BackupFindings:
-    """Read every object that a snapshot names."""
-    found, wanted = BackupFindings(), dict[str, str]()
+    """Read every object that a snapshot names; damaged ones are removed, so that the next backup brings them again."""
+    found, wanted = BackupFindings(), dict[str, tuple[str, int]]()
     for name in target.snapshots():
         found.snapshots += 1
         try:
-            wanted |= dict.fromkeys(target.read(name)[1].objects(), name)
+            snapshot = target.read(name)[1]
+            wanted |= {address: (name, size) for address, size in snapshot.objects().items()}
+            found.faults += [f"snapshot {name}: the store had lost {address} before" for address in snapshot.missing]
         except MapFormatError as error:
             found.faults.append(str(error))
-    for number, (address, name) in enumerate(sorted(wanted.items()), start=1):
+    for number, (address, (name, most_bytes)) in enumerate(sorted(wanted.items()), start=1):
         progress(number, len(wanted))
         try:
-            found.bytes += len(target.get(address))
+            found.bytes += sum(map(len, target.chunks(address, most_bytes)))
             found.objects += 1
+        except MapFormatError as error:
+            found.faults.append(
+                f"snapshot {name}: {error}; it is removed, and the next backup brings it if the store has it"
+            )
+            target.remove(address)
         except FleetmapError as error:
             found.faults.append(f"snapshot {name}: {error}")
     return found
@@ -124,9 +157,9 @@ def _write(target: BackupTarget, snapshot: Snapshot, part: Path, keys: dict[str,
         _write_file(part / path, (target.get(address) for address in pieces))
     for file, data in keys.items():
         _write_file(part / "keys" / file, [data])
-    for number, address in enumerate(snapshot.blobs, start=1):
+    for number, (address, size) in enumerate(snapshot.blobs.items(), start=1):
         progress(number, len(snapshot.blobs))
-        _write_file(part / blob_path(address), [target.get(address)])
+        _write_file(part / blob_path(address), target.chunks(address, size))
 
 
 def _write_file(path: Path, chunks: Iterable[bytes]) -> None:
@@ -146,14 +179,14 @@ def _keys(target: BackupTarget, snapshot: Snapshot, identities: "list[pyrage.x25
         raise UsageError(
             f"--identity is not the key for which this backup was made ({error}); name the right one"
         ) from error
-    with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+    with tarfile.open(fileobj=io.BytesIO(packed), mode="r:") as archive:
         return dict(_members(archive))
 
 
 def _members(archive: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
     for member in archive:
         file = archive.extractfile(member) if member.isreg() else None
-        if file is None or "/" in member.name or member.name.startswith(".") or member.size > _MOST_KEY_BYTES:
+        if file is None or "/" in member.name or member.name.startswith(".") or member.size > PIECE_BYTES:
             raise StoreError(
                 f"the backup's keys hold {member.name[:200]!r}, which is no key file; take another snapshot"
             )

@@ -8,6 +8,7 @@ An object is uploaded once, however many snapshots name it. URL: a folder, or s3
 credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL, ...).
 """
 
+import hashlib
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,36 +22,40 @@ from obstore.exceptions import BaseError
 from obstore.store import LocalStore, ObjectStore, from_url
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, UsageError
+from fleetmap.errors import FleetmapError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
-from fleetmap.mapformat import check_sha256, sha256_hex, verified
+from fleetmap.mapformat import check_sha256, sha256_hex
 
 FORMAT = 1
+PIECE_BYTES = 4 << 20
+"""Size of a database's pieces, whose unchanged pages stay where they are, and the limit of other files'."""
 _OBJECTS, _SNAPSHOTS, _RESTORES = "objects", "snapshots", "restores"
-_NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z")
+_NAME, _NAME_FORMAT = re.compile(r"[0-9]{8}T[0-9]{6}Z"), "%Y%m%dT%H%M%SZ"
 _PATH = re.compile(r"store\.sqlite3|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
 _LONGEST_BACKUP = timedelta(days=1)
 _MOST_BYTES = 1 << 30  # of a snapshot
+_MOST_RESTORES = 50_000  # signed lists count in ten digits
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """A store at one time. files: pieces by path, in order. keys: its folder of keys, encrypted; empty without a recipient.
+    """A store at one time. files: pieces by path, in order. blobs: their sizes by address.
 
-    missing: blobs that the store itself had lost or had damaged.
+    keys: its folder of keys, encrypted; empty without a recipient. missing: blobs that the store itself had lost or had damaged.
     """
 
     format: int = FORMAT
     store_format: int
     versions: int
     files: dict[str, list[str]]
-    blobs: list[str]
+    blobs: dict[str, int]
     keys: str = ""
     missing: list[str] = []
 
-    def objects(self) -> set[str]:
-        """Addresses of all objects that it names."""
+    def objects(self) -> dict[str, int]:
+        """Addresses of all objects that it names, with their largest sizes."""
         keys = [self.keys] if self.keys else []
-        return {*self.blobs, *keys, *(piece for pieces in self.files.values() for piece in pieces)}
+        pieces = dict.fromkeys([*keys, *(piece for pieces in self.files.values() for piece in pieces)], PIECE_BYTES)
+        return {**pieces, **self.blobs}
 
 
 class BackupTarget:
@@ -72,14 +77,33 @@ class BackupTarget:
         with self._errors():
             return {name: size for name, size, _ in self._listed(_OBJECTS)}
 
-    def put(self, data: bytes) -> None:
-        """Upload bytes to their address."""
-        self._put(_path(sha256_hex(data)), data)
+    def put(self, content: bytes | Path, address: str | None = None) -> None:
+        """Upload bytes, or a file in pieces, to their address."""
+        name = sha256_hex(content) if isinstance(content, bytes) else address
+        assert name is not None
+        self._put(_path(name), content)
 
-    def get(self, address: str) -> bytes:
-        """Return the bytes of an address, verified; StoreError if missing, MapFormatError if damaged."""
+    def chunks(self, address: str, most_bytes: int) -> Iterator[bytes]:
+        """Yield the bytes of an address in pieces; StoreError if missing, MapFormatError, at the end at the latest, if damaged."""
         with self._errors():
-            return verified(bytes(obstore.get(self._store, _path(address)).bytes()), address)
+            found, digest = obstore.get(self._store, _path(address)), hashlib.sha256()
+            if found.meta["size"] > most_bytes:
+                raise MapFormatError(f"object {address} has {found.meta['size']} bytes instead of at most {most_bytes}")
+            for chunk in found.stream():
+                data = bytes(chunk)
+                digest.update(data)
+                yield data
+            if digest.hexdigest() != address:
+                raise MapFormatError(f"object {address} is damaged: its SHA-256 is {digest.hexdigest()}")
+
+    def get(self, address: str, most_bytes: int = PIECE_BYTES) -> bytes:
+        """Return the bytes of an address at once; errors as of `chunks`."""
+        return b"".join(self.chunks(address, most_bytes))
+
+    def remove(self, address: str) -> None:
+        """Remove an object, which is damaged."""
+        with self._errors():
+            obstore.delete(self._store, _path(address))
 
     def snapshots(self) -> list[str]:
         """Return the names of all snapshots, oldest first."""
@@ -103,29 +127,38 @@ class BackupTarget:
         return name, _decoded(name, data)
 
     def write(self, snapshot: Snapshot, now: datetime) -> str:
-        """Write a snapshot, whose objects are there, and return its name."""
-        name = f"{now.astimezone(UTC):%Y%m%dT%H%M%SZ}"
+        """Write a snapshot, whose objects are there, and return its name: the time, but later than all others, whatever the clock says."""
+        moments = [datetime.strptime(name, _NAME_FORMAT).replace(tzinfo=UTC) for name in self.snapshots()[-1:]]
+        name = max([now.astimezone(UTC), *(moment + timedelta(seconds=1) for moment in moments)]).strftime(_NAME_FORMAT)
         self._put(f"{_SNAPSHOTS}/{name}.json", to_json(snapshot))
         return name
 
-    def prune(self, keep: int, now: datetime) -> tuple[list[str], int]:
-        """Remove all but the newest `keep` snapshots, then objects that none names; return names, and the number of objects.
+    def prune(self, keep: int, now: datetime) -> list[str]:
+        """Remove all but the newest `keep` snapshots, then objects that none names; return the names of the snapshots.
 
-        Objects of the last day stay: they may belong to a backup under way.
+        Objects of the last day stay: they may belong to a backup under way. All of them stay beside a snapshot that cannot be read.
         """
         names = self.snapshots()
-        gone, kept = names[:-keep], set[str]().union(*(self.read(name)[1].objects() for name in names[-keep:]))
         with self._errors():
-            obstore.delete(self._store, [f"{_SNAPSHOTS}/{name}.json" for name in gone])
+            obstore.delete(self._store, [f"{_SNAPSHOTS}/{name}.json" for name in names[:-keep]])
+        try:
+            kept = set[str]().union(*(self.read(name)[1].objects() for name in names[-keep:]))
+        except FleetmapError:
+            return names[:-keep]
+        with self._errors():
             old = [name for name, _, changed in self._listed(_OBJECTS) if changed < now - _LONGEST_BACKUP]
-            loose = [name for name in old if name not in kept]
-            obstore.delete(self._store, [_path(name) for name in loose])
-        return gone, len(loose)
+            obstore.delete(self._store, [_path(name) for name in old if name not in kept])
+        return names[:-keep]
 
     def count_restore(self) -> int:
-        """Return the number of this restoration, from 1 on; no other one gets it."""
+        """Return the number of this restoration, from 1 on; no other one gets it. StoreError if the target cannot be written."""
         with self._errors():
-            number = 1 + max((int(name) for name, _, _ in self._listed(_RESTORES) if name.isdecimal()), default=0)
+            counted = [int(name) for name, _, _ in self._listed(_RESTORES) if re.fullmatch(r"[0-9]{1,6}", name)]
+        number = 1 + max(counted, default=0)
+        if number > _MOST_RESTORES:
+            raise StoreError(
+                f"{self.where} counts {number - 1} restorations, which cannot be; look at {_RESTORES} there"
+            )
         self._put(f"{_RESTORES}/{number:06}", b"", mode="create")
         return number
 
@@ -134,10 +167,10 @@ class BackupTarget:
             for meta in batch:
                 yield meta["path"].rpartition("/")[2].removesuffix(".json"), meta["size"], meta["last_modified"]
 
-    def _put(self, path: str, data: bytes, *, mode: Literal["create", "overwrite"] = "overwrite") -> None:
+    def _put(self, path: str, content: bytes | Path, *, mode: Literal["create", "overwrite"] = "overwrite") -> None:
         """Write an object durably: an object store answers once it is, files and their folders are synced."""
         with self._errors():
-            obstore.put(self._store, path, data, mode=mode)
+            obstore.put(self._store, path, content, mode=mode)
             if self._folder is not None:
                 file = self._folder / path
                 for synced in (file, file.parent, file.parent.parent):
@@ -161,7 +194,7 @@ def _decoded(name: str, data: bytes) -> Snapshot:
         found = msgspec.json.decode(data, type=Snapshot)
         for address in found.objects():
             check_sha256(address)
-    except (msgspec.MsgspecError, MapFormatError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
         raise MapFormatError(f"snapshot {name} is damaged ({error}); take an earlier one with --snapshot") from error
     if found.format > FORMAT:
         raise NewerFormatError(f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it")

@@ -77,10 +77,15 @@ def restore(
         print_json(done)
         return
     typer.echo(f"{store} holds snapshot {done.snapshot}: {done.versions} versions, {len(done.keys)} key files")
-    if not done.is_signed:
+    if done.lists == "ahead":
         typer.echo(
-            "the signed lists are those of the backup, and robots may know later ones: restore with --identity, or put the keys into "
-            f"{store / 'keys'} and run `mapserver trust rotate online --store {store}`"
+            "the root key is elsewhere: if sites or keys were added after the backup, robots refuse the lists until "
+            f"`mapserver trust rotate online --key ROOT --store {store}` has run twice"
+        )
+    elif done.lists == "old":
+        typer.echo(
+            "the signed lists are those of the backup, and robots that know later ones refuse them: restore with --identity, or put the "
+            f"keys into {store / 'keys'} and run `mapserver trust rotate online --key ROOT --store {store}` twice"
         )
     for address in done.missing:
         typer.echo(f"blob {address} was lost or damaged already when the backup was made")

@@ -20,6 +20,7 @@ from mapserver.store.access.chain import AuditLine
 from mapserver.store.access.operators import OperatorQueries
 from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
+from mapserver.store.files import check_no_link
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.rows import (
     NOBODY,
@@ -99,6 +100,16 @@ class StoreQueries:
     def named_blobs(self) -> set[str]:
         """Return the addresses of all blobs that the database names."""
         return mentioned(self._transactions)
+
+    def blob_file(self, sha256: str) -> Path | None:
+        """Return the file of a blob, None if it is missing; StoreError behind a symbolic link."""
+        path = self._blobs.path(sha256)
+        check_no_link(self._root, path)
+        return path if path.is_file() else None
+
+    def is_whole(self, sha256: str) -> bool:
+        """True if a blob exists and matches its address; reads it in pieces."""
+        return self._blobs.is_whole(sha256)
 
     def copy_database(self, path: Path) -> DatabaseCopy:
         """Copy the database into a new file, as of one moment, and return what the copy names. Raises StoreError on a disk error."""

@@ -86,9 +86,13 @@ class ListRepository:
     def replace_root(self, root_key: Signer, new: Signer) -> None:
         """Write the next root and targets, signed by `new` in place of `root_key`, or extended with the same key."""
         self._change_root(("root", "targets"), new.public_key, [root_key, new])
+        self.renew_targets(new)
+
+    def renew_targets(self, root_key: Signer) -> None:
+        """Write the next targets with the same content."""
         targets = self.targets()
-        targets.version += 1
-        self._sign("targets", targets, new, judges=(self.root(),))
+        targets.version += 1 + self.ahead
+        self._sign("targets", targets, root_key, judges=(self.root(),))
 
     def _change_root(self, roles: Sequence[str], key: Key, signers: Sequence[Signer]) -> None:
         """Write the next root, in which only `key` signs these roles; StateError unless the last root's key and its own signed it."""

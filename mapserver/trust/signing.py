@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
@@ -67,21 +67,29 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
         raise faults[0]
 
 
-def sign_ahead(store: MapStore, ahead: int) -> bool:
+def sign_ahead(store: MapStore, ahead: int) -> Literal["new", "ahead", "old"]:
     """Sign the lists of a restored store under numbers this far ahead, beyond those that robots may know from the lost one.
 
-    False if a key is elsewhere: then the lists stay as they are. Errors as of `update_lists`.
+    With the root key at hand there are new online keys as well, after which robots forget what they knew of sites and keys: "new". There
+    are two, as the lost store may have made one after the backup, whose root has the number of the first. "ahead" without the root key;
+    "old": nothing is signed, as another key is elsewhere. Errors as of `update_lists`.
     """
     with _held(store) as repository:
-        if any(repository.keys.signer(name) is None for name in ("online", *repository.lists.site_roles())):
-            return False
+        keys, root_key = repository.keys, repository.keys.signer("root")
+        if any(keys.signer(name) is None for name in ("online", *repository.lists.site_roles())):
+            return "old"
         repository.ahead = ahead
+        if root_key is not None:
+            repository.check_root_key(root_key)
+            repository.replace_online(root_key)
+            repository.replace_online(root_key)
+            repository.renew_targets(root_key)
         for info in store.sites():
             if site_role(info.site) in repository.lists.site_roles():
                 _update_site(repository, store.releases(info.site))
-        repository.sign_online(cast("Signer", repository.keys.signer("online")))
+        repository.sign_online(cast("Signer", keys.signer("online")))
     store.audit("lists signed", f"{ahead} numbers ahead, after a restoration")
-    return True
+    return "ahead" if root_key is None else "new"
 
 
 def try_update_lists(store: MapStore) -> None:

@@ -32,6 +32,7 @@ RETIRED = {  # keys of files (behind their section where that decides), and opti
     "frozen": _IN_A_VERSION,
     "map": _IN_A_VERSION,
     "output.map": '`map_topic = ""` leaves /map to nav2\'s map_server, which shows files; delete the key',
+    "alias_step_m": "a build measures it, and maps carry it; delete the key",
     "driver_odom_topic": "the driver's odom -> base is taken from /tf, as everybody else takes it; delete the key",
     "output.is_map_server": "nav2's map_server loads files; delete the key",
     **{f"trajectory_{item}": _OF_POSES for item in ("format", "direction", "quaternion", "stamps")},

@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import tarfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,12 +18,15 @@ import pytest
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError
 from fleetmap.mapformat import blob_path, sha256_hex
+from fleetmap.messages import WantedVersion
+from fleetmap.trust import TrustedMap
 from mapserver import releases
 from mapserver.backup.backup import back_up, recipient_of
 from mapserver.backup.restore import identities_of, restore, verify
 from mapserver.backup.snapshots import BackupTarget
 from mapserver.store import Actor, MapStore, Retention
-from mapserver.trust import SignedLists, init_here
+from mapserver.trust import KeyFolder, SignedLists, init_here
+from mapserver.trust.signing import rotate_online
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
 
@@ -149,6 +153,7 @@ def test_a_blob_that_the_store_lost_is_named_and_the_rest_is_kept(store: MapStor
     target = BackupTarget(str(tmp_path / "backups"), create=True)
     report = back_up(store, target)
     assert set(report.missing) == {lost, damaged}
+    assert len(verify(target).faults) == 2
     assert restore(target, tmp_path / "new", ADA).missing == report.missing
 
 
@@ -168,11 +173,13 @@ def test_a_damaged_backup_restores_nothing(store: MapStore, where: str, tmp_path
     back_up(store, target)
     address = store.manifest("lab", 2).tiles[0].sha256
     obstore.put(target._store, f"objects/{address[:2]}/{address}", b"other")
-    assert [address in fault for fault in verify(target).faults] == [True]
     with pytest.raises(MapFormatError, match=address):
         restore(target, tmp_path / "new", ADA)
-    assert not (tmp_path / "new").exists()
-    assert not list(tmp_path.glob("*.part"))
+    assert [address in fault for fault in verify(target).faults] == [True]
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["lock"]
+    back_up(store, target)
+    assert verify(target).faults == [], "what was found damaged is uploaded again"
+    restore(target, tmp_path / "new", ADA)
 
 
 def test_keys_come_back_with_the_right_identity_alone(store: MapStore, tmp_path: Path) -> None:
@@ -188,10 +195,10 @@ def test_keys_come_back_with_the_right_identity_alone(store: MapStore, tmp_path:
     with pytest.raises(UsageError, match="not the key"):
         restore(target, tmp_path / "new", ADA, identities=identities_of(tmp_path / "other"))
     without = restore(target, tmp_path / "without", ADA)
-    assert (without.keys, without.is_signed) == ((), False)
+    assert (without.keys, without.lists) == ((), "old")
     restored = restore(target, tmp_path / "new", ADA, identities=identities_of(tmp_path / "key"))
-    assert restored.is_signed
-    assert (tmp_path / "new" / "keys" / "online.pem").read_bytes() == secret
+    assert restored.lists == "new"
+    assert secret in [path.read_bytes() for path in (tmp_path / "new" / "keys").glob("online.*.old")]
     assert (tmp_path / "new" / "keys" / "online.pem").stat().st_mode & 0o777 == 0o600
     lists, before = SignedLists(tmp_path / "new"), SignedLists(store.folder)
     assert lists.newest("site-lab") > before.newest("site-lab") + 1000
@@ -208,7 +215,9 @@ def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path) -
     target.put(stolen := pyrage.encrypt(packed.getvalue(), [identity.to_public()]))
     hostile = [
         msgspec.structs.replace(found, files={**found.files, "../outside": found.files["store.sqlite3"]}),
-        msgspec.structs.replace(found, blobs=["../outside"]),
+        msgspec.structs.replace(found, blobs={"../outside": 1}),
+        msgspec.structs.replace(found, blobs={"0" * 64: 1 << 60}),
+        msgspec.structs.replace(found, blobs=dict.fromkeys(found.blobs, 1)),
         msgspec.structs.replace(found, keys=sha256_hex(stolen)),
         msgspec.structs.replace(found, format=2),
     ]
@@ -216,7 +225,125 @@ def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path) -
         (tmp_path / "backups" / "snapshots" / f"{name}.json").write_bytes(bad)
         with pytest.raises(FleetmapError):
             restore(target, tmp_path / "new", ADA, identities=[identity])
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["backups", "store"]
+        assert {path.name for path in (tmp_path / "new").iterdir()} <= {"lock"}
+        assert {path.name for path in tmp_path.iterdir()} <= {"backups", "store", "new"}
+
+
+def test_a_clock_that_was_ahead_hides_no_later_snapshot(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    clock.now_ns += 400 * DAY_NS
+    back_up(store, target, keep=1)
+    clock.now_ns -= 400 * DAY_NS
+    save_sample_draft(store, seed=7)
+    report = back_up(store, target, keep=1)
+    assert target.snapshots() == [report.snapshot]
+    assert restore(target, tmp_path / "new", ADA).versions == 3
+
+
+def test_a_target_that_fails_is_not_a_store_that_lost_something(
+    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target, keep=1)
+    before = target.snapshots()
+    save_sample_draft(store, seed=7)
+    real, calls = obstore.put, []
+
+    def put(*args: object, **more: object) -> object:
+        calls.append(args)
+        if isinstance(args[2], Path):
+            raise OSError(28, "No space left on device")
+        return real(*args, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(obstore, "put", put)
+    with pytest.raises(StoreError, match="No space"):
+        back_up(store, target, keep=1)
+    assert target.snapshots() == before
+
+
+def test_a_truncated_object_is_uploaded_again(store: MapStore, tmp_path: Path) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target)
+    address = store.manifest("lab", 2).tiles[0].sha256
+    (tmp_path / "backups" / "objects" / address[:2] / address).write_bytes(b"")
+    back_up(store, target)
+    assert verify(target).faults == []
+
+
+def test_a_folder_with_something_in_it_stays_as_it_is(
+    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target)
+    disk = tmp_path / "disk"  # a new file system
+    (disk / "lost+found").mkdir(parents=True)
+    monkeypatch.chdir(disk)
+    restore(target, Path(), ADA)
+    with MapStore.open(disk) as restored:
+        assert restored.verify().faults == []
+    with pytest.raises(UsageError, match="holds"):
+        restore(target, disk, ADA)
+
+
+def test_what_counts_restorations_is_bounded(store: MapStore, tmp_path: Path) -> None:
+    target = BackupTarget(str(tmp_path / "backups"), create=True)
+    back_up(store, target)
+    restores = tmp_path / "backups" / "restores"
+    restores.mkdir()
+    (restores / str(10**18)).touch()
+    restore(target, tmp_path / "new", ADA)
+    (restores / "60000").touch()
+    with pytest.raises(StoreError, match="60000 restorations"):
+        restore(target, tmp_path / "newer", ADA)
+    assert {path.name for path in (tmp_path / "newer").iterdir()} == {"lock"}
+
+
+def test_keys_that_only_the_unit_can_read_come_back(
+    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "credentials").mkdir()
+    for name in ("online", "root", "site-lab"):
+        (tmp_path / "credentials" / f"fleetmap-{name}").write_text("a passphrase of the unit")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path / "credentials"))
+    init_here(store)
+    target, identity = BackupTarget(str(tmp_path / "backups"), create=True), pyrage.x25519.Identity.generate()
+    back_up(store, target, recipient=identity.to_public())
+    monkeypatch.delenv("CREDENTIALS_DIRECTORY")
+    report = restore(target, tmp_path / "new", ADA, identities=[identity])
+    assert report.lists == "old"
+    assert "online.pem" in report.keys
+
+
+@pytest.mark.parametrize("change", ["a site", "the online key", "both"])
+def test_robots_accept_lists_older_than_a_site_or_a_key_that_they_know(
+    store: MapStore, tmp_path: Path, clock: Clock, change: str
+) -> None:
+    clock.now_ns = time.time_ns()
+    init_here(store)
+    root = (store.folder / "trust" / "1.root.json").read_bytes()
+    target, identity = BackupTarget(str(tmp_path / "backups"), create=True), pyrage.x25519.Identity.generate()
+    back_up(store, target, recipient=identity.to_public())
+    if change != "the online key":
+        save_sample_draft(store, seed=3, site="other")
+        releases.publish(store, "other")
+    if change != "a site":
+        rotate_online(store, KeyFolder(store.folder / "keys").signer("root"))
+    trusted = TrustedMap(
+        tmp_path / "robot", "lab", root, lambda name: SignedLists(store.folder).file("lab", name) or None
+    )
+    trusted.refresh()
+    trusted.admitted(wanted(store))
+    restore(target, tmp_path / "new", ADA, identities=[identity])
+    with MapStore.open(tmp_path / "new") as restored:
+        lists = SignedLists(restored.folder)
+        again = TrustedMap(tmp_path / "robot", "lab", root, lambda name: lists.file("lab", name) or None)
+        again.refresh()
+        again.admitted(wanted(restored))
+
+
+def wanted(store: MapStore) -> WantedVersion:
+    current = store.current("lab")
+    return WantedVersion(site="lab", version=current.version, manifest_sha256=current.manifest_sha256)
 
 
 def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,7 +355,7 @@ def test_wrong_words_get_a_next_step(store: MapStore, tmp_path: Path, monkeypatc
     with pytest.raises(UsageError, match="public key of age"):
         recipient_of("age1wrong")
     back_up(store, target)
-    with pytest.raises(UsageError, match="not empty"):
+    with pytest.raises(UsageError, match="holds"):
         restore(target, store.folder, ADA)
     with pytest.raises(UsageError, match="without --recipient"):
         restore(target, tmp_path / "new", ADA, identities=[pyrage.x25519.Identity.generate()])
