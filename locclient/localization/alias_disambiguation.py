@@ -60,6 +60,11 @@ _MODEL = CellModel(
 )
 
 
+def is_other_viewpoint(since: Array) -> bool:
+    """Return True if a motion (4, 4) leads to another viewpoint."""
+    return bool(np.linalg.norm(since[:3, 3]) >= _STEP_M or rotation_angle_rad(since[:3, :3]) >= _STEP_RAD)
+
+
 @dataclass(slots=True)
 class ViewpointGate:
     """Admits a view only from another viewpoint than the last admitted one."""
@@ -68,10 +73,9 @@ class ViewpointGate:
 
     def is_new(self, odom_from_body: Array) -> bool:
         """Return True if this view is admitted, and store it as the last one."""
-        if self.odom_from_body is not None:
-            since = se3_inverse(self.odom_from_body) @ odom_from_body
-            if np.linalg.norm(since[:3, 3]) < _STEP_M and rotation_angle_rad(since[:3, :3]) < _STEP_RAD:
-                return False
+        last = self.odom_from_body
+        if last is not None and not is_other_viewpoint(se3_inverse(last) @ odom_from_body):
+            return False
         self.odom_from_body = odom_from_body
         return True
 

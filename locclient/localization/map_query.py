@@ -1,12 +1,13 @@
 """Map queries: their start, and their work spread over frames. Pure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
@@ -43,10 +44,11 @@ class MapQuery:
         IDLE      --due by the interval, or at once after lost tracks-->   EXTRACT   features of that frame
         EXTRACT   --a pose is confirmed-->                                 NEAR      landmarks expected around it
         EXTRACT   --no pose is confirmed-->                                SEARCH    near candidates, then in the whole map or the prior
-        NEAR      --no fix, repeatedly-->                                  SEARCH
+        NEAR      --no fix, as in earlier frames-->                        POOLED    landmarks of all those frames, around it
+        NEAR, POOLED --no fix, repeatedly-->                               SEARCH
         any       --slices used up-->                                      continue with the next frame
         any       --version changes, forget, tracks are lost-->            IDLE, without a result
-        NEAR, SEARCH --done-->                                             IDLE, with fixes for the tracker
+        NEAR, POOLED, SEARCH --done-->                                     IDLE, with fixes for the tracker
 
     failed: number of failed queries in a row.
     """
@@ -168,9 +170,17 @@ class MapQuery:
         features = yield from _extract(query, frame, relocalizer)
         confirmed = tracker.confirmed
         if confirmed is None:
+            tracker.forget_frames()
             fixes, outside = yield from self._search(features, relocalizer)
             return (yield from tracker.update_candidates(fixes, outside=outside))
         near = self._near(features, relocalizer, confirmed)
+        if near is None and (earlier := tracker.earlier_frames()):
+            yield
+            near = self._near(features, relocalizer, confirmed, earlier)
+        if near is None:
+            tracker.keep_frame(features)
+        else:
+            tracker.forget_frames()
         fixes = [] if near is None else [near]
         if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
             yield
@@ -178,12 +188,18 @@ class MapQuery:
             fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
-    def _near(self, features: FrameFeatures, relocalizer: Relocalizer, hypothesis: PoseHypothesis) -> Fix | None:
-        """Return the fix near a hypothesis at the frame of the query."""
+    def _near(
+        self,
+        features: FrameFeatures,
+        relocalizer: Relocalizer,
+        hypothesis: PoseHypothesis,
+        earlier: Sequence[EarlierFrame] = (),
+    ) -> Fix | None:
+        """Return the fix near a hypothesis at the frame of the query, by that frame and earlier ones."""
         map_from_body = hypothesis.query_map_from_body
         map_from_cam = map_from_body @ self._tracker.body_from_cam
         cov_cam = transport_cov(hypothesis.query_cov, map_from_cam[:3, 3] - map_from_body[:3, 3])
-        return relocalizer.near(features, map_from_cam, cov_cam)
+        return relocalizer.near(features, map_from_cam, cov_cam, earlier)
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
         return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]

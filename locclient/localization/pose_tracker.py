@@ -8,10 +8,12 @@ import numpy as np
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import OdometryEstimate
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
-from fleetmap.relocalization.relocalizer import Fix, is_reliable
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.time_sliced import TimeSliced
+from locclient.localization.alias_disambiguation import is_other_viewpoint
 from locclient.localization.estimate import QueryResult
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
@@ -20,6 +22,7 @@ from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
+_EARLIER = 3  # frames that a query may pool with its own: of a metre of a drive
 NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
 OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given initial pose")
 
@@ -80,6 +83,8 @@ class PoseTracker:
         self.odom_from_body: Array | None = None  # of the last frame
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
+        # Frames of queries since the last fix, each as the identity.
+        self._unmatched: list[tuple[PoseHypothesis, FrameFeatures]] = []
 
     # --- priors and starts --------------------------------------------------------------------------------------------
 
@@ -97,6 +102,7 @@ class PoseTracker:
         if not (keeps_new_prior and self.prior is not None and self.prior.is_new):
             self.prior = None
         self.confirmed = self._query_frame = None
+        self.forget_frames()
         self.candidates.reset()
         self.was_tracking &= is_carried
         self.is_carried = self.was_tracking
@@ -173,6 +179,7 @@ class PoseTracker:
         found = [*self.candidates.tracked(), *([] if self.prior is None else self.prior.tracked())]
         if self.confirmed is not None:
             found.append(self.confirmed)
+        found.extend(frame for frame, _ in self._unmatched)
         return found if self._query_frame is None else [*found, self._query_frame]
 
     # --- fixes of a map query -----------------------------------------------------------------------------------------
@@ -200,6 +207,27 @@ class PoseTracker:
 
     def end_query(self) -> None:
         self._query_frame = None
+
+    def keep_frame(self, features: FrameFeatures) -> None:
+        """Keep the frame of the running query, which found no fix near the confirmed pose, for later ones; not the same view again, whose
+        wrong matches would be the same."""
+        assert self._query_frame is not None
+        if len(self.earlier_frames()) == len(self._unmatched):
+            self._unmatched = [*self._unmatched, (self._query_frame, features)][-_EARLIER:]
+
+    def forget_frames(self) -> None:
+        """Drop all kept frames: each counts for one fix."""
+        self._unmatched.clear()
+
+    def earlier_frames(self) -> list[EarlierFrame]:
+        """Return the kept frames from other viewpoints than that of the running query."""
+        found = []
+        for frame, features in self._unmatched:
+            earlier_from_query = frame.query_map_from_body
+            if is_other_viewpoint(earlier_from_query):
+                cam_from_query = self._cam_from_body @ earlier_from_query @ self.body_from_cam
+                found.append(EarlierFrame(features, cam_from_query, frame.query_cov))
+        return found
 
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""

@@ -27,7 +27,9 @@ struct Normal {
 void linearize(const Sightings& seen, const StereoLens& lens, double width, const SE3& cam_from_source, Normal& normal, double* squared) {
   normal = {};
   for (size_t n = 0; n < seen.count; ++n) {
-    const Vec3 point = cam_from_source * vec3(seen.points + 3 * n);
+    const Vec3 from_first = cam_from_source * vec3(seen.points + 3 * n);
+    const SE3* const camera = seen.cameras_from_first == nullptr ? nullptr : seen.cameras_from_first + seen.cameras[n];
+    const Vec3 point = camera == nullptr ? from_first : *camera * from_first;
     const double x = point[0], y = point[1], z = point[2];
     squared[n] = kUnseen;
     if (z < kNearest) {
@@ -44,7 +46,10 @@ void linearize(const Sightings& seen, const StereoLens& lens, double width, cons
                               {0.0, lens.focal * inverse * w, -lens.focal * y * inverse * inverse * w},
                               {0.0, 0.0, -lens.focal_baseline * inverse * inverse * w_disparity}};
     double jacobian[3][6];
-    for (int k = 0; k < 3; ++k) store(cross(point, by_point[k]), jacobian[k]), store(by_point[k], jacobian[k] + 3);
+    for (int k = 0; k < 3; ++k) {
+      const Vec3 by_first = camera == nullptr ? by_point[k] : transposed(camera->rotation) * by_point[k];
+      store(cross(from_first, by_first), jacobian[k]), store(by_first, jacobian[k] + 3);
+    }
     const double e2 = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
     squared[n] = e2;
     const double damped = width * width / (width * width + e2), robust = damped * damped;

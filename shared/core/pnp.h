@@ -1,7 +1,8 @@
-// The pose of one camera from points with known positions (PnP).
+// The pose of one camera from points with known positions (PnP), or of several that are held together: a generalised camera.
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <optional>
 #include <vector>
 
@@ -16,19 +17,29 @@ struct Sightings {
   const double* pixels;   // (count, 3) u left, v, u right (NaN none)
   const double* weights;  // (count, 2) 1 / sigma of u and v, of the disparity; 1 / pixels
   size_t count;
+  // Where several cameras see them: the number of each sighting's camera, and those cameras from the first one, whose pose is sought.
+  // Source: Pless 2003 (generalised cameras).
+  const uint8_t* cameras = nullptr;  // (count,)
+  const SE3* cameras_from_first = nullptr;
 };
 
 // Sightings that are chosen one by one.
 struct ChosenSightings {
   std::vector<double> points, pixels, weights;
+  std::vector<uint8_t> cameras;
+  const SE3* cameras_from_first = nullptr;
 
   void add(const Sightings& from, size_t n) {
     points.insert(points.end(), from.points + 3 * n, from.points + 3 * n + 3);
     pixels.insert(pixels.end(), from.pixels + 3 * n, from.pixels + 3 * n + 3);
     weights.insert(weights.end(), from.weights + 2 * n, from.weights + 2 * n + 2);
+    cameras.push_back(from.cameras == nullptr ? 0 : from.cameras[n]);
+    cameras_from_first = from.cameras_from_first;
   }
-  void clear() { points.clear(), pixels.clear(), weights.clear(); }
-  Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size() / 3}; }
+  void clear() { points.clear(), pixels.clear(), weights.clear(), cameras.clear(); }
+  Sightings all() const {
+    return {points.data(), pixels.data(), weights.data(), points.size() / 3, cameras.data(), cameras_from_first};
+  }
 };
 
 // The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared

@@ -23,22 +23,23 @@ constexpr double kNearlyPx = 50.0;                            // beside the imag
 constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // limits of the survey's cameras that define covisible landmarks
 constexpr double kColumns = 8.0, kRows = 6.0;                 // the parts of an image
 
-// Landmarks of the map that features of a frame show.
+// Landmarks of the map that features of some frames show, frame by frame.
 struct Matched {
   std::vector<int64_t> features, rows;
   std::vector<double> points, pixels, sigmas;
+  std::vector<double> disparities;  // expected
+  std::vector<uint8_t> frames;
 };
 
-// Measures the depth of some features that were not tried before, near the disparities (P,) that are expected.
-void measure(const QueryFrame::Unmeasured& unmeasured, const std::vector<int64_t>& features, const std::vector<double>& expected,
-             const FixLimits& limits) {
+// Measures the depth of a frame's matched features that were not tried before, near the disparities that are expected.
+void measure(const QueryFrame::Unmeasured& unmeasured, const Matched& matched, size_t frame, const FixLimits& limits) {
   std::vector<double> left, prior, found;
   std::vector<int64_t> now;
-  for (size_t n = 0; n < features.size(); ++n) {
-    const int64_t at = features[n];
-    if (unmeasured.is_tried[at]) continue;
+  for (size_t n = 0; n < matched.features.size(); ++n) {
+    const int64_t at = matched.features[n];
+    if (matched.frames[n] != frame || unmeasured.is_tried[at]) continue;
     unmeasured.is_tried[at] = true;
-    now.push_back(at), prior.push_back(expected[n]);
+    now.push_back(at), prior.push_back(matched.disparities[n]);
     left.insert(left.end(), unmeasured.pixels + 3 * at, unmeasured.pixels + 3 * at + 2);
   }
   found.resize(2 * now.size());
@@ -49,10 +50,10 @@ void measure(const QueryFrame::Unmeasured& unmeasured, const std::vector<int64_t
   }
 }
 
-// Sigmas of a pixel and of its disparity, by its octave and by the landmark's own uncertainty. That lies along the direction from which
-// the landmark was mapped: seen from there it hardly shows, from aside it does.
+// Sigmas of a pixel and of its disparity, by its octave, by the motion between frames and by the landmark's own uncertainty. That lies along
+// the direction from which the landmark was mapped: seen from there it hardly shows, from aside it does.
 void add_sigmas(const MapLandmarks& map, size_t row, int8_t octave, const StereoLens& lens, const FixLimits& limits, Vec3 place,
-                double doubt, std::vector<double>& sigmas) {
+                const QueryFrame& frame, double doubt, std::vector<double>& sigmas) {
   const double base = limits.feature_sigma_px * std::pow(limits.octave_scale, std::min(double(octave), kCoarsestOctave));
   const Vec3 ray = vec3(map.cones.points_map + 3 * row) - place;
   const float* direction = map.cones.directions_map + 3 * row;
@@ -61,17 +62,18 @@ void add_sigmas(const MapLandmarks& map, size_t row, int8_t octave, const Stereo
   const double off_px = lens.focal * map.sigmas_m[row] / distance;
   const double across_px = std::min(off_px * std::sqrt(std::max(1.0 - along * along, 0.0)), kMostAcrossPx);
   const double depth_px = off_px * along * (lens.focal_baseline / lens.focal) / distance;
-  sigmas.push_back(doubt * std::hypot(base, across_px));
-  sigmas.push_back(doubt * std::hypot(limits.disparity_sigma_px, depth_px));
+  const double moved_px = lens.focal * std::hypot(frame.sigma_rad, frame.sigma_m / distance);
+  const double nearer_px = lens.focal_baseline * frame.sigma_m / (distance * distance);
+  sigmas.push_back(doubt * std::hypot(std::hypot(base, across_px), moved_px));
+  sigmas.push_back(doubt * std::hypot(std::hypot(limits.disparity_sigma_px, depth_px), nearer_px));
 }
 
-// The features that match landmarks expected from a pose; none if they are too few for a pose.
-std::optional<Matched> match_visible(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera, const FixLimits& limits,
-                                     const SE3& map_from_cam, double radius_px, double doubt) {
+// Adds the features of a frame that match landmarks expected from a pose of its camera.
+void match_visible(const MapLandmarks& map, const QueryFrame& frame, size_t number, const StereoImage& camera, const FixLimits& limits,
+                   const SE3& map_from_cam, double radius_px, double doubt, Matched& matched) {
   const VisibleLandmarks visible = visible_landmarks(map.cones, map_from_cam, camera, float(limits.distance_scale), radius_px,
                                                      limits.max_view_angle_rad, limits.octave_scale);
   const size_t count = visible.rows.size();
-  if (count < limits.min_inliers) return {};
   std::vector<double> pixels, windows;
   std::vector<int64_t> octaves, index(count);
   std::vector<uint64_t> words;
@@ -86,20 +88,39 @@ std::optional<Matched> match_visible(const MapLandmarks& map, const QueryFrame& 
   }
   match_projected({pixels.data(), windows.data(), octaves.data(), {words.data(), count}}, frame.features, limits.guided_distance,
                   limits.guided_ratio, index.data(), distances.data());
-  Matched matched;
-  std::vector<double> expected;
   for (size_t n = 0; n < count; ++n) {
     if (index[n] < 0) continue;
     const size_t row = size_t(visible.rows[n]);
     const double* point = map.cones.points_map + 3 * row;
-    matched.features.push_back(index[n]), matched.rows.push_back(visible.rows[n]);
+    matched.features.push_back(index[n]), matched.rows.push_back(visible.rows[n]), matched.frames.push_back(uint8_t(number));
     matched.points.insert(matched.points.end(), point, point + 3);
-    expected.push_back(visible.pixels[3 * n] - visible.pixels[3 * n + 2]);
-    add_sigmas(map, row, frame.features.octaves[index[n]], camera.lens, limits, map_from_cam.translation, doubt, matched.sigmas);
+    matched.disparities.push_back(visible.pixels[3 * n] - visible.pixels[3 * n + 2]);
+    add_sigmas(map, row, frame.features.octaves[index[n]], camera.lens, limits, map_from_cam.translation, frame, doubt, matched.sigmas);
   }
-  if (matched.rows.size() < limits.min_inliers) return {};
-  if (frame.unmeasured) measure(*frame.unmeasured, matched.features, expected, limits);
-  for (const int64_t at : matched.features) matched.pixels.insert(matched.pixels.end(), frame.pixels + 3 * at, frame.pixels + 3 * at + 3);
+}
+
+// The number of landmarks among the matches that are flagged (no pointer: all).
+size_t landmarks_of(const Matched& matched, const std::vector<uint8_t>* flags) {
+  std::vector<int64_t> rows;
+  for (size_t n = 0; n < matched.rows.size(); ++n)
+    if (flags == nullptr || (*flags)[n]) rows.push_back(matched.rows[n]);
+  std::sort(rows.begin(), rows.end());
+  return size_t(std::unique(rows.begin(), rows.end()) - rows.begin());
+}
+
+// The features of all frames that match landmarks expected from a pose of the first; none if they are too few for a pose.
+std::optional<Matched> match_frames(const MapLandmarks& map, std::span<const QueryFrame> frames, const StereoImage& camera,
+                                    const FixLimits& limits, const SE3& map_from_cam, double radius_px, double doubt) {
+  Matched matched;
+  for (size_t k = 0; k < frames.size(); ++k)
+    match_visible(map, frames[k], k, camera, limits, map_from_cam * inverse(frames[k].cam_from_query), radius_px, doubt, matched);
+  if (landmarks_of(matched, nullptr) < limits.min_inliers) return {};
+  for (size_t k = 0; k < frames.size(); ++k)
+    if (frames[k].unmeasured) measure(*frames[k].unmeasured, matched, k, limits);
+  for (size_t n = 0; n < matched.features.size(); ++n) {
+    const double* pixel = frames[matched.frames[n]].pixels + 3 * matched.features[n];
+    matched.pixels.insert(matched.pixels.end(), pixel, pixel + 3);
+  }
   return matched;
 }
 
@@ -182,25 +203,31 @@ VisibleLandmarks visible_landmarks(const ViewingCones& cones, const SE3& map_fro
   return visible;
 }
 
-std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera,
+std::optional<MapFix> fix_by_projection(const MapLandmarks& map, std::span<const QueryFrame> frames, const StereoImage& camera,
                                         const FixLimits& limits, SE3 map_from_cam, double radius_px) {
   std::optional<Matched> matched;
   std::optional<Resection> found;
   MapFix fix;
-  size_t inliers = 0;
+  std::vector<SE3> cameras;
+  double sigma_rad = 0.0, sigma_m = 0.0;
+  for (const QueryFrame& frame : frames) {
+    cameras.push_back(frame.cam_from_query);
+    sigma_rad = std::max(sigma_rad, frame.sigma_rad), sigma_m = std::max(sigma_m, frame.sigma_m);
+  }
   for (const bool is_first : {true, false}) {
     const double radius = is_first ? radius_px : std::min(radius_px, limits.guided_radius_px) * kNarrower;
-    matched = match_visible(map, frame, camera, limits, map_from_cam, radius, is_first ? kFirstDoubt : 1.0);
+    matched = match_frames(map, frames, camera, limits, map_from_cam, radius, is_first ? kFirstDoubt : 1.0);
     if (!matched) return {};
     std::vector<double> weights;
     for (const double sigma : matched->sigmas) weights.push_back(1.0 / sigma);
-    const Sightings seen{matched->points.data(), matched->pixels.data(), weights.data(), matched->rows.size()};
+    Sightings seen{matched->points.data(), matched->pixels.data(), weights.data(), matched->rows.size()};
+    if (frames.size() > 1) seen.cameras = matched->frames.data(), seen.cameras_from_first = cameras.data();
     found = refine_pnp(seen, camera.lens, limits.refinement, nullptr, inverse(map_from_cam));
     if (!found) return {};
     fix.inliers.clear();
     for (const double squared : found->squared) fix.inliers.push_back(squared < limits.refinement.gate_squared);
-    inliers = size_t(std::count(fix.inliers.begin(), fix.inliers.end(), true));
-    if (inliers < limits.min_inliers) return {};
+    fix.landmarks = landmarks_of(*matched, &fix.inliers);
+    if (fix.landmarks < limits.min_inliers) return {};
     map_from_cam = inverse(found->cam_from_source);
   }
   bool is_held[int(kColumns * kRows)] = {};
@@ -208,8 +235,11 @@ std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFram
     if (fix.inliers[n]) is_held[image_cell(&matched->pixels[3 * n], camera)] = true;
   fix.cells = int(std::count(std::begin(is_held), std::end(is_held), true));
   fix.map_from_cam = map_from_cam;
+  const auto inliers = std::count(fix.inliers.begin(), fix.inliers.end(), true);
   if (fix.cells < limits.min_cells || double(inliers) < limits.min_inlier_share * double(fix.inliers.size())) return {};
   if (!map_covariance(found->information, map_from_cam.rotation, limits, fix.covariance)) return {};
+  // An error of the motion is common to all that a frame shows.
+  for (int a = 0; a < 6; ++a) fix.covariance[7 * a] += a < 3 ? sigma_rad * sigma_rad : sigma_m * sigma_m;
   add_covisible(map, camera, limits, *matched, fix);
   fix.features = std::move(matched->features), fix.rows = std::move(matched->rows);
   fix.points_map = std::move(matched->points), fix.pixels = std::move(matched->pixels), fix.sigmas_px = std::move(matched->sigmas);

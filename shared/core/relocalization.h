@@ -2,6 +2,7 @@
 #pragma once
 
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "camera.h"
@@ -55,6 +56,9 @@ struct QueryFrame {
     bool* is_tried;  // (N,)
   };
   std::optional<Unmeasured> unmeasured;
+  // Of a frame before the one whose place is sought, by odometry, with the largest sigmas of that motion.
+  SE3 cam_from_query{kIdentity, {}};
+  double sigma_rad = 0.0, sigma_m = 0.0;
 };
 
 struct FixLimits {
@@ -75,12 +79,14 @@ struct FixLimits {
   Refinement refinement;
 };
 
-// A verified place of a frame; covariance (6, 6) in map axes about the camera, rotation first.
+// A verified place of a frame; covariance (6, 6) in map axes about the camera, rotation first. Landmarks that are seen in several frames
+// count once, parts of the image too.
 struct MapFix {
   SE3 map_from_cam;
   double covariance[36];
   int cells;                                          // parts of the image that hold inliers
-  std::vector<int64_t> features, rows;                // matched at the end: features and landmarks
+  size_t landmarks;                                   // among the inliers
+  std::vector<int64_t> features, rows;                // matched at the end: features and landmarks, frame by frame
   std::vector<uint8_t> inliers;                       // of them
   std::vector<double> points_map, pixels, sigmas_px;  // (P, 3), (P, 3), (P, 2) of them
   std::vector<int64_t> covisible;                     // expected landmarks
@@ -88,8 +94,9 @@ struct MapFix {
   bool is_passed;                                     // by the survey; else all that may be visible are covisible
 };
 
-// The fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result.
-std::optional<MapFix> fix_by_projection(const MapLandmarks& map, const QueryFrame& frame, const StereoImage& camera,
+// The fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result. Of several frames
+// the first is the one whose place is sought; all are matched around the same pose, and one pose is fitted to all of them.
+std::optional<MapFix> fix_by_projection(const MapLandmarks& map, std::span<const QueryFrame> frames, const StereoImage& camera,
                                         const FixLimits& limits, SE3 map_from_cam, double radius_px);
 
 // The median distance of the landmarks expected in view, or nearly so; NaN without any.

@@ -4,6 +4,7 @@ The headers there document each function. Images (H, W) uint8 grey, descriptors 
 ValueError for invalid sizes and numbers, TypeError for another kind of array; input that is not finite raises no error.
 """
 
+import collections.abc
 from collections.abc import Callable
 
 import numpy as np
@@ -158,16 +159,29 @@ class FixFinder:
         unmeasured: tuple[_Grey, _Grey, _Reals, _Flags] | None,
         map_from_cam: _Reals,
         radius_px: float,
+        earlier: collections.abc.Sequence[
+            tuple[
+                tuple[_Reals, _Reals, _Octaves, _Descriptors],
+                tuple[_Grey, _Grey, _Reals, _Flags] | None,
+                _Reals,
+                float,
+                float,
+            ]
+        ] = (),
     ) -> (
-        tuple[_Reals, _Reals, int, _Indices, _Indices, _Flags, tuple[_Reals, _Reals, _Reals], _Indices, _Flags, bool]
+        tuple[
+            _Reals, _Reals, int, int, _Indices, _Indices, _Flags, tuple[_Reals, _Reals, _Reals], _Indices, _Flags, bool
+        ]
         | None
     ):
         """Find the verified pose near map_from_cam, None without one.
 
         features: pixels (M, 3) u_left v u_right, those in the left image (M, 2), octaves, descriptors. unmeasured: the pair of images,
-        pixels again and flags of tried features (M,), both of which are written. Returns map_from_cam and its covariance, the number of
-        image cells with inliers, features and landmarks of the final matches (P,), flags of inliers among them, their points (P, 3),
-        pixels (P, 3) and sigmas (P, 2), the expected landmarks (E,), flags of seen ones, and True if the survey passed there.
+        pixels again and flags of tried features (M,), both of which are written. earlier: at most 16 more frames to which the
+        pose is fitted, each with its features, pair of images, cam_from_query (4, 4) and sigmas of that motion, of rotation and position.
+        Returns map_from_cam and its covariance, the numbers of image cells and of landmarks with inliers, features and landmarks of the
+        final matches (P,), frame by frame, flags of inliers among them, their points (P, 3), pixels (P, 3) and sigmas (P, 2), the
+        expected landmarks (E,), flags of seen ones, and True if the survey passed there.
         """
 
 def nearest_cells(descriptors: _Descriptors, centres: _Descriptors, cells: int) -> _Numbers:

@@ -1,5 +1,7 @@
 #include "images.h"  // first: Python's header comes before the system's
 
+#include <nanobind/stl/vector.h>
+
 #include <algorithm>
 #include <numbers>
 
@@ -42,6 +44,9 @@ using Poses = Array<double, -1, 4, 4>;
 using Indices = Array<int64_t, -1>;
 using Features = std::tuple<Array<double, -1, 3>, Places, Array<int8_t, -1>, Packed>;
 using Unmeasured = std::tuple<Image, Image, MutableArray<double, -1, 3>, MutableArray<bool, -1>>;
+// Features, the pair of images, cam_from_query, and the sigmas of that motion: of rotation and position.
+using EarlierFrame = std::tuple<Features, std::optional<Unmeasured>, Array<double, 4, 4>, double, double>;
+constexpr size_t kMostEarlier = 16;
 
 // Finds fixes in one map. The map's arrays are held as they are; the rows of places, which must stay in their bounds, are copied.
 class FixFinder {
@@ -93,7 +98,21 @@ class FixFinder {
   }
 
   auto by_projection(const Features& features, const std::optional<Unmeasured>& unmeasured, const Array<double, 4, 4>& map_from_cam,
-                     double radius_px) const {
+                     double radius_px, const std::vector<EarlierFrame>& earlier) const {
+    if (earlier.size() > kMostEarlier) throw nb::value_error("earlier: at most 16 frames");
+    std::vector<QueryFrame> frames{frame_of(features, unmeasured)};
+    for (const auto& [of_frame, of_pair, cam_from_query, sigma_rad, sigma_m] : earlier) {
+      frames.push_back(frame_of(of_frame, of_pair));
+      frames.back().cam_from_query = se3(cam_from_query.data());
+      frames.back().sigma_rad = sigma_rad, frames.back().sigma_m = sigma_m;
+    }
+    auto fix = unlocked([&] { return fix_by_projection(map(), frames, camera_, limits_, se3(map_from_cam.data()), radius_px); });
+    using Fix = decltype(as_python(std::move(*fix)));
+    return fix ? std::optional<Fix>(as_python(std::move(*fix))) : std::nullopt;
+  }
+
+ private:
+  static QueryFrame frame_of(const Features& features, const std::optional<Unmeasured>& unmeasured) {
     const auto& [pixels, left_pixels, octaves, descriptors] = features;
     const size_t count = pixels.shape(0);
     if (left_pixels.shape(0) != count || octaves.shape(0) != count || descriptors.shape(0) != count)
@@ -105,19 +124,17 @@ class FixFinder {
       if (to.shape(0) != count || is_tried.shape(0) != count) throw nb::value_error("unmeasured: a row for each feature");
       frame.unmeasured = {{grey(left), grey(right)}, to.data(), is_tried.data()};
     }
-    auto fix = unlocked([&] { return fix_by_projection(map(), frame, camera_, limits_, se3(map_from_cam.data()), radius_px); });
-    using Fix = decltype(as_python(std::move(*fix)));
-    return fix ? std::optional<Fix>(as_python(std::move(*fix))) : std::nullopt;
+    return frame;
   }
 
- private:
-  static std::tuple<Reals2, Reals2, int, Rows, Rows, Flags, std::tuple<Reals2, Reals2, Reals2>, Rows, Flags, bool> as_python(MapFix&& fix) {
+  static std::tuple<Reals2, Reals2, int, size_t, Rows, Rows, Flags, std::tuple<Reals2, Reals2, Reals2>, Rows, Flags, bool> as_python(MapFix&& fix) {
     std::vector<double> place(16);
     store(fix.map_from_cam, place.data());
     const size_t matched = fix.rows.size();
     return {as_numpy<double, 2>(std::move(place), {4, 4}),
             copied<2>(fix.covariance, {6, 6}),
             fix.cells,
+            fix.landmarks,
             as_numpy<int64_t>(std::move(fix.features)),
             as_numpy<int64_t>(std::move(fix.rows)),
             as_numpy<bool>(std::move(fix.inliers)),
@@ -180,7 +197,7 @@ void bind_relocalization(nb::module_& module) {
            "stereo"_a, "min_inlier_share"_a, "refinement"_a)
       .def("median_distance_m", &FixFinder::median_distance_m, "map_from_cam"_a.noconvert())
       .def("by_projection", &FixFinder::by_projection, "features"_a.noconvert(), "unmeasured"_a.noconvert().none(),
-           "map_from_cam"_a.noconvert(), "radius_px"_a);
+           "map_from_cam"_a.noconvert(), "radius_px"_a, "earlier"_a = std::vector<EarlierFrame>());
   const auto descriptors = "descriptors"_a.noconvert(), centres = "centres"_a.noconvert();
   module.def("visible_landmarks", &visible_landmarks_of, "cones"_a.noconvert(), "map_from_cam"_a.noconvert(), "pinhole"_a.noconvert(),
              "distance_scale"_a, "margin_px"_a, "max_view_angle_rad"_a, "octave_scale"_a);

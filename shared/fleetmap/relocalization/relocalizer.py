@@ -53,6 +53,22 @@ class Fix:
     matched: Correspondences | None = field(default=None, repr=False, compare=False)
 
 
+@dataclass(frozen=True, slots=True)
+class EarlierFrame:
+    """Features of a frame before that of a query: cam_from_query (4, 4) by odometry, covariance (6, 6) of that motion."""
+
+    features: FrameFeatures
+    cam_from_query: Array
+    cov_rot_trans: Array
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """The largest sigmas of rotation and position."""
+        widest = np.linalg.eigvalsh(np.stack([self.cov_rot_trans[:3, :3], self.cov_rot_trans[3:, 3:]]))[:, -1]
+        rotation, position = np.sqrt(np.maximum(widest, 0.0))
+        return float(rotation), float(position)
+
+
 class Relocalizer:
     """Finds fixes of frames in one map view."""
 
@@ -67,12 +83,22 @@ class Relocalizer:
         features = yield from extract_in_slices(frame.left, self._settings.orb)
         return FrameFeatures.of(frame, features, self._camera, self._settings.stereo)
 
-    def near(self, query: FrameFeatures, map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
-        """Find the fix near a predicted pose whose covariance (map axes) sets the search window; None without agreement."""
-        radius = self._radius_px(map_from_cam, cov_rot_trans)
-        if radius > self._settings.fix.max_radius_px:
+    def near(
+        self, query: FrameFeatures, map_from_cam: Array, cov_rot_trans: Array, earlier: Sequence[EarlierFrame] = ()
+    ) -> Fix | None:
+        """Find the fix near a predicted pose whose covariance (map axes) sets the search window; None without agreement.
+
+        earlier: other frames that count as well. Chance matches of several frames add up: so the fix must be reliable, and pose and
+        motion known to within the smallest window. None otherwise.
+        """
+        radius, settings = self._radius_px(map_from_cam, cov_rot_trans), self._settings.fix
+        if not earlier:
+            return self.by_projection(query, map_from_cam, radius) if radius <= settings.max_radius_px else None
+        known = [e for e in earlier if self._radius_px(map_from_cam, e.cov_rot_trans) <= settings.guided_radius_px]
+        if not known or radius > settings.guided_radius_px:
             return None
-        return self.by_projection(query, map_from_cam, radius)
+        fix = self.by_projection(query, map_from_cam, radius, known)
+        return fix if fix is not None and is_reliable(fix, settings) else None
 
     def anywhere(
         self,
@@ -119,24 +145,41 @@ class Relocalizer:
             fixes = yield from self._with_aliases(query, fixes)
         return sorted(fixes, key=lambda f: -f.inliers)
 
-    def by_projection(self, query: FrameFeatures, map_from_cam: Array, radius_px: float) -> Fix | None:
-        """Find the fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result."""
+    def by_projection(
+        self, query: FrameFeatures, map_from_cam: Array, radius_px: float, earlier: Sequence[EarlierFrame] = ()
+    ) -> Fix | None:
+        """Find the fix by guided matching of all landmarks visible from a pose, twice: wide, then narrow around the first result.
+
+        With earlier frames one pose is fitted to all, as a generalised camera, and a landmark counts once; matches are not returned.
+        Sources: Pless 2003 and Kneip et al. 2013 (generalised cameras).
+        """
         place = np.ascontiguousarray(map_from_cam)
-        found = self._finder.by_projection(query.packed(), query.unmeasured(), place, radius_px)
+        others = [
+            (e.features.packed(), e.features.unmeasured(), np.ascontiguousarray(e.cam_from_query), *e.sigmas)
+            for e in earlier
+        ]
+        found = self._finder.by_projection(query.packed(), query.unmeasured(), place, radius_px, others)
         if found is None:
             return None
         view = self.view
-        map_from_cam, covariance, cells, features, rows, inliers, matched, covisible, is_found, is_passed = found
+        map_from_cam, covariance, cells, landmarks, features, rows, inliers, matched, covisible, is_found, is_passed = (
+            found
+        )
         seen = int(is_found.sum())
-        return Fix(
+        fix = Fix(
             map_from_cam=map_from_cam,
             cov_rot_trans=covariance,
-            inliers=int(inliers.sum()),
+            inliers=landmarks,
             image_coverage=cells,
             inlier_share=float(inliers.mean()),
             landmark_recall=seen / max(len(covisible), 1),
             expected=len(covisible),
             seen=seen,
+        )
+        if earlier:
+            return fix
+        return replace(
+            fix,
             matches=np.column_stack([features, rows])[inliers],
             covisible=CovisibleLandmarks(
                 view.landmark_ids[covisible], view.points_map[covisible], view.descriptors[covisible], is_found

@@ -1,6 +1,8 @@
 """The fix of a frame in a map, against numeric derivatives of the pixels."""
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
@@ -9,6 +11,8 @@ from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 
+Rows = NDArray[np.int64]
+Features = tuple[Array, Array, NDArray[np.int8], NDArray[np.uint64]]
 CAMERA = StereoCamera(420.0, 319.5, 239.5, 0.12, 640, 480)
 COUNT, OCTAVE_SCALE, STEP = 120, 1.2, 1e-6
 
@@ -38,7 +42,20 @@ def test_a_fix_is_the_robust_minimum_and_its_covariance_that_of_the_minimum() ->
         features, None, truth @ se3_exp(np.array([0.01, -0.01, 0.01, 0.04, 0.03, -0.04])), 30.0
     )
     assert found is not None
-    map_from_cam, covariance, _, seen, rows, inliers, (points, measured, sigmas), covisible, is_found, is_passed = found
+    (
+        map_from_cam,
+        covariance,
+        _,
+        landmarks,
+        seen,
+        rows,
+        inliers,
+        (points, measured, sigmas),
+        covisible,
+        is_found,
+        is_passed,
+    ) = found
+    assert landmarks == inliers.sum()
     np.testing.assert_array_equal(seen, rows)
     assert inliers.mean() > 0.8
     assert not inliers[rows % 8 == 0].any()
@@ -75,3 +92,51 @@ def test_a_fix_is_the_robust_minimum_and_its_covariance_that_of_the_minimum() ->
     off = np.concatenate([so3_log(truth[:3, :3] @ map_from_cam[:3, :3].T), truth[:3, 3] - map_from_cam[:3, 3]])
     np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-4 * floors.min())
     assert off @ np.linalg.solve(covariance, off) < 22.0
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.02])
+def test_frames_that_show_too_little_each_are_one_camera_together(sigma_m: float) -> None:
+    """Ten landmarks in each of three frames; the same ten in all of them are as few as in one."""
+    rng, settings = np.random.default_rng(7), FixSettings()
+    truth = se3_exp(np.array([0.4, -1.1, 0.6, 2.0, -3.0, 1.0]))
+    cameras = [se3_exp(np.array([0.0, 0.02 * k, 0.0, 0.05 * k, 0.0, 0.3 * k])) for k in range(3)]  # from the first
+    first = np.column_stack([rng.uniform([-0.5, -0.4], [0.5, 0.4], (30, 2)), np.ones(30)]) * rng.uniform(3, 8, (30, 1))
+    points_map = transform_points(truth, first)
+    distances = np.linalg.norm(first, axis=1)
+    towards = ((truth[:3, 3] - points_map) / distances[:, None]).astype(np.float32)
+    descriptors = rng.integers(0, 2**63, (30, 4)).astype(np.uint64)
+    finder = core.FixFinder(
+        *((points_map, towards, np.full(30, 0.3, np.float32), distances.astype(np.float32)), np.zeros(30, np.float32)),
+        *(descriptors, truth[None], np.arange(30), np.array([0, 30]), np.array([*CAMERA.lens, 640.0, 480.0]), 1.0, 1.2),
+        *(settings, StereoSettings(), 0.35, REFINEMENT),
+    )  # fmt: skip
+
+    def shown(k: int, rows: Rows) -> Features:
+        pixels = CAMERA.pixel_from_point(transform_points(cameras[k], first[rows]))
+        pixels += rng.normal(0.0, 0.1, pixels.shape)
+        return pixels, pixels[:, :2].copy(), np.zeros(len(rows), np.int8), descriptors[rows]
+
+    frames = [shown(k, np.arange(10 * k, 10 * k + 10)) for k in range(3)]
+    guess = truth @ se3_exp(np.array([0.004, -0.004, 0.004, 0.02, 0.02, -0.02]))
+    for k, frame in enumerate(frames):
+        assert finder.by_projection(frame, None, guess @ se3_inverse(cameras[k]), 30.0) is None
+    earlier = [(frames[k], None, cameras[k], 0.0, sigma_m) for k in (1, 2)]
+    found = finder.by_projection(frames[0], None, guess, 30.0, earlier)
+    assert found is not None
+    map_from_cam, covariance, _, landmarks, *_ = found
+    assert landmarks == 30
+    assert np.linalg.norm(map_from_cam[:3, 3] - truth[:3, 3]) < 0.01
+    assert np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > max(settings.floor_m, sigma_m)
+    same = [(shown(k, np.arange(10)), None, cameras[k], 0.0, sigma_m) for k in (1, 2)]
+    assert finder.by_projection(frames[0], None, guess, 30.0, same) is None
+
+
+def test_more_frames_than_a_query_pools_are_refused() -> None:
+    finder = core.FixFinder(
+        *((np.zeros((0, 3)), *(np.zeros(shape, np.float32) for shape in ((0, 3), 0, 0))), np.zeros(0, np.float32)),
+        *(np.zeros((0, 4), np.uint64), np.zeros((0, 4, 4)), np.zeros(0, np.int64), np.zeros(1, np.int64)),
+        *(np.array([*CAMERA.lens, 640.0, 480.0]), 1.0, 1.2, FixSettings(), StereoSettings(), 0.35, REFINEMENT),
+    )  # fmt: skip
+    frame = np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros((0, 4), np.uint64)
+    with pytest.raises(ValueError, match="at most 16 frames"):
+        finder.by_projection(frame, None, np.eye(4), 9.0, [(frame, None, np.eye(4), 0.0, 0.0)] * 17)

@@ -1,4 +1,4 @@
-"""Which places of a map the relocalizer tries for a frame of a robot that does not know its place."""
+"""Which places of a map the relocalizer tries for a frame of a robot that does not know its place, and what several frames may prove."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from fleetmap.features.orb import Features
 from fleetmap.geometry import Array, se3
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
-from fleetmap.relocalization.relocalizer import Relocalizer
+from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.time_sliced import finished
@@ -66,3 +66,28 @@ def test_without_memory_the_same_places_are_tried(tried: list[int]) -> None:
     first = tried.copy()
     search(view, None)
     assert tried == first * 2
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "motion_m", "recall", "frames"),
+    [(0.01, 0.01, 0.3, 2), (0.5, 0.01, 0.3, 0), (0.01, 0.5, 0.3, 1), (0.01, 0.01, 0.05, 0)],
+)
+def test_several_frames_prove_a_place_only_where_pose_and_motion_are_known(
+    monkeypatch: pytest.MonkeyPatch, sigma_m: float, motion_m: float, recall: float, frames: int
+) -> None:
+    """Else what looks a little like it, as the next bay does, would agree in one frame after the other."""
+    counted = [0]
+
+    def by_projection(_: Relocalizer, query: object, place: Array, radius: float, earlier: list[EarlierFrame]) -> Fix:
+        counted[0] = len(earlier)
+        return Fix(place, np.eye(6), 20, 9, landmark_recall=recall)
+
+    monkeypatch.setattr(Relocalizer, "by_projection", by_projection)
+    monkeypatch.setattr(
+        Relocalizer, "_radius_px", lambda _, place, covariance: max(12.0, 600 * covariance[5, 5] ** 0.5)
+    )
+    relocalizer = Relocalizer(line_of_places(), CAMERA, RelocalizerSettings())
+    nothing = FrameFeatures(Features.empty(), np.zeros((0, 3)))
+    earlier = [EarlierFrame(nothing, np.eye(4), m**2 * np.eye(6)) for m in (0.01, motion_m)]
+    fix = relocalizer.near(nothing, np.eye(4), sigma_m**2 * np.eye(6), earlier)
+    assert (0 if fix is None else counted[0]) == frames

@@ -11,6 +11,7 @@ import pytest
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, FailureKind, Status
+from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.estimate import assemble
 from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.settings import TrackSettings
@@ -377,6 +378,26 @@ def test_a_look_that_took_two_frames_corrects_the_present(monkeypatch: pytest.Mo
     robot = Robot(monkeypatch, fix_interval_s=0.6).load()
     said = [robot.go(0.4, turn_rad=0.2) for _ in range(30)]
     assert robot.knows(said[-1])
+
+
+@pytest.mark.parametrize(
+    ("step_m", "pooled"), [(0.3, [0, 1, 2, 3, 3, 0, 0, 1]), (0.11, [0, 0, 1, 1, 2, 0, 0, 0]), (0.0, [0] * 8)]
+)
+def test_frames_without_a_fix_count_together_until_the_next_one(
+    tracking: Robot, step_m: float, pooled: list[int]
+) -> None:
+    """Those of other viewpoints, at most three beside the query's own; a robot that stands sees the same again."""
+    asked, near = list[int](), tracking.relocalizer.near
+
+    def counted(seen: list[Fix], place: Array, covariance: Array, earlier: Sequence[object] = ()) -> Fix | None:
+        asked[-1] = max(asked[-1], len(earlier))
+        return near(seen, place, covariance)
+
+    tracking.relocalizer.near = counted  # type: ignore[method-assign]
+    for number in range(8):
+        asked.append(0)
+        tracking.go(step_m, TRUE if number == 5 else NO_FIX, turn_rad=0.0)
+    assert asked == pooled
 
 
 def test_darkness_is_named_within_a_second(tracking: Robot) -> None:

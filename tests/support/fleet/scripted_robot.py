@@ -84,7 +84,7 @@ class ScriptedRelocalizer:
         yield
         return seen
 
-    def near(self, seen: list[Fix], map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
+    def near(self, seen: list[Fix], map_from_cam: Array, cov_rot_trans: Array, _: object = ()) -> Fix | None:
         reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
         close = [f for f in seen if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
         return close[0] if close else None
